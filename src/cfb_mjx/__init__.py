@@ -1,0 +1,30 @@
+"""Simulate, identify and train controllers for the Crazyflie 2.1 Brushless in JAX and MJX.
+
+The rooms of the library are imported on first use, so that ``import cfb_mjx`` costs milliseconds::
+
+    import cfb_mjx
+    model = cfb_mjx.model.Quadrotor.from_preset("cfb-guards")
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+__version__ = "0.1.0"
+
+_ROOMS = ("logs", "model", "parameters", "sysid", "view")
+__all__ = ["__version__", *_ROOMS]
+
+if TYPE_CHECKING:
+    from cfb_mjx import logs, model, parameters, sysid, view
+
+
+def __getattr__(name: str):
+    if name in _ROOMS:
+        return importlib.import_module(f"cfb_mjx.{name}")
+    raise AttributeError(f"module 'cfb_mjx' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

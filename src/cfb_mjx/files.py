@@ -1,0 +1,85 @@
+"""Writing results so that a failure never costs the user an earlier one, and finding shipped files."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from cfb_mjx.errors import CfbError
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``; rename it to ``path`` if the block succeeds, delete it otherwise.
+
+    The rename is atomic, so a reader (or a crash, a full disk, Ctrl-C) sees the old file or the whole new one.
+
+    Raises:
+        CfbError: the folder is missing or the file cannot be written (full disk, no permission).
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise CfbError(f"{path}: the folder {path.parent} does not exist; create it first.")
+    if path.is_dir():
+        raise CfbError(f"{path}: this is a folder; give the name of a file to write.")
+    temporary = None
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=f".tmp{path.suffix}", dir=path.parent)
+        os.close(handle)
+        temporary = Path(name)
+        yield temporary
+        with open(temporary, "rb") as written:
+            os.fsync(written.fileno())
+        # mkstemp makes the file private; give it the mode an ordinary open() would have given.
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
+        temporary.replace(path)
+        temporary = None
+    except OSError as error:
+        raise CfbError(
+            f"{path}: could not be written ({error.strerror or error}); free some space or choose another place. "
+            "Nothing that was there before has changed."
+        ) from error
+    finally:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Write a text file atomically (see `replacing`)."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: str | os.PathLike, value: object) -> None:
+    """Write ``value`` as JSON atomically; NaN and infinities, which JSON lacks, become null."""
+    write_text(path, json.dumps(_plain(value), indent=1) + "\n")
+
+
+def _plain(value):
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def shipped(*parts: str) -> Path:
+    """Path of a file shipped with the library (``assets/...`` or ``configs/...``), installed or from a checkout."""
+    package = Path(__file__).resolve().parent
+    for root in (package / "_data", package.parents[1]):
+        path = root.joinpath(*parts)
+        if path.exists():
+            return path
+    raise CfbError(f"{'/'.join(parts)} is missing from this installation of cfb_mjx; reinstall it.")

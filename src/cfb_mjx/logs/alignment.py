@@ -1,0 +1,190 @@
+"""Are the motor columns in step with the gyro? Finding and removing a constant shift between them.
+
+The angular acceleration that the rotor speeds must cause is compared with the derivative of the gyro in a band above
+the bandwidth of the flight controller. Below it a closed loop lets the motors answer the motion as much as cause it,
+which moves the lag and can flip the sign of the correlation; above it the motors are mostly cause.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from cfb_mjx.logs.flight_log import FlightLog
+
+BAND_HZ = (5.0, 17.0)
+MAX_SHIFT = 0.06  # s: under one period of the band's centre, so that the neighbouring correlation peak stays outside
+_BLOCK = 2.0  # s
+_RESAMPLES = 200
+# Nominal rotor model of the Crazyflie 2.1 Brushless; only its phase in the band matters. A motor time constant wrong by
+# 10 ms moves the lag by 1 ms.
+_TIME_CONSTANT, _GAIN = 0.050, 2900.0
+_THRUST = (-0.23, 0.562, -0.043, 0.0)
+_ROLL_PITCH = np.array([[-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, 1.0, -1.0]]) * (0.0707 / 2) / np.array([[3.3e-5], [3.6e-5]])
+
+
+@dataclasses.dataclass(frozen=True)
+class AlignmentEstimate:
+    """Lag of the measured motion behind the motor columns.
+
+    Attributes:
+        shift_s: s by which the motor columns (command and rotor speed) must be *delayed*; negative: advanced.
+        std_s: standard deviation of ``shift_s`` from a bootstrap over blocks of the flight, s; infinite without data.
+        correlation: of predicted and measured angular acceleration in the band at that shift, 0 to 1.
+        gain: measured over predicted angular acceleration in the band (1 for the nominal inertia and thrust).
+        method: which column predicted the torque, ``rotor_speed`` or ``command``.
+        band_hz: the band used, Hz.
+        blocks: number of half-overlapping blocks used.
+    """
+
+    shift_s: float
+    std_s: float
+    correlation: float
+    gain: float
+    method: str
+    band_hz: tuple[float, float]
+    blocks: int
+
+    @property
+    def reliable(self) -> bool:
+        """Whether the flight excites the band enough to act on the estimate."""
+        return self.correlation > 0.4 and self.std_s < 0.004
+
+    def report(self) -> dict:
+        """The estimate in JSON terms, milliseconds."""
+        return {
+            "shift_ms": self.shift_s * 1e3,
+            "shift_std_ms": self.std_s * 1e3,
+            "correlation": self.correlation,
+            "method": self.method,
+            "band_hz": list(self.band_hz),
+            "blocks": self.blocks,
+            "reliable": self.reliable,
+        }
+
+
+def estimate_command_shift(
+    log: FlightLog, method: str | None = None, band_hz: tuple[float, float] = BAND_HZ, seed: int = 0
+) -> AlignmentEstimate:
+    """Estimate by how much the motor columns must be delayed to be in step with the gyro.
+
+    Args:
+        log: the flight; irregular sampling is fine, nothing is computed across gaps.
+        method: ``rotor_speed`` or ``command`` (through a first-order motor of 50 ms); None takes the best available.
+        band_hz: band of the comparison, Hz. Its lower edge should lie above the bandwidth of the flight controller.
+        seed: of the bootstrap.
+
+    Returns:
+        The estimate; with too little data, shift 0 with infinite standard deviation.
+    """
+    if method is None:
+        measured = log.rotor_speed is not None and np.isfinite(log.rotor_speed).all(axis=1).mean() > 0.5
+        method = "rotor_speed" if measured else "command"
+    if method == "rotor_speed":
+        valid = ~np.isnan(log.rotor_speed).any(axis=1)
+        times, speeds, gyro = log.time[valid], log.rotor_speed[valid], log.body_rate[valid]
+    elif method == "command":
+        times, speeds, gyro = log.time, _motors(log), log.body_rate
+    else:
+        raise ValueError(f"method must be 'rotor_speed' or 'command', not {method!r}")
+    s = speeds / _GAIN
+    predicted = np.polyval(_THRUST, s) @ _ROLL_PITCH.T
+    blocks = _spectra(times, predicted, gyro[:, :2], log, band_hz)
+    if blocks is None:
+        return AlignmentEstimate(0.0, float("inf"), 0.0, 0.0, method, band_hz, 0)
+    frequency, cross, power_x, power_y = blocks
+    lags = np.arange(-MAX_SHIFT, MAX_SHIFT + 5e-4, 1e-3)
+    steer = np.exp(2j * np.pi * np.outer(frequency, lags))
+    total = cross.sum(axis=0)
+    shift, peak = _peak(lags, np.real(total @ steer)[None])
+    # Neighbouring blocks overlap by half: drawing them in pairs keeps the standard deviation honest.
+    pairs = np.add.reduceat(cross, np.arange(0, len(cross), 2))
+    draws = np.random.default_rng(seed).multinomial(len(pairs), np.full(len(pairs), 1 / len(pairs)), size=_RESAMPLES)
+    resampled, _ = _peak(lags, np.real((draws @ pairs) @ steer))
+    std = float(np.std(resampled)) if len(pairs) >= 4 else float("inf")
+    correlation = float(peak[0] / np.sqrt(power_x * power_y)) if power_x * power_y > 0 else 0.0
+    gain = float(peak[0] / power_x) if power_x > 0 else 0.0
+    return AlignmentEstimate(float(shift[0]), std, correlation, gain, method, tuple(band_hz), len(cross))
+
+
+def apply_shift(log: FlightLog, shift: float) -> FlightLog:
+    """Delay the motor columns (command and rotor speed) by ``shift`` s; rows whose motor data are unknown are dropped.
+
+    Commands are held (the row gets the command in force ``shift`` earlier), rotor speeds are interpolated linearly.
+    A row whose source falls into a gap or outside the log is dropped, so gaps grow rather than fill with guesses.
+    """
+    if shift == 0.0:
+        return log
+    t, source = log.time, log.time - shift
+    slack = 0.01 * log.nominal_interval  # a whole number of samples must not fall to the sample before by rounding
+    before = np.searchsorted(t, source + slack, side="right") - 1
+    inside = (before >= 0) & (source <= t[-1] + slack)
+    before = np.clip(before, 0, len(t) - 1)
+    after = np.minimum(before + 1, len(t) - 1)
+    in_gap = (t[after] - t[before] > log.gap_threshold) & (source - t[before] > log.nominal_interval + slack)
+    weight = np.clip((source - t[before]) / np.where(after > before, t[after] - t[before], 1.0), 0.0, 1.0)[:, None]
+    speed = log.rotor_speed
+    if speed is not None:
+        mixed = (1 - weight) * speed[before] + weight * speed[after]
+        speed = np.where(weight * (t[after] - t[before])[:, None] <= slack, speed[before], mixed)
+    return log.replace(command=log.command[before], rotor_speed=speed).rows(inside & ~in_gap)
+
+
+def delay_by_samples(log: FlightLog, samples: int) -> FlightLog:
+    """Delay the motor columns by a whole number of rows, without interpolation; the end rows are repeated."""
+    source = np.clip(np.arange(len(log)) - samples, 0, len(log) - 1)
+    speed = log.rotor_speed
+    return log.replace(command=log.command[source], rotor_speed=None if speed is None else speed[source])
+
+
+def _motors(log: FlightLog) -> np.ndarray:
+    """Rotor speeds (n, 4) that the commands, held between rows, give through the first-order motor."""
+    decay = np.exp(-np.diff(log.time) / _TIME_CONSTANT)
+    target = _GAIN * log.command
+    speed = target.copy()
+    for k, keep in enumerate(decay):
+        speed[k + 1] = target[k] + (speed[k] - target[k]) * keep
+    return speed
+
+
+def _spectra(t, predicted, gyro, log, band_hz):
+    """Per-block cross spectra of predicted and measured angular acceleration, summed over roll and pitch.
+
+    Returns (frequency (f,) Hz, cross (blocks, f), and the total power of both in the band), or None without data.
+    """
+    interval = log.nominal_interval
+    if interval <= 0.0 or 0.4 / interval < band_hz[1]:
+        return None
+    size = round(_BLOCK / interval)
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(t) > log.gap_threshold) + 1, [len(t)]])
+    window = np.hanning(size)[:, None]
+    frequency = np.fft.rfftfreq(size, interval)
+    band = (frequency >= band_hz[0]) & (frequency <= band_hz[1])
+    frequency = frequency[band]
+    cross, power_x, power_y = [], 0.0, 0.0
+    for a, b in itertools.pairwise(edges):
+        if b - a < 2 or t[b - 1] - t[a] < (size - 1) * interval * 0.999:
+            continue
+        grid = t[a] + interval * np.arange(int((t[b - 1] - t[a]) / interval + 1e-3) + 1)
+        x, y = ([np.interp(grid, t[a:b], v[a:b, i]) for i in range(2)] for v in (predicted, gyro))
+        x, y = np.stack(x, axis=1), np.stack(y, axis=1)
+        for start in range(0, len(grid) - size + 1, size // 2):
+            pieces = (v[start : start + size] for v in (x, y))
+            fx, fy = (np.fft.rfft((p - p.mean(axis=0)) * window, axis=0)[band] for p in pieces)
+            fy = fy * (2j * np.pi * frequency)[:, None]
+            cross.append(np.sum(np.conj(fx) * fy, axis=1))
+            power_x += float(np.sum(np.abs(fx) ** 2))
+            power_y += float(np.sum(np.abs(fy) ** 2))
+    return (frequency, np.array(cross), power_x, power_y) if cross else None
+
+
+def _peak(lags: np.ndarray, correlation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lag and height of the maximum of each row, refined by a parabola through three points."""
+    k = np.clip(np.argmax(correlation, axis=1), 1, len(lags) - 2)
+    rows = np.arange(len(k))
+    left, middle, right = (correlation[rows, k + i] for i in (-1, 0, 1))
+    bend = left - 2 * middle + right
+    offset = np.clip(np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0), -1.0, 1.0)
+    return lags[k] + offset * (lags[1] - lags[0]), middle - 0.25 * (left - right) * offset

@@ -1,0 +1,175 @@
+"""One flight as arrays: the only form in which the rest of the library sees measured data."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+REQUIRED = ("time", "position", "velocity", "quaternion", "body_rate", "specific_force", "command")
+OPTIONAL = ("rotor_speed", "battery_voltage")
+_WIDTH = {
+    "position": 3,
+    "velocity": 3,
+    "quaternion": 4,
+    "body_rate": 3,
+    "specific_force": 3,
+    "command": 4,
+    "rotor_speed": 4,
+}
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class FlightLog:
+    """A flight, sampled at ``n`` instants that need not be evenly spaced. Arrays are float64 and read-only.
+
+    A pause in the samples longer than `gap_threshold` is a gap: nothing in the library interpolates across it.
+
+    Attributes:
+        time: (n,) s, strictly increasing.
+        position: (n, 3) m, world (z up).
+        velocity: (n, 3) m/s, world.
+        quaternion: (n, 4) ``[w, x, y, z]``, body to world, unit norm.
+        body_rate: (n, 3) rad/s, body axes (the gyro).
+        specific_force: (n, 3) m/s^2, body axes (the accelerometer: +9.81 along z at rest).
+        command: (n, 4) in [0, 1], motors M1 to M4; a row holds from its time to the next row's.
+        rotor_speed: (n, 4) rad/s, NaN where a sample is invalid; None if not measured.
+        battery_voltage: (n,) V; None if not measured.
+        metadata: JSON-like mapping with at least ``name``, ``source`` (file name), ``format`` and
+            ``observation_delay`` (s by which position, velocity and quaternion lag their row's time; None: unknown).
+
+    Raises:
+        ValueError: arrays of the wrong shape (a programming mistake; `validate` judges the content).
+    """
+
+    time: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    quaternion: np.ndarray
+    body_rate: np.ndarray
+    specific_force: np.ndarray
+    command: np.ndarray
+    rotor_speed: np.ndarray | None = None
+    battery_voltage: np.ndarray | None = None
+    metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self):
+        n = len(self.time)
+        for field in (*REQUIRED, *OPTIONAL):
+            value = getattr(self, field)
+            if value is None and field in OPTIONAL:
+                continue
+            shape = (n, _WIDTH[field]) if field in _WIDTH else (n,)
+            array = np.array(value, dtype=np.float64, order="C")
+            if array.shape != shape:
+                raise ValueError(f"FlightLog.{field} has shape {array.shape}, expected {shape}")
+            array.flags.writeable = False
+            object.__setattr__(self, field, array)
+        # Through JSON, so that what is stored in a file is exactly what was in memory.
+        plain = json.loads(json.dumps(_to_plain(self.metadata), allow_nan=False))
+        defaults = {"name": "log", "source": "", "format": "memory", "observation_delay": None}
+        object.__setattr__(self, "metadata", MappingProxyType(defaults | plain))
+
+    @property
+    def name(self) -> str:
+        """Name of the log, unique among files of one folder (the file name without its ending)."""
+        return self.metadata["name"]
+
+    @property
+    def observation_delay(self) -> float | None:
+        """Seconds by which position, velocity and quaternion rows lag their time; None when the log does not say."""
+        return self.metadata["observation_delay"]
+
+    @property
+    def duration(self) -> float:
+        """Time between the first and the last row, s."""
+        return float(self.time[-1] - self.time[0]) if len(self.time) else 0.0
+
+    @property
+    def nominal_interval(self) -> float:
+        """Median of the positive sampling intervals, s."""
+        steps = np.diff(self.time)
+        steps = steps[steps > 0]
+        return float(np.median(steps)) if len(steps) else 0.0
+
+    @property
+    def gap_threshold(self) -> float:
+        """Two rows further apart than this, s, have a gap between them (three nominal intervals + 0.5 ms)."""
+        return 3.0 * self.nominal_interval + 0.5e-3
+
+    def gaps(self) -> np.ndarray:
+        """Indices ``i`` of the rows after which a gap begins: ``time[i + 1] - time[i] > gap_threshold``."""
+        return np.flatnonzero(np.diff(self.time) > self.gap_threshold)
+
+    def segments(self) -> list[slice]:
+        """The contiguous stretches between gaps, in order, as slices of rows."""
+        edges = [0, *(self.gaps() + 1).tolist(), len(self.time)]
+        return [slice(a, b) for a, b in itertools.pairwise(edges) if b > a]
+
+    def slice(self, start: float, stop: float) -> FlightLog:
+        """The rows with ``start <= time <= stop`` (s). Times keep their values."""
+        return self.rows((self.time >= start) & (self.time <= stop))
+
+    def rows(self, index: np.ndarray) -> FlightLog:
+        """The rows that ``index`` (a mask, indices or a slice) selects."""
+        arrays = {f: getattr(self, f) for f in (*REQUIRED, *OPTIONAL)}
+        return self.replace(**{f: None if a is None else a[index] for f, a in arrays.items()})
+
+    def replace(self, **changes) -> FlightLog:
+        """A copy with some fields changed; ``metadata`` is merged into the present one instead of replacing it."""
+        if "metadata" in changes:
+            changes["metadata"] = dict(self.metadata) | dict(changes["metadata"])
+        return dataclasses.replace(self, **changes)
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    def __repr__(self) -> str:
+        rate = 1.0 / self.nominal_interval if self.nominal_interval else float("nan")
+        return (
+            f"FlightLog({self.name!r}, {len(self)} rows, {self.duration:.2f} s at {rate:.0f} Hz, "
+            f"{len(self.gaps()) if len(self) else 0} gaps, rotor_speed={self.rotor_speed is not None}, "
+            f"battery_voltage={self.battery_voltage is not None})"
+        )
+
+    def __reduce__(self):
+        # A mappingproxy cannot be pickled.
+        return FlightLog, (*(getattr(self, f) for f in (*REQUIRED, *OPTIONAL)), dict(self.metadata))
+
+
+def quantise_time(time: np.ndarray) -> np.ndarray:
+    """Round times (s) to whole nanoseconds, the resolution log files keep; applying it twice changes nothing."""
+    return from_nanoseconds(*to_nanoseconds(time))
+
+
+def to_nanoseconds(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Split times (s) into whole seconds and nanoseconds 0..999999999, both int64, exactly also for epoch times."""
+    time = np.asarray(time, dtype=np.float64)
+    seconds = np.floor(time)
+    nanos = np.rint((time - seconds) * 1e9)
+    carry = nanos >= 1e9
+    return (seconds + carry).astype(np.int64), np.where(carry, 0, nanos).astype(np.int64)
+
+
+def from_nanoseconds(seconds: np.ndarray, nanos: np.ndarray) -> np.ndarray:
+    """Inverse of `to_nanoseconds`."""
+    return np.asarray(seconds, dtype=np.float64) + np.asarray(nanos, dtype=np.float64) / 1e9
+
+
+def _to_plain(value):
+    """JSON terms only: arrays become lists, and NaN and infinities, which JSON lacks, become None."""
+    if isinstance(value, Mapping):
+        return {str(k): _to_plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_to_plain(v) for v in value]
+    if hasattr(value, "tolist"):
+        return _to_plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,160 @@
+"""Reading a flight log from MCAP with the message descriptions embedded in the file."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from operator import attrgetter
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import mcap_schema
+from cfb_mjx.logs.flight_log import FlightLog, from_nanoseconds
+
+_MAGIC = b"\x89MCAP0\r\n"
+_STAMP = ("timestamp.seconds", "timestamp.nanos")
+_POSE_COLUMNS = tuple(f"pose.position.{c}" for c in "xyz") + tuple(f"pose.orientation.{c}" for c in "wxyz")
+
+
+def read_mcap(path: str | os.PathLike) -> FlightLog:
+    """Read a log that `write_mcap` wrote. `read_log` also validates the content.
+
+    Raises:
+        CfbError: the file is missing, not an MCAP, cut short, damaged (checksums), holds other topics, or its topics
+            do not share one set of time stamps.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise CfbError(f"{path}: there is no such file; check the path.") from None
+    except OSError as error:
+        raise CfbError(
+            f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions."
+        ) from None
+    if not data:
+        raise CfbError(f"{path}: the file is empty; export the log again.")
+    if not data.startswith(_MAGIC):
+        raise CfbError(f"{path}: this is not an MCAP file; give a log written by cfb_mjx or a table (parquet, csv).")
+    try:
+        schemas, channels, payloads, record = _records(data)
+    except Exception as error:  # the MCAP library lets struct, codec and lookup errors of damaged bytes through
+        raise CfbError(f"{path}: the MCAP file is {_diagnosis(data, error)}; copy or export it again.") from None
+    _check_origin(path, schemas, channels, record)
+    try:
+        columns = _decode(schemas, channels, payloads)
+        metadata = json.loads(record["metadata"])
+        if not isinstance(metadata, dict):
+            raise ValueError("metadata is not an object")
+    except Exception as error:  # protobuf and JSON decoding of foreign or damaged content
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CfbError(
+            f"{path}: the messages do not match their description in the file ({reason}); export the log again."
+        ) from None
+    return _assemble(path, columns, metadata)
+
+
+def _records(data: bytes):
+    """Channels, schemas, message payloads per topic in file order, and the log's metadata record; checks all CRCs."""
+    from mcap.records import Channel, Message, Metadata, Schema
+    from mcap.stream_reader import StreamReader
+
+    schemas, channels, payloads, record = {}, {}, {}, {}
+    for item in StreamReader(io.BytesIO(data), validate_crcs=True, record_size_limit=len(data)).records:
+        if isinstance(item, Message):
+            payloads.setdefault(item.channel_id, []).append(item.data)
+        elif isinstance(item, Schema):
+            schemas[item.id] = item
+        elif isinstance(item, Channel):
+            channels[item.id] = item
+        elif isinstance(item, Metadata) and item.name == mcap_schema.METADATA_RECORD:
+            record = item.metadata
+    return schemas, channels, payloads, record
+
+
+def _diagnosis(data: bytes, error: Exception) -> str:
+    if not data.endswith(_MAGIC):
+        return "cut short (its closing bytes are missing)"
+    if "crc" in str(error):
+        return "damaged (a checksum does not match)"
+    return f"damaged ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
+
+
+def _check_origin(path: Path, schemas: dict, channels: dict, record: dict) -> None:
+    topics = sorted({c.topic for c in channels.values()})
+    ours = {
+        c.topic
+        for c in channels.values()
+        if c.schema_id in schemas
+        and schemas[c.schema_id].encoding == c.message_encoding == "protobuf"
+        and schemas[c.schema_id].name == mcap_schema.MESSAGES.get(c.topic)
+    }
+    if not ours or not record:
+        listed = ", ".join(topics[:8]) + (", ..." if len(topics) > 8 else "") if topics else "none"
+        raise CfbError(
+            f"{path}: this MCAP has topics {listed}; it was not written by cfb_mjx, export it to the tabular layout "
+            "instead (see docs/logs.md)."
+        )
+    if record.get("format_version") != mcap_schema.FORMAT_VERSION:
+        raise CfbError(
+            f"{path}: the log has format version {record.get('format_version')!r}, this library reads "
+            f"{mcap_schema.FORMAT_VERSION!r}; update cfb_mjx or export the log again."
+        )
+    required = [
+        mcap_schema.POSE,
+        *(t.topic for t in mcap_schema.TOPICS if t.field not in ("rotor_speed", "battery_voltage")),
+    ]
+    if missing := [t for t in required if t not in ours]:
+        raise CfbError(
+            f"{path}: the MCAP lacks the topic{'s' * (len(missing) > 1)} {', '.join(missing)}; export all of them."
+        )
+
+
+def _decode(schemas: dict, channels: dict, payloads: dict) -> dict[str, np.ndarray]:
+    """Per topic an (n, 2 + columns) list of rows: seconds, nanoseconds, values."""
+    columns = {t.topic: t.columns for t in mcap_schema.TOPICS} | {mcap_schema.POSE: _POSE_COLUMNS}
+    tables = {}
+    for identifier, channel in channels.items():
+        if channel.topic not in columns:
+            continue
+        schema = schemas[channel.schema_id]
+        parse = mcap_schema.message_class(schema.name, schema.data).FromString
+        row = attrgetter(*_STAMP, *columns[channel.topic])
+        rows = [row(parse(data)) for data in payloads.get(identifier, [])]
+        table = np.array(rows, dtype=np.float64).reshape(len(rows), 2 + len(columns[channel.topic]))
+        tables[channel.topic] = np.concatenate([tables[channel.topic], table]) if channel.topic in tables else table
+    return tables
+
+
+def _assemble(path: Path, tables: dict[str, np.ndarray], metadata: dict) -> FlightLog:
+    reference = tables.pop(mcap_schema.POSE)
+    for topic, table in tables.items():
+        if len(table) != len(reference):
+            raise CfbError(
+                f"{path}: {topic} has {len(table)} messages, {mcap_schema.POSE} {len(reference)}, but a log needs "
+                "every topic at every time stamp; resample with cfb_mjx.logs.resample before writing "
+                "or export all at one rate."
+            )
+        if (table[:, :2] != reference[:, :2]).any():
+            row = int(np.argmax((table[:, :2] != reference[:, :2]).any(axis=1)))
+            stamps = from_nanoseconds(*np.stack([table[row, :2], reference[row, :2]], axis=1))
+            raise CfbError(
+                f"{path}: message {row} of {topic} is at {stamps[0]:.9g} s, that of {mcap_schema.POSE} at "
+                f"{stamps[1]:.9g} s; resample with cfb_mjx.logs.resample before writing or export all at one rate."
+            )
+    fields = {t.field: tables[t.topic][:, 2:] for t in mcap_schema.TOPICS if t.topic in tables}
+    if "battery_voltage" in fields:
+        fields["battery_voltage"] = fields["battery_voltage"][:, 0]
+    # The file being read names the log; where the data first came from stays on record.
+    origin = {k: metadata.get(k) for k in ("name", "source", "format")}
+    metadata = {"origin": origin} | metadata | {"name": path.stem, "source": path.name, "format": "mcap"}
+    return FlightLog(
+        time=from_nanoseconds(reference[:, 0], reference[:, 1]),
+        position=reference[:, 2:5],
+        quaternion=reference[:, 5:9],
+        metadata=metadata,
+        **fields,
+    )

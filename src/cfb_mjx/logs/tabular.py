@@ -1,0 +1,196 @@
+"""The tabular flight log (parquet or csv): one row per sample, columns named after what they hold."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import replacing
+from cfb_mjx.logs.flight_log import FlightLog, quantise_time
+
+COLUMNS = {
+    "time": ("t",),
+    "position": ("px", "py", "pz"),
+    "velocity": ("vx", "vy", "vz"),
+    "quaternion": ("qw", "qx", "qy", "qz"),
+    "body_rate": ("wx", "wy", "wz"),
+    "specific_force": ("ax", "ay", "az"),
+    "command": ("u1", "u2", "u3", "u4"),
+}
+OPTIONAL_COLUMNS = {"rotor_speed": ("omega1", "omega2", "omega3", "omega4"), "battery_voltage": ("vbat",)}
+LAYOUT = (
+    "t, px py pz, vx vy vz, qw qx qy qz, wx wy wz, ax ay az, u1..u4 and optionally omega1..omega4, vbat "
+    "(see docs/logs.md)"
+)
+
+
+class Text(NamedTuple):
+    """Stands for a column that does not hold numbers: the row (counted from 0) and content of its first such cell."""
+
+    row: int
+    cell: str
+
+
+Table = dict[str, np.ndarray | Text]
+
+
+def read_table(path: str | os.PathLike) -> Table:
+    """Read a parquet or csv file, every numeric column as float64.
+
+    Args:
+        path: a parquet file (recognised by its first bytes) or a csv with a header line.
+
+    Returns:
+        Column name to (n,) array with NaN for missing cells, or to `Text` for columns of anything but numbers.
+
+    Raises:
+        CfbError: the file is missing, empty, damaged, or not a table.
+    """
+    import pyarrow as pa
+
+    path = Path(path)
+    try:
+        with open(path, "rb") as file:
+            head = file.read(4)
+    except FileNotFoundError:
+        raise CfbError(f"{path}: there is no such file; check the path.") from None
+    except OSError as error:
+        raise CfbError(
+            f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions."
+        ) from None
+    if not head:
+        raise CfbError(f"{path}: the file is empty; export the log again.")
+    is_parquet = head == b"PAR1"
+    try:
+        table = _parquet(path) if is_parquet else _csv(path)
+    except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError, MemoryError, RuntimeError) as error:
+        kind = "parquet" if is_parquet else "csv"
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise CfbError(
+            f"{path}: not a readable {kind} table, the file is damaged or cut short ({reason}); export it again."
+        ) from None
+    if not table:
+        raise CfbError(f"{path}: the table has no columns; the layout is {LAYOUT}.")
+    return table
+
+
+def require_numbers(table: Table, columns: list[str], path: Path) -> None:
+    """Raise `CfbError` naming the first of ``columns`` that holds something else than numbers."""
+    for column in columns:
+        if isinstance(table[column], Text):
+            row, cell = table[column]
+            raise CfbError(
+                f"{path}: column {column} holds {cell!r} in row {row} (counted from 0) instead of a number; "
+                "export it as plain decimal numbers and leave missing cells empty."
+            )
+
+
+def _parquet(path: Path) -> Table:
+    import pyarrow.parquet as pq
+
+    # ParquetFile rather than read_table: the latter guesses partitions from folder names.
+    with pq.ParquetFile(path, memory_map=False, page_checksum_verification=True) as file:
+        return _to_arrays(file.read())
+
+
+def _csv(path: Path) -> Table:
+    import pyarrow.csv as pc
+
+    return _to_arrays(pc.read_csv(path, read_options=pc.ReadOptions(use_threads=False)))
+
+
+def _to_arrays(table) -> Table:
+    import pyarrow as pa
+    import pyarrow.compute as pcm
+
+    names = [name.strip() for name in table.column_names]
+    if twice := sorted({n for n in names if names.count(n) > 1}):
+        raise ValueError(f"column {twice[0]!r} appears twice")
+    arrays: Table = {}
+    for name, column in zip(names, table.columns, strict=True):
+        kind = column.type
+        if pa.types.is_null(kind):
+            arrays[name] = np.full(len(column), np.nan)
+        elif pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
+            arrays[name] = pcm.cast(column, pa.float64(), safe=False).to_numpy().astype(np.float64)
+        else:
+            arrays[name] = _first_text(column)
+    return arrays
+
+
+def _first_text(column) -> Text:
+    for row, cell in enumerate(column):
+        try:
+            float(str(cell))
+        except ValueError:
+            return Text(row, str(cell)[:40])
+    return Text(0, str(column[0])[:40] if len(column) else "")
+
+
+def read_tabular(path: str | os.PathLike) -> FlightLog:
+    """Read the tabular layout (parquet or csv). `read_log` also validates the content.
+
+    Raises:
+        CfbError: unreadable file, missing columns (all are listed), cells that are not numbers.
+    """
+    path = Path(path)
+    return from_columns(read_table(path), path)
+
+
+def from_columns(table: Table, path: Path) -> FlightLog:
+    """Build a log from columns in the tabular layout; ``path`` names the file in messages and metadata."""
+    missing = [c for names in COLUMNS.values() for c in names if c not in table]
+    partial = [
+        c for names in OPTIONAL_COLUMNS.values() if any(c in table for c in names) for c in names if c not in table
+    ]
+    if missing or partial:
+        raise CfbError(
+            f"{path}: missing column{'s' * (len(missing + partial) > 1)} {', '.join(missing + partial)}; "
+            f"the tabular layout is {LAYOUT}."
+        )
+    known = [c for names in (COLUMNS | OPTIONAL_COLUMNS).values() for c in names if c in table]
+    require_numbers(table, known, path)
+
+    def stack(names):
+        return table[names[0]] if len(names) == 1 else np.stack([table[c] for c in names], axis=1)
+
+    fields = {field: stack(names) for field, names in COLUMNS.items()}
+    for field, names in OPTIONAL_COLUMNS.items():
+        values = stack(names) if names[0] in table else None
+        # A column without a single value means "not measured", as does a missing one.
+        fields[field] = None if values is None or np.isnan(values).all() else values
+    if np.isfinite(fields["time"]).all() and np.abs(fields["time"]).max(initial=0.0) < 1e12:
+        fields["time"] = quantise_time(fields["time"])
+    metadata = {"name": path.stem, "source": path.name, "format": "tabular", "observation_delay": None}
+    return FlightLog(**fields, metadata=metadata)
+
+
+def write_tabular(log: FlightLog, path: str | os.PathLike) -> None:
+    """Write the tabular layout, float64, as parquet or (path ending in ``.csv``) csv. Metadata is not kept.
+
+    Raises:
+        CfbError: the path ends in neither ``.parquet`` nor ``.csv``, or cannot be written.
+    """
+    import pyarrow as pa
+    import pyarrow.csv as pc
+    import pyarrow.parquet as pq
+
+    path = Path(path)
+    if path.suffix not in (".parquet", ".csv"):
+        raise CfbError(f"{path}: a tabular log is written as .parquet or .csv; give the file one of these endings.")
+    columns = {}
+    for field, names in (COLUMNS | OPTIONAL_COLUMNS).items():
+        values = getattr(log, field)
+        if values is not None:
+            columns |= dict(zip(names, np.reshape(values, (len(log), -1)).T, strict=True))
+    # from_pandas=True turns NaN (an invalid rotor speed) into a missing value, the only kind csv can carry.
+    table = pa.table({c: pa.array(np.ascontiguousarray(v), from_pandas=True) for c, v in columns.items()})
+    with replacing(path) as temporary:
+        if path.suffix == ".csv":
+            pc.write_csv(table, temporary)
+        else:
+            pq.write_table(table, temporary, write_page_checksum=True)

@@ -1,0 +1,133 @@
+"""Refusing logs that would silently give wrong answers: order, gaps in the data, units and axis conventions."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import plausibility, rotation
+from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.tabular import COLUMNS, OPTIONAL_COLUMNS
+
+_NORM_TOLERANCE = 0.05
+_COMMAND_TOLERANCE = 1e-3
+# No Crazyflie rotor turns faster than about 2900 rad/s; twice that can only be another unit or a bad packet.
+_ROTOR_SPEED_LIMIT = 6000.0
+
+
+def validate(log: FlightLog, path: str | os.PathLike) -> FlightLog:
+    """Check a log and return it with unit quaternions of continuous sign and commands within [0, 1].
+
+    Args:
+        log: the log as read.
+        path: the file to name in messages.
+
+    Raises:
+        CfbError: fewer than two rows; time that does not increase; NaN or infinity in a required column; quaternions
+            that are not unit; commands or rotor speeds out of range; and, when the signals are large enough to tell,
+            a wrong unit or axis convention (see `cfb_mjx.logs.plausibility`).
+    """
+
+    def fail(problem: str):
+        raise CfbError(f"{path}: {problem}.")
+
+    if len(log) < 2:
+        fail(f"the log has {len(log)} row{'s' * (len(log) != 1)}, at least 2 are needed; export more of the flight")
+    _finite(log, fail)
+    _time(log, fail)
+    _quaternion_norm(log, fail)
+    _command(log, fail)
+    _rotor_speed(log, fail)
+    if log.battery_voltage is not None and np.median(log.battery_voltage) > 100.0:
+        fail(
+            f"vbat has a median of {np.median(log.battery_voltage):.0f}, which looks like millivolts; divide it by 1000"
+        )
+    log = log.replace(quaternion=rotation.tidy(log.quaternion), command=np.clip(log.command, 0.0, 1.0))
+    if problem := plausibility.first_problem(log):
+        fail(problem)
+    return log
+
+
+def _at(log: FlightLog, row: int) -> str:
+    return f"row {row} (counted from 0; t = {log.time[row]:.6g} s)"
+
+
+def _finite(log: FlightLog, fail) -> None:
+    for field, names in (COLUMNS | OPTIONAL_COLUMNS).items():
+        values = getattr(log, field)
+        if values is None:
+            continue
+        # A rotor speed may be NaN (invalid sample), everything else must be there.
+        bad = np.isinf(values) if field == "rotor_speed" else ~np.isfinite(values)
+        bad = bad.reshape(len(log), -1)
+        if bad.any():
+            row = int(np.argmax(bad.any(axis=1)))
+            column = int(np.argmax(bad[row]))
+            what = "an infinite value" if np.isinf(values.reshape(len(log), -1)[row, column]) else "no value (NaN)"
+            fail(
+                f"column {names[column]} has {what} in {_at(log, row)} ({int(bad.any(axis=1).sum())} rows in all); "
+                "drop those rows (a gap is handled) or repair them"
+            )
+
+
+def _time(log: FlightLog, fail) -> None:
+    steps = np.diff(log.time)
+    if (steps <= 0).any():
+        row = int(np.argmax(steps <= 0)) + 1
+        kind = "repeats the time of" if steps[row - 1] == 0 else "is earlier than"
+        fail(f"{_at(log, row)} {kind} the row before it; sort the rows by t and drop duplicates")
+    median = float(np.median(steps))
+    if median >= 0.5:
+        unit, factor = ("milli", "1e3") if median < 500 else ("micro", "1e6") if median < 5e5 else ("nano", "1e9")
+        fail(f"the median interval of t is {median:g} s, so t looks like {unit}seconds; divide it by {factor}")
+
+
+def _quaternion_norm(log: FlightLog, fail) -> None:
+    norm = np.linalg.norm(log.quaternion, axis=1)
+    bad = np.abs(norm - 1.0) > _NORM_TOLERANCE
+    if bad.any():
+        row = int(np.argmax(bad))
+        fail(
+            f"the quaternion in {_at(log, row)} has norm {norm[row]:.3g} ({int(bad.sum())} rows are off); "
+            "the quaternion columns qw qx qy qz must be [w, x, y, z], unit"
+        )
+
+
+def _command(log: FlightLog, fail) -> None:
+    low, high = float(log.command.min()), float(log.command.max())
+    if low >= -_COMMAND_TOLERANCE and high <= 1.0 + _COMMAND_TOLERANCE:
+        return
+    if low >= -_COMMAND_TOLERANCE and high > 100.5:
+        fail(f"u1..u4 reach {high:.0f}, which looks like raw PWM in 0..65535; divide the commands by 65535")
+    if low >= -_COMMAND_TOLERANCE and float(np.median(log.command)) > 2.0:
+        fail(f"u1..u4 reach {high:.1f}, which looks like percent; divide the commands by 100")
+    row, motor = np.unravel_index(int(np.argmax(np.abs(log.command - 0.5))), log.command.shape)
+    fail(
+        f"u{motor + 1} is {log.command[row, motor]:.4g} in {_at(log, int(row))}, outside [0, 1]; "
+        "scale the commands to duty or clip them as the ESC does"
+    )
+
+
+def _rotor_speed(log: FlightLog, fail) -> None:
+    if log.rotor_speed is None:
+        return
+    speed = np.where(np.isnan(log.rotor_speed), 0.0, log.rotor_speed)
+    if (speed < 0).any():
+        row, motor = np.unravel_index(int(np.argmax(speed < 0)), speed.shape)
+        fail(
+            f"omega{motor + 1} is negative in {_at(log, int(row))}; rotor speeds are magnitudes in rad/s, drop the sign"
+        )
+    if speed.max() <= _ROTOR_SPEED_LIMIT:
+        return
+    # The median tells a wrong unit from a few bad packets.
+    turning = speed[speed > 0]
+    if np.median(turning) > _ROTOR_SPEED_LIMIT:
+        unit, factor = ("rpm", "2 pi / 60") if np.median(turning) < 4e4 else ("electrical rpm", "2 pi / 360 (12 poles)")
+        fail(f"omega1..omega4 have a median of {np.median(turning):.0f}, which looks like {unit}; multiply by {factor}")
+    row, motor = np.unravel_index(int(np.argmax(speed)), speed.shape)
+    fail(
+        f"omega{motor + 1} is {speed[row, motor]:.0f} rad/s in {_at(log, int(row))}, faster than any rotor turns; "
+        "leave invalid samples empty (NaN)"
+    )

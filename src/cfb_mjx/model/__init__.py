@@ -1,0 +1,41 @@
+"""The simulated drone: rotors, bodies, delay, effects and rollouts."""
+
+from cfb_mjx.model.bodies import Body, RigidBody
+from cfb_mjx.model.delay import DelayLine
+from cfb_mjx.model.effects import CATALOGUE, Condition, Effect, ParasiticDrag, Wrench
+from cfb_mjx.model.quadrotor import Quadrotor, step
+from cfb_mjx.model.rollout import in_chunks, rollout, rollout_final
+from cfb_mjx.model.rotors import hover_command, hover_rotor_speed, rotor_speed_history, thrust, torque
+from cfb_mjx.model.state import State
+
+__all__ = [
+    "CATALOGUE",
+    "Body",
+    "Condition",
+    "DelayLine",
+    "Effect",
+    "MjxBody",
+    "ParasiticDrag",
+    "Quadrotor",
+    "RigidBody",
+    "State",
+    "Wrench",
+    "hover_command",
+    "hover_rotor_speed",
+    "in_chunks",
+    "rollout",
+    "rollout_final",
+    "rotor_speed_history",
+    "step",
+    "thrust",
+    "torque",
+]
+
+
+def __getattr__(name: str):
+    # MuJoCo takes a second to import; the closed-form body does not need it.
+    if name == "MjxBody":
+        from cfb_mjx.model.mjx_body import MjxBody
+
+        return MjxBody
+    raise AttributeError(f"module 'cfb_mjx.model' has no attribute {name!r}")

@@ -1,0 +1,62 @@
+"""The closed-form rigid body, and the interface both bodies share.
+
+A body turns a wrench into accelerations; the integrators in `cfb_mjx.model.integrate` serve every body.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import equinox as eqx
+
+from cfb_mjx.model.effects.base import Wrench
+from cfb_mjx.model.state import Components
+from cfb_mjx.model.vector import Vec, rotate
+from cfb_mjx.parameters.parameters import Parameters
+
+
+class Body(Protocol):
+    """What carries the rotors: static (hashable, no arrays); its constants come with every call."""
+
+    name: str
+
+    def prepare(self, parameters: Parameters) -> object:
+        """Quantities computed once per rollout."""
+
+    def accelerations(self, prepared, state: Components, wrench: Wrench) -> tuple[Vec, Vec]:
+        """Acceleration of the centre of gravity (world, m/s^2) and angular acceleration (body, rad/s^2).
+
+        ``wrench`` is about the centre of gravity, body axes.
+        """
+
+
+class _Prepared(eqx.Module):
+    inverse_mass: object
+    gravity: object
+    inertia: Vec
+    inverse_inertia: Vec
+
+
+class RigidBody:
+    """Newton-Euler in closed form (paper eqs. 1-4), without ground: what stands on nothing falls."""
+
+    name = "rigid"
+
+    def prepare(self, parameters: Parameters) -> _Prepared:
+        inertia = Vec.unstack(parameters.inertia)
+        return _Prepared(1 / parameters.mass, parameters.gravity, inertia, inertia.map(lambda x: 1 / x))
+
+    def accelerations(self, prepared: _Prepared, state: Components, wrench: Wrench) -> tuple[Vec, Vec]:
+        omega = state.body_rate
+        angular = (wrench.torque - omega.cross(prepared.inertia * omega)) * prepared.inverse_inertia
+        x, y, z = rotate(state.quaternion, wrench.force * prepared.inverse_mass)
+        return Vec(x, y, z - prepared.gravity), angular
+
+    def __eq__(self, other) -> bool:
+        return type(other) is RigidBody
+
+    def __hash__(self) -> int:
+        return hash(RigidBody)
+
+    def __repr__(self) -> str:
+        return "RigidBody()"

@@ -1,0 +1,148 @@
+"""The body inside MuJoCo XLA: the paper's simulator, with floor contact when asked for."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+from mujoco.mjx._src import smooth
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import shipped
+from cfb_mjx.model.effects.base import Wrench
+from cfb_mjx.model.state import Components
+from cfb_mjx.model.vector import Vec, rotate
+from cfb_mjx.parameters.parameters import Parameters
+
+BODY_NAME = "cfb"
+_NOT_NEEDED = (
+    mujoco.mjtDisableBit.mjDSBL_EQUALITY
+    | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
+    | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    | mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    | mujoco.mjtDisableBit.mjDSBL_SENSOR
+    | mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+)
+
+
+class _Prepared(eqx.Module):
+    model: mjx.Model
+    data: mjx.Data
+
+
+class MjxBody:
+    """Accelerations from MJX on an MJCF whose only moving body is a free joint named ``cfb``.
+
+    ``floor=False`` leaves contacts out (several times faster; same free flight). Contact forces are solved anew at
+    every call from the state alone (no warm start), so that a simulation remains a pure function of the 17 numbers.
+    Reverse-mode derivatives exist without the floor only; the contact solver has none.
+
+    Args:
+        floor: let the drone touch the floor and other static geometry of the MJCF.
+        mjcf: path of another MJCF; static geometry may be added freely to a copy of ``assets/cfb.xml``.
+
+    Raises:
+        CfbError: the MJCF cannot be compiled, lacks the free joint, or has other moving bodies.
+    """
+
+    name = "mjx"
+
+    def __init__(self, floor: bool = True, mjcf: str | Path | None = None):
+        self.floor = bool(floor)
+        self.mjcf = None if mjcf is None else str(mjcf)
+        self.mujoco_model = _compile(self.mjcf, self.floor)
+
+    def prepare(self, parameters: Parameters) -> _Prepared:
+        template = _on_device(self.mjcf, self.floor, jax.config.jax_enable_x64)
+        model, data = jax.tree.map(jnp.asarray, template)
+        body = _body_index(self.mujoco_model)
+        mass, inertia = parameters.mass, Vec.unstack(parameters.inertia).stack()
+        center = Vec.unstack(parameters.center_of_gravity).stack()
+        moving = jnp.asarray(self.mujoco_model.geom_bodyid == body)
+        # Contact softness is scaled with the inverse inertia of the free body: exact, not a fresh mj_setConst.
+        inverse = jnp.stack([1 / mass, jnp.mean(1 / inertia)])
+        model = model.replace(
+            opt=model.opt.replace(gravity=jnp.stack([jnp.zeros_like(mass), jnp.zeros_like(mass), -parameters.gravity])),
+            body_mass=model.body_mass.at[body].set(mass),
+            body_subtreemass=model.body_subtreemass.at[body].set(mass).at[0].set(mass),
+            body_inertia=model.body_inertia.at[body].set(inertia),
+            # The body frame sits at the centre of gravity (see Components), so it is the geoms that move.
+            geom_pos=jnp.where(moving[:, None], model.geom_pos - center, model.geom_pos),
+            body_invweight0=model.body_invweight0.at[body].set(inverse),
+        )
+        return _Prepared(model, data)
+
+    def accelerations(self, prepared: _Prepared, state: Components, wrench: Wrench) -> tuple[Vec, Vec]:
+        model = prepared.model
+        data = prepared.data.replace(
+            qpos=jnp.concatenate([state.position.stack(), state.quaternion.stack()]),
+            qvel=jnp.concatenate([state.velocity.stack(), state.body_rate.stack()]),
+            # Generalised force of a free joint: world force at its origin, torque in body axes.
+            qfrc_applied=jnp.concatenate([rotate(state.quaternion, wrench.force).stack(), wrench.torque.stack()]),
+        )
+        if self.floor:
+            acceleration = mjx.forward(model, data).qacc
+        else:
+            acceleration = _contact_free(model, data)
+        return Vec.unstack(acceleration[:3]), Vec.unstack(acceleration[3:])
+
+    def __eq__(self, other) -> bool:
+        return type(other) is MjxBody and (self.floor, self.mjcf) == (other.floor, other.mjcf)
+
+    def __hash__(self) -> int:
+        return hash((MjxBody, self.floor, self.mjcf))
+
+    def __repr__(self) -> str:
+        return f"MjxBody(floor={self.floor}, mjcf={self.mjcf!r})"
+
+
+def _contact_free(model: mjx.Model, data: mjx.Data) -> jax.Array:
+    """qacc of `mjx.forward` where nothing touches: its stages without geoms, sites, actuators and constraints."""
+    data = mjx.kinematics(model, data)
+    data = mjx.com_pos(model, data)
+    data = mjx.crb(model, data)
+    data = mjx.factor_m(model, data)
+    data = mjx.com_vel(model, data)
+    data = mjx.rne(model, data)
+    return smooth.solve_m(model, data, data.qfrc_applied - data.qfrc_bias)
+
+
+@functools.lru_cache(maxsize=8)
+def _compile(mjcf: str | None, floor: bool) -> mujoco.MjModel:
+    path = str(shipped("assets", "cfb.xml")) if mjcf is None else mjcf
+    try:
+        specification = mujoco.MjSpec.from_file(path)
+        specification.option.disableflags |= int(_NOT_NEEDED)
+        if not floor:
+            specification.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+            # Geoms cost kinematics even where they cannot touch.
+            for geom in list(specification.geoms):
+                specification.delete(geom)
+        for site in list(specification.sites):
+            specification.delete(site)
+        model = specification.compile()
+    except ValueError as error:
+        raise CfbError(f"{path}: MuJoCo cannot compile this MJCF ({' '.join(str(error).split())}).") from None
+    joints = model.njnt == 1 and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
+    if not joints or model.body(model.jnt_bodyid[0]).name != BODY_NAME:
+        raise CfbError(f"{path}: must have exactly one joint, the free joint of a body named '{BODY_NAME}'.")
+    return model
+
+
+def _body_index(model: mujoco.MjModel) -> int:
+    return int(model.jnt_bodyid[0])
+
+
+@functools.lru_cache(maxsize=8)
+def _on_device(mjcf: str | None, floor: bool, x64: bool):
+    # Host copies: a cached device array made during one trace must not leak into another.
+    with jax.ensure_compile_time_eval():
+        model = mjx.put_model(_compile(mjcf, floor), impl="jax")
+        data = mjx.make_data(model)
+    return jax.tree.map(np.asarray, (model, data))

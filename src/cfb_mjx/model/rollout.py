@@ -1,0 +1,102 @@
+"""Many steps, many drones: rollouts under a command sequence, and chunked execution of a batch too big for memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, prepare
+from cfb_mjx.model.state import Components, State, stack, unstack
+from cfb_mjx.model.vector import Vec
+
+
+def rollout(
+    model: Quadrotor, state: State, commands: Float[Array, "steps 4"], *, hold: int = 1, every: int = 1
+) -> State:
+    """Fly ``commands``; return the states after every ``every``-th command.
+
+    Use ``jax.vmap`` over any of model, state and commands; differentiable in all three. A batch of commands is read
+    fastest with the batch axis last: ``jax.vmap(rollout, in_axes=(None, 0, 2))`` on commands (steps, 4, drones).
+
+    Args:
+        model: the drone.
+        state: initial state, without batch axes.
+        commands: (steps, 4) in [0, 1].
+        hold: number of steps of ``model.dt`` for which each command is held.
+        every: keep one state in so many commands; ``steps`` must be a multiple of it.
+
+    Returns:
+        `State` with leading axis ``steps // every``; the first entry is the state after ``every`` commands.
+    """
+    steps = commands.shape[0]
+    if hold < 1 or every < 1 or steps % every:
+        raise ValueError(f"{steps} commands, each held {hold} steps, cannot be kept every {every}")
+    prepared = prepare(model)
+
+    def fly(components, rows):
+        components = _fly(prepared, components, rows, hold)
+        return components, components
+
+    rows = jax.tree.map(lambda x: x.reshape(steps // every, every), Vec.unstack(commands))
+    _, kept = jax.lax.scan(fly, _carry(prepared, state, commands), rows)
+    return stack(kept, prepared.parameters.center_of_gravity)
+
+
+def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 4"], *, hold: int = 1) -> State:
+    """As `rollout`, but return the last state only; the trajectory is never stored."""
+    prepared = prepare(model)
+    final = _fly(prepared, _carry(prepared, state, commands), Vec.unstack(commands), hold)
+    return stack(final, prepared.parameters.center_of_gravity)
+
+
+def _fly(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Components:
+    def one(components, row):
+        if hold == 1:
+            return advance(prepared, components, row), None
+        # scan, not fori_loop: it has a reverse mode.
+        return jax.lax.scan(lambda c, _: (advance(prepared, c, row), None), components, length=hold)[0], None
+
+    if rows[0].shape[0] == 1:
+        return one(components, jax.tree.map(lambda x: x[0], rows))[0]
+    return jax.lax.scan(one, components, rows)[0]
+
+
+def _carry(prepared: Prepared, state: State, commands: Array):
+    # One precision throughout, or the scan's carry would change type.
+    dtype = jnp.result_type(prepared.parameters.mass, state.position, commands)
+    components = unstack(state, prepared.parameters.center_of_gravity)
+    return jax.tree.map(lambda x: x.astype(dtype), components)
+
+
+def in_chunks(function: Callable, size: int, *arguments, progress: Callable[[int, int], None] | None = None):
+    """``vmap(function)(*arguments)`` executed ``size`` examples at a time, results gathered in host memory.
+
+    Let ``function`` draw what is large (parameters, commands) from a PRNG key and return what is small: then a million
+    rollouts need the memory of ``size``.
+
+    Args:
+        function: maps one example (one entry of each argument) to a pytree of arrays.
+        size: examples per compiled call.
+        arguments: pytrees with a common leading axis.
+        progress: called with (done, total) after each chunk.
+
+    Returns:
+        The pytree of stacked results as numpy arrays.
+    """
+    total = len(jax.tree.leaves(arguments)[0])
+    batched = eqx.filter_jit(jax.vmap(function))
+    pieces = []
+    for start in range(0, total, size):
+        stop = min(start + size, total)
+        # The last chunk repeats its final example, so that it reuses the compiled program.
+        index = np.minimum(np.arange(start, start + min(size, total)), stop - 1)
+        result = batched(*jax.tree.map(lambda x, i=index: x[i], arguments))
+        pieces.append(jax.tree.map(lambda x, n=stop - start: np.asarray(x[:n]), result))
+        if progress is not None:
+            progress(stop, total)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)

@@ -1,0 +1,215 @@
+"""Motors and rotors: exact first-order speed, cubic thrust and torque, reactive torque (paper eqs. 5-10).
+
+Within one step the command is held, so each rotor speed is an exponential known in closed form. A `RotorPath` holds
+what the body needs of it: speeds and accelerations at the start, middle and end, and the step means of thrust and
+torque. Nothing here depends on the body that carries the rotors.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.parameters import Parameters
+
+YAW_SIGNS = (-1.0, 1.0, -1.0, 1.0)
+"""Sign of each rotor's reaction on the body about +z (paper eq. 7)."""
+POSITION_SIGNS_X = (1.0, -1.0, -1.0, 1.0)
+POSITION_SIGNS_Y = (-1.0, -1.0, 1.0, 1.0)
+"""Rotor positions in units of l/2: front-right, back-right, back-left, front-left."""
+
+
+class RotorLoads(eqx.Module):
+    """Loads of the four rotors on the body."""
+
+    thrust: Vec
+    """Along body +z, N."""
+    torque: Vec
+    """Aerodynamic torque magnitude, N m (the body feels it with `YAW_SIGNS`)."""
+    rate: Vec
+    """Rate of rotor speed Omega', rad/s^2; times J_m it is the reactive torque."""
+
+
+class RotorPath(eqx.Module):
+    """Rotor speeds and their rates over one step (start, middle, end), and the step's mean loads."""
+
+    start: Vec
+    middle: Vec
+    end: Vec
+    rate_start: Vec
+    rate_middle: Vec
+    rate_end: Vec
+    mean: RotorLoads
+
+
+class RotorConstants(eqx.Module):
+    """What every step of one length needs of the parameters, computed once outside the time loop."""
+
+    decay: Vec
+    decay_half: Vec
+    mean1: Vec
+    mean2: Vec
+    mean3: Vec
+    """(1/dt) * integral of exp(-n t / T) over the step, n = 1, 2, 3."""
+    inverse_dt: Array
+    inverse_time_constant: Vec
+    gain: Vec
+    offset: Vec
+    thrust: Polynomial
+    torque: Polynomial
+
+
+class Polynomial(eqx.Module):
+    """c3 x^3 + c2 x^2 + c1 x of each rotor's speed x [rad/s], with the scaling by sigma and the rotor's factor inside."""
+
+    c3: Vec
+    c2: Vec
+    c1: Vec
+
+    def __call__(self, x: Vec) -> Vec:
+        return x * (self.c1 + x * (self.c2 + x * self.c3))
+
+    def mean(self, a: Vec, b: Vec, constants: RotorConstants) -> Vec:
+        """Mean over the step along x = a + b exp(-t/T): the Taylor series about a ends after three terms."""
+        first = self.c1 + a * (2 * self.c2 + a * (3 * self.c3))
+        second = self.c2 + 3 * (a * self.c3)
+        return self(a) + b * (
+            constants.mean1 * first + b * (constants.mean2 * second + b * (constants.mean3 * self.c3))
+        )
+
+
+def polynomial(coefficients: Array | Vec, scale: Array | Vec, sigma: Array) -> Polynomial:
+    """Polynomial in rotor speed from the coefficients of s^3, s^2, s with s = Omega / sigma."""
+    c3, c2, c1 = Vec.unstack(coefficients)
+    scale = Vec.unstack(scale)
+    return Polynomial(scale * (c3 / sigma**3), scale * (c2 / sigma**2), scale * (c1 / sigma))
+
+
+def prepare(parameters: Parameters, dt: Float[Array, ""] | float) -> RotorConstants:
+    """Constants of the exact zero-order-hold solution of eq. (5) over ``dt`` seconds (``dt`` = 0 is allowed)."""
+    time_constant = Vec.unstack(parameters.motor_time_constant)
+    x = dt / time_constant.stack()
+    safe = jnp.where(x > 0, x, 1.0)
+
+    def mean_of_exponential(n: int) -> Vec:
+        return Vec.unstack(jnp.where(x > 0, -jnp.expm1(-n * safe) / (n * safe), 1.0))
+
+    dt = jnp.asarray(dt, x.dtype)
+    return RotorConstants(
+        decay=Vec.unstack(jnp.exp(-x)),
+        decay_half=Vec.unstack(jnp.exp(-x / 2)),
+        mean1=mean_of_exponential(1),
+        mean2=mean_of_exponential(2),
+        mean3=mean_of_exponential(3),
+        inverse_dt=jnp.where(dt > 0, 1 / jnp.where(dt > 0, dt, 1.0), 0.0),
+        inverse_time_constant=time_constant.map(lambda t: 1 / t),
+        gain=Vec.unstack(parameters.motor_gain),
+        offset=Vec.unstack(parameters.motor_speed_offset),
+        thrust=polynomial(parameters.thrust_polynomial, parameters.thrust_scale, parameters.reference_rotor_speed),
+        torque=polynomial(parameters.torque_polynomial, parameters.torque_scale, parameters.reference_rotor_speed),
+    )
+
+
+def steady_speed(constants: RotorConstants, command: Vec) -> Vec:
+    """Rotor speed that a command held forever leads to, rad/s: K u (plus the offset of an affine map)."""
+    return constants.gain * command + constants.offset
+
+
+def path_to(constants: RotorConstants, speed: Vec, target: Vec) -> RotorPath:
+    """Exact path of eq. (5) from ``speed`` towards the steady speed ``target``, both rad/s."""
+    away = speed - target
+    end = target + away * constants.decay
+    rate = -(away * constants.inverse_time_constant)
+    return RotorPath(
+        start=speed,
+        middle=target + away * constants.decay_half,
+        end=end,
+        rate_start=rate,
+        rate_middle=rate * constants.decay_half,
+        rate_end=rate * constants.decay,
+        # The clamp acts on the mean; where a rotor crosses 229 rad/s within a step this is off by less than 0.8 mN.
+        mean=RotorLoads(
+            constants.thrust.mean(target, away, constants).map(_at_least_zero),
+            constants.torque.mean(target, away, constants),
+            (end - speed) * constants.inverse_dt,
+        ),
+    )
+
+
+def path_between(constants: RotorConstants, start: Vec, end: Vec) -> RotorPath:
+    """Straight path between two measured rotor speeds, rad/s."""
+    middle = 0.5 * (start + end)
+    slope = (end - start) * constants.inverse_dt
+
+    def simpson(curve: Polynomial) -> Vec:
+        # Exact: along a straight path the loads are cubic in time.
+        return (curve(start) + 4 * curve(middle) + curve(end)) / 6
+
+    mean = RotorLoads(simpson(constants.thrust).map(_at_least_zero), simpson(constants.torque), slope)
+    return RotorPath(start, middle, end, slope, slope, slope, mean)
+
+
+def loads_at(constants: RotorConstants, speed: Vec, rate: Vec) -> RotorLoads:
+    """Loads at one instant, from rotor speeds [rad/s] and their rates [rad/s^2]."""
+    return RotorLoads(constants.thrust(speed).map(_at_least_zero), constants.torque(speed), rate)
+
+
+def thrust(parameters: Parameters, speed: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Thrust of each rotor [eq. 8], N. Clamped at zero: the cubic is negative below 229 rad/s, a fit artefact."""
+    curve = polynomial(parameters.thrust_polynomial, parameters.thrust_scale, parameters.reference_rotor_speed)
+    return curve(Vec.unstack(speed)).map(_at_least_zero).stack()
+
+
+def torque(parameters: Parameters, speed: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Aerodynamic torque magnitude of each rotor [eq. 9], N m."""
+    curve = polynomial(parameters.torque_polynomial, parameters.torque_scale, parameters.reference_rotor_speed)
+    return curve(Vec.unstack(speed)).stack()
+
+
+def _at_least_zero(x):
+    return jnp.maximum(x, 0.0)
+
+
+def hover_rotor_speed(parameters: Parameters) -> Float[Array, "4"]:
+    """Rotor speeds whose thrusts carry the weight without roll or pitch torque, rad/s.
+
+    The centre-of-gravity offset shifts load between the rotors. Newton on the cubic from full speed: the thrust curve
+    is convex where it matters, so it converges without a bracket; differentiable.
+    """
+    half = parameters.rotor_spacing / 2
+    cog = parameters.center_of_gravity
+    share = 0.25 * (1 + cog[0] * jnp.array(POSITION_SIGNS_X) / half + cog[1] * jnp.array(POSITION_SIGNS_Y) / half)
+    wanted = parameters.mass * parameters.gravity * share / parameters.thrust_scale
+    c3, c2, c1 = parameters.thrust_polynomial
+
+    def newton(_, s):
+        return s - (((c3 * s + c2) * s + c1) * s - wanted) / ((3 * c3 * s + 2 * c2) * s + c1)
+
+    s = jax.lax.fori_loop(0, 12, newton, jnp.full(4, 0.8, wanted.dtype))
+    return s * parameters.reference_rotor_speed
+
+
+def hover_command(parameters: Parameters) -> Float[Array, "4"]:
+    """Commands that hold the hover of `hover_rotor_speed`; outside [0, 1] if the drone cannot hover."""
+    return (hover_rotor_speed(parameters) - parameters.motor_speed_offset) / parameters.motor_gain
+
+
+def rotor_speed_history(
+    parameters: Parameters, times: Float[Array, "n"], commands: Float[Array, "n 4"]
+) -> Float[Array, "n 4"]:
+    """Rotor speeds at ``times`` [s] from logged commands held between rows, steady at the first row, rad/s.
+
+    This is how rotor speed is estimated where a log does not hold it (``docs/evaluation.md``).
+    """
+    targets = parameters.motor_gain * jnp.clip(commands, 0.0, 1.0) + parameters.motor_speed_offset
+
+    def advance(speed, row):
+        dt, target = row
+        speed = target + (speed - target) * jnp.exp(-dt / parameters.motor_time_constant)
+        return speed, speed
+
+    _, later = jax.lax.scan(advance, targets[0], (jnp.diff(times), targets[:-1]))
+    return jnp.concatenate([targets[:1], later])

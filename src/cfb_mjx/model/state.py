@@ -1,0 +1,78 @@
+"""The 17 numbers that describe the drone at one instant."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.vector import Vec, rotate
+
+
+class State(eqx.Module):
+    """State of the drone, or a batch or trajectory of states (leading axes). Conventions: ``docs/conventions.md``."""
+
+    position: Float[Array, "*batch 3"]
+    """Centre of the rotors, world, m."""
+    velocity: Float[Array, "*batch 3"]
+    """Velocity of that point, world, m/s."""
+    quaternion: Float[Array, "*batch 4"]
+    """Attitude [w, x, y, z], body to world, unit norm."""
+    body_rate: Float[Array, "*batch 3"]
+    """Angular velocity, body axes, rad/s."""
+    rotor_speed: Float[Array, "*batch 4"]
+    """Rotor speeds, motors M1..M4, rad/s."""
+
+    @classmethod
+    def at_rest(cls, position=(0.0, 0.0, 0.0), rotor_speed=0.0) -> State:
+        """Level, motionless, at ``position`` [m] with the given rotor speed(s) [rad/s]."""
+        dtype = jnp.result_type(float)
+        return cls(
+            position=jnp.asarray(position, dtype),
+            velocity=jnp.zeros(3, dtype),
+            quaternion=jnp.array([1.0, 0.0, 0.0, 0.0], dtype),
+            body_rate=jnp.zeros(3, dtype),
+            rotor_speed=jnp.broadcast_to(jnp.asarray(rotor_speed, dtype), (4,)),
+        )
+
+
+class Components(eqx.Module):
+    """What the simulator computes in: one array per number, and the centre of gravity as the point that moves.
+
+    Newton's law holds for the centre of gravity without coupling to the rotation, which makes a step shorter and its
+    first-order errors smaller than integrating the rotors' centre; both bodies do so. `State` speaks of the rotors'
+    centre, the point that logs report.
+    """
+
+    position: Vec
+    """Centre of gravity, world, m."""
+    velocity: Vec
+    """Its velocity, world, m/s."""
+    quaternion: Vec
+    body_rate: Vec
+    rotor_speed: Vec
+
+
+def unstack(state: State, center_of_gravity: Vec) -> Components:
+    """State to components, given the centre of gravity in body axes [m]."""
+    quaternion, body_rate = Vec.unstack(state.quaternion), Vec.unstack(state.body_rate)
+    return Components(
+        Vec.unstack(state.position) + rotate(quaternion, center_of_gravity),
+        Vec.unstack(state.velocity) + rotate(quaternion, body_rate.cross(center_of_gravity)),
+        quaternion,
+        body_rate,
+        Vec.unstack(state.rotor_speed),
+    )
+
+
+def stack(state: Components, center_of_gravity: Vec) -> State:
+    """Components to state; the inverse of `unstack`."""
+    lever = rotate(state.quaternion, center_of_gravity)
+    lever_velocity = rotate(state.quaternion, state.body_rate.cross(center_of_gravity))
+    return State(
+        (state.position - lever).stack(),
+        (state.velocity - lever_velocity).stack(),
+        state.quaternion.stack(),
+        state.body_rate.stack(),
+        state.rotor_speed.stack(),
+    )

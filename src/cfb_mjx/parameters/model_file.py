@@ -1,0 +1,231 @@
+"""Model files: YAML in and out, every constant with its unit, its source and, where known, its uncertainty."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import shipped, write_text
+from cfb_mjx.parameters.parameters import DEFAULTS, SPECIFICATIONS, Parameters
+
+FORMAT = "cfb_mjx model 1"
+_TOP_LEVEL = {"format", "name", "description", "parameters", "effects", "provenance"}
+_ENTRY_KEYS = {"value", "unit", "std", "source"}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One constant: ``value`` in SI, its ``source`` and its standard deviation ``std`` (None where unknown)."""
+
+    value: np.ndarray
+    source: str
+    std: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """What a model YAML holds. ``effects`` are kept as read; `cfb_mjx.model.Quadrotor.from_file` builds them."""
+
+    name: str
+    entries: Mapping[str, Entry]
+    description: str = ""
+    effects: tuple[Mapping[str, Any], ...] = ()
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def parameters(self) -> Parameters:
+        """The parameter pytree, in the current default float precision."""
+        return Parameters(**{key: self.entries[key].value for key in SPECIFICATIONS})
+
+    def with_values(self, source: str, **values: float | list | np.ndarray) -> ModelFile:
+        """A copy with some constants replaced, each carrying ``source``.
+
+        Raises:
+            CfbError: an unknown name or an impossible value.
+        """
+        where = f"model {self.name}"
+        changed = {k: Entry(_value(k, v, where), source) for k, v in values.items() if _known(k, where)}
+        return replace(self, entries={**self.entries, **changed})
+
+
+def preset_names() -> list[str]:
+    """Names of the parameter sets shipped with the library."""
+    return sorted(path.stem for path in shipped("configs", "parameters").glob("*.yaml"))
+
+
+def load_model_file(name_or_path: str | Path) -> ModelFile:
+    """Read a shipped preset (by name) or a model YAML (by path).
+
+    Raises:
+        CfbError: no such preset or file, broken YAML, unknown or missing keys, missing or wrong units,
+            impossible values; the message names the file and the key.
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        if str(name_or_path) not in preset_names():
+            raise CfbError(
+                f"{name_or_path}: no such model; give a YAML file or one of the presets {', '.join(preset_names())}."
+            )
+        path = shipped("configs", "parameters", f"{name_or_path}.yaml")
+    document = load_yaml(path)
+    _refuse_unknown(document, _TOP_LEVEL, path, "")
+    if document.get("format") != FORMAT:
+        raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
+    raw = document.get("parameters")
+    if not isinstance(raw, dict):
+        raise CfbError(f"{path}: 'parameters' must be a mapping of names to {{value, unit, source}}.")
+    _refuse_unknown(raw, set(SPECIFICATIONS), path, "parameters.")
+    missing = [key for key in SPECIFICATIONS if key not in raw and key not in DEFAULTS]
+    if missing:
+        raise CfbError(f"{path}: missing parameters {', '.join(missing)}; add them with value, unit and source.")
+    entries = {key: _entry(key, raw[key], path) for key in raw}
+    for key in SPECIFICATIONS:
+        if key not in entries:
+            entries[key] = Entry(_value(key, DEFAULTS[key], path), "neutral value (not given in the file)")
+    effects = document.get("effects") or []
+    if not isinstance(effects, list) or not all(isinstance(e, dict) and "name" in e for e in effects):
+        raise CfbError(f"{path}: 'effects' must be a list of mappings, each with a 'name'.")
+    return ModelFile(
+        name=str(document.get("name", path.stem)),
+        description=str(document.get("description", "")),
+        entries=entries,
+        effects=tuple(effects),
+        provenance=document.get("provenance") or {},
+    )
+
+
+def save_model_file(model: ModelFile, path: str | Path) -> None:
+    """Write a model YAML atomically. What is written can be read back by `load_model_file` without loss.
+
+    Raises:
+        CfbError: the file cannot be written.
+    """
+    parameters = {}
+    for key, entry in model.entries.items():
+        item = {"value": _plain(entry.value), "unit": SPECIFICATIONS[key].unit, "source": entry.source}
+        if entry.std is not None:
+            item["std"] = _plain(entry.std)
+        parameters[key] = item
+    document = {"format": FORMAT, "name": model.name, "description": model.description, "parameters": parameters}
+    if model.effects:
+        document["effects"] = [dict(e) for e in model.effects]
+    if model.provenance:
+        document["provenance"] = dict(model.provenance)
+    write_text(path, yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=110))
+
+
+def load_yaml(path: str | Path) -> dict:
+    """Read a YAML mapping.
+
+    Raises:
+        CfbError: the file is missing, unreadable, not YAML, not a mapping, or has a key twice.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise CfbError(f"{path}: no such file.") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CfbError(f"{path}: cannot be read as text ({error}).") from None
+    try:
+        document = yaml.load(text, Loader=_StrictLoader)
+    except yaml.YAMLError as error:
+        raise CfbError(f"{path}: is not valid YAML ({' '.join(str(error).split())}).") from None
+    if not isinstance(document, dict):
+        raise CfbError(f"{path}: must hold a YAML mapping, found {type(document).__name__}.")
+    return document
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Refuses repeated keys, and reads 3.3e-5 as a number (YAML 1.1 wants 3.3e-05 with a dot and a sign)."""
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if isinstance(key, list | dict):
+                raise yaml.YAMLError("a key must be plain text")
+            if key in seen:
+                raise yaml.YAMLError(f"the key '{key}' appears twice (line {key_node.start_mark.line + 1})")
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def _entry(key: str, raw: Any, path: Path) -> Entry:
+    if not isinstance(raw, dict):
+        raise CfbError(f"{path}: parameters.{key} must be a mapping with value, unit and source.")
+    _refuse_unknown(raw, _ENTRY_KEYS, path, f"parameters.{key}.")
+    unit = SPECIFICATIONS[key].unit
+    if "unit" not in raw:
+        raise CfbError(f"{path}: parameters.{key} has no unit; write 'unit: {unit}'.")
+    if _same_unit(raw["unit"]) != _same_unit(unit):
+        raise CfbError(f"{path}: parameters.{key} is in '{raw['unit']}'; convert it to '{unit}'.")
+    if "value" not in raw:
+        raise CfbError(f"{path}: parameters.{key} has no value.")
+    if not raw.get("source"):
+        raise CfbError(f"{path}: parameters.{key} has no source; say where the number comes from.")
+    std = None if raw.get("std") is None else _numbers(key, raw["std"], path, "std")
+    if std is not None and np.any(std < 0):
+        raise CfbError(f"{path}: parameters.{key}.std must be zero or positive.")
+    return Entry(_value(key, raw["value"], path), str(raw["source"]), std)
+
+
+def _value(key: str, raw: Any, path) -> np.ndarray:
+    value = _numbers(key, raw, path, "value")
+    specification = SPECIFICATIONS[key]
+    if not specification.holds(value):
+        raise CfbError(f"{path}: parameters.{key} = {_plain(value)} must {_be(specification.condition)}.")
+    return value
+
+
+def _be(condition: str) -> str:
+    return condition if condition.startswith("give") else f"be {condition}"
+
+
+def _numbers(key: str, raw: Any, path, what: str) -> np.ndarray:
+    shape = SPECIFICATIONS[key].shape
+    flat = raw.tolist() if isinstance(raw, np.ndarray | np.generic) else raw
+    numbers = flat if isinstance(flat, list | tuple) else [flat]
+    if not all(isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x) for x in numbers):
+        raise CfbError(f"{path}: parameters.{key}.{what} = {flat!r} must be a finite number or a list of them.")
+    value = np.asarray(flat, dtype=np.float64)
+    if value.shape not in ((), shape):
+        raise CfbError(
+            f"{path}: parameters.{key}.{what} must have {shape[0] if shape else 1} number(s), found {flat!r}."
+        )
+    return np.broadcast_to(value, shape).copy()
+
+
+def _known(key: str, where: str) -> bool:
+    _refuse_unknown({key: None}, set(SPECIFICATIONS), where, "")
+    return True
+
+
+def _refuse_unknown(found: Mapping, known: set[str], path, prefix: str) -> None:
+    unknown = [str(key) for key in found if key not in known]
+    if unknown:
+        names = ", ".join(f"'{prefix}{key}'" for key in unknown)
+        raise CfbError(f"{path}: unknown key {names}; known here are {', '.join(sorted(known))}.")
+
+
+def _same_unit(unit: Any) -> str:
+    text = str(unit).replace("²", "^2").replace("·", " ").replace("*", " ").replace("**", "^")
+    return " ".join(text.split())
+
+
+def _plain(value: np.ndarray):
+    # 4 equal motors read better as one number.
+    if value.ndim == 1 and value.size == 4 and np.all(value == value[0]):
+        return float(value[0])
+    return value.tolist()

@@ -1,0 +1,122 @@
+"""Domain randomisation: ranges read from YAML, and parameter draws as a pure function of a PRNG key."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import shipped
+from cfb_mjx.parameters.model_file import _refuse_unknown, load_yaml
+from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters
+
+FORMAT = "cfb_mjx randomisation 1"
+
+
+@dataclass(frozen=True)
+class Range:
+    """Half-width of a uniform draw about the nominal value.
+
+    ``relative`` widths are fractions of the nominal value; others carry the parameter's unit. ``shared`` draws one
+    number for all motors or axes of the parameter.
+    """
+
+    half_width: tuple[float, ...]
+    relative: bool
+    shared: bool
+
+
+@dataclass(frozen=True)
+class Randomisation:
+    """Which parameters vary, and how far at magnitude 1. Hashable, so it can be closed over under ``jit``."""
+
+    name: str
+    ranges: tuple[tuple[str, Range], ...]
+
+
+def load_randomisation(name_or_path: str | Path = "paper") -> Randomisation:
+    """Read a shipped randomisation (``paper``, ``identification``) or a YAML file.
+
+    Raises:
+        CfbError: no such file, unknown keys or impossible widths, named.
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        path = shipped("configs", "randomisation", f"{name_or_path}.yaml")
+    document = load_yaml(path)
+    _refuse_unknown(document, {"format", "name", "description", "ranges"}, path, "")
+    if document.get("format") != FORMAT:
+        raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
+    ranges = document.get("ranges") or {}
+    if not isinstance(ranges, dict):
+        raise CfbError(f"{path}: 'ranges' must be a mapping of parameter names.")
+    _refuse_unknown(ranges, set(SPECIFICATIONS), path, "ranges.")
+    return Randomisation(
+        name=str(document.get("name", path.stem)),
+        ranges=tuple((key, _range(key, raw, path)) for key, raw in ranges.items()),
+    )
+
+
+def _range(key: str, raw, path: Path) -> Range:
+    if not isinstance(raw, dict):
+        raise CfbError(f"{path}: ranges.{key} must be a mapping with half_width and unit.")
+    _refuse_unknown(raw, {"half_width", "unit", "shared", "source"}, path, f"ranges.{key}.")
+    unit = SPECIFICATIONS[key].unit
+    if raw.get("unit") not in ("relative", unit):
+        raise CfbError(f"{path}: ranges.{key}.unit must be 'relative' or '{unit}', found {raw.get('unit')!r}.")
+    width = raw.get("half_width")
+    widths = width if isinstance(width, list) else [width]
+    size = SPECIFICATIONS[key].shape
+    if not all(isinstance(w, int | float) and not isinstance(w, bool) and 0 <= w < float("inf") for w in widths):
+        raise CfbError(f"{path}: ranges.{key}.half_width = {width!r} must be zero or positive.")
+    if len(widths) not in (1, *size):
+        raise CfbError(f"{path}: ranges.{key}.half_width must have 1 or {size[0] if size else 1} numbers.")
+    relative = raw["unit"] == "relative"
+    if relative and max(widths) >= 1:
+        raise CfbError(f"{path}: ranges.{key}.half_width = {width!r} relative would allow values of the wrong sign.")
+    return Range(tuple(float(w) for w in widths), relative, bool(raw.get("shared", False)))
+
+
+def sample_parameters(
+    key: PRNGKeyArray,
+    nominal: Parameters,
+    randomisation: Randomisation | None = None,
+    magnitude: float | Float[Array, ""] = 1.0,
+) -> Parameters:
+    """Draw one drone. ``vmap`` over ``key`` for many; the same key gives the same drone.
+
+    Args:
+        key: PRNG key.
+        nominal: parameters about which to draw (without batch axes).
+        randomisation: ranges; the paper's (section V) by default.
+        magnitude: factor on every range; 0 returns the nominal drone. May be traced.
+
+    A drawn inertia that no rigid body can have (the paper's independent +-20 % allows some) has its largest moment
+    reduced to the sum of the other two.
+    """
+    randomisation = load_randomisation() if randomisation is None else randomisation
+    drawn = {}
+    for name, spread in randomisation.ranges:
+        value = getattr(nominal, name)
+        shape = () if spread.shared else value.shape
+        # fold_in by position in the specification table: adding a range never changes the draws of the others.
+        order = list(SPECIFICATIONS).index(name)
+        unit = jax.random.uniform(jax.random.fold_in(key, order), shape, value.dtype, -1.0, 1.0)
+        width = jnp.asarray(spread.half_width if len(spread.half_width) > 1 else spread.half_width[0], value.dtype)
+        change = magnitude * width * unit
+        drawn[name] = value * (1 + change) if spread.relative else value + change
+    if "inertia" in drawn:
+        drawn["inertia"] = _physical(drawn["inertia"])
+    return eqx.tree_at(
+        lambda p: [getattr(p, name) for name in drawn], nominal, [jnp.asarray(v) for v in drawn.values()]
+    )
+
+
+def _physical(inertia: Float[Array, "3"]) -> Float[Array, "3"]:
+    others = jnp.sum(inertia) - inertia
+    return jnp.minimum(inertia, others)
