@@ -3,7 +3,7 @@
 The rooms of the library are imported on first use, so that ``import cfb_mjx`` costs milliseconds::
 
     import cfb_mjx
-    model = cfb_mjx.model.Quadrotor.from_preset("cfb-guards")
+    model = cfb_mjx.model.Quadrotor.from_file("cfb-guards")
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 _ROOMS = ("logs", "model", "parameters", "sysid", "view")
-__all__ = ["__version__", *_ROOMS]
+__all__ = ["__version__", "logs", "model", "parameters", "sysid", "view"]
 
 if TYPE_CHECKING:
     from cfb_mjx import logs, model, parameters, sysid, view

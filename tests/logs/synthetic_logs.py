@@ -66,7 +66,8 @@ def make_flight(
         return np.column_stack([np.interp(when, t, column) for column in values.T])
 
     position, velocity, q, omega, force = (at(s, rows) for s in signals[:5])
-    command, speed = (at(s, rows + motor_lead) for s in signals[5:])
+    # A row's command holds until the next row: the one value that stands for a changing command is that of the middle.
+    command, speed = at(signals[5], rows + motor_lead + 0.5 / rate), at(signals[6], rows + motor_lead)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
 
     def noisy(x, size):

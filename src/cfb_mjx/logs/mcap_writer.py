@@ -80,7 +80,7 @@ def _channel(writer, topic: mcap_schema.Topic, log: FlightLog):
     channel, message = _register(writer, topic.topic)
     if topic.frame:
         message.frame_id = topic.frame
-    rows = getattr(log, topic.field).reshape(len(log), -1).tolist()
+    rows = getattr(log, topic.field).reshape(len(log), len(topic.columns)).tolist()
 
     def fill(row: int) -> None:
         for column, value in zip(topic.columns, rows[row], strict=True):

@@ -186,7 +186,7 @@ def write_tabular(log: FlightLog, path: str | os.PathLike) -> None:
     for field, names in (COLUMNS | OPTIONAL_COLUMNS).items():
         values = getattr(log, field)
         if values is not None:
-            columns |= dict(zip(names, np.reshape(values, (len(log), -1)).T, strict=True))
+            columns |= dict(zip(names, np.reshape(values, (len(log), len(names))).T, strict=True))
     # from_pandas=True turns NaN (an invalid rotor speed) into a missing value, the only kind csv can carry.
     table = pa.table({c: pa.array(np.ascontiguousarray(v), from_pandas=True) for c, v in columns.items()})
     with replacing(path) as temporary:

@@ -63,7 +63,7 @@ class RotorConstants(eqx.Module):
 
 
 class Polynomial(eqx.Module):
-    """c3 x^3 + c2 x^2 + c1 x of each rotor's speed x [rad/s], with the scaling by sigma and the rotor's factor inside."""
+    """c3 x^3 + c2 x^2 + c1 x of each rotor's speed x [rad/s]; sigma and the rotor's own factor are folded in."""
 
     c3: Vec
     c2: Vec

@@ -1,0 +1,6 @@
+"""Judging and fitting the model on flights."""
+
+from cfb_mjx.sysid.evaluation import HORIZONS, Evaluation, evaluate
+from cfb_mjx.sysid.windows import Windows, find_windows
+
+__all__ = ["HORIZONS", "Evaluation", "Windows", "evaluate", "find_windows"]

@@ -1,0 +1,153 @@
+"""Prediction windows of a log: where they start, what goes in, what must come out (evaluation protocol, DESIGN 5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+
+FIRST_START = 0.6
+START_SPACING = 0.2
+REACH = 0.53
+"""A window starts while t0 + REACH lies inside the log, s."""
+GAP_BEFORE, GAP_AFTER = 0.3, 0.5
+LONGEST_STEP = 0.0051
+"""Rows further apart are integrated in equal substeps of at most this, s."""
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Everything a batch of predictions needs; W windows, S steps (the shorter windows end in steps of length 0).
+
+    Attributes:
+        start: (W,) window starts t0, s of log time.
+        position, velocity, quaternion, body_rate: (W, 3 or 4) measured state at t0.
+        row: (W,) row at or before t0.
+        step: (W, S) integration steps, s; they end at every row and every horizon.
+        command: (W, S, 4) command held during each step.
+        rotor_speed: (W, S + 1, 4) measured rotor speed at the step boundaries, rad/s, NaN where not measured.
+        at: (W, H) index of the state (0 = initial) at each horizon.
+        true_position, true_velocity, true_quaternion, true_body_rate: (W, H, 3 or 4) what was measured there.
+    """
+
+    start: np.ndarray
+    position: np.ndarray
+    velocity: np.ndarray
+    quaternion: np.ndarray
+    body_rate: np.ndarray
+    row: np.ndarray
+    step: np.ndarray
+    command: np.ndarray
+    rotor_speed: np.ndarray
+    at: np.ndarray
+    true_position: np.ndarray
+    true_velocity: np.ndarray
+    true_quaternion: np.ndarray
+    true_body_rate: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.start)
+
+
+def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float) -> np.ndarray:
+    """Window starts the protocol allows: (W,) s of log time, possibly none."""
+    first, last = log.time[0], log.time[-1]
+    count = int(np.floor((last - first - REACH - FIRST_START) / START_SPACING + 1e-9)) + 1
+    starts = first + FIRST_START + START_SPACING * np.arange(max(count, 0))
+    gaps = np.asarray(log.gaps(), dtype=int)
+    begin, end = log.time[gaps], log.time[gaps + 1] if len(gaps) else log.time[gaps]
+    instants = np.array([0.0, delay, *horizons, *(h + delay for h in horizons)])
+    allowed = [
+        not np.any((begin >= t0 - GAP_BEFORE) & (begin <= t0 + GAP_AFTER))
+        and not np.any((begin[:, None] < t0 + instants) & (t0 + instants < end[:, None]))
+        for t0 in starts
+    ]
+    return starts[np.array(allowed, dtype=bool)]
+
+
+def find_windows(log: FlightLog, horizons: tuple[float, ...], delay: float) -> Windows:
+    """Cut a log into prediction windows.
+
+    Args:
+        log: the flight.
+        horizons: prediction horizons, s, ascending.
+        delay: age of pose and velocity in a row, s; gyro and commands are taken as current.
+    """
+    starts = find_starts(log, horizons, delay)
+    plans = [_plan(log.time, t0, horizons) for t0 in starts]
+    width = max((len(edges) - 1 for edges, _, _ in plans), default=0)
+    count, reach = len(starts), len(horizons)
+    step, at = np.zeros((count, width)), np.zeros((count, reach), dtype=int)
+    command = np.zeros((count, width, 4))
+    boundary = np.zeros((count, width + 1))
+    for i, (edges, rows, where) in enumerate(plans):
+        n = len(edges) - 1
+        step[i, :n] = np.diff(edges)
+        command[i, :n], command[i, n:] = log.command[rows], log.command[rows[-1]]
+        boundary[i, : n + 1], boundary[i, n + 1 :] = edges, edges[-1]
+        at[i] = where
+    ends = starts[:, None] + np.asarray(horizons)
+    return Windows(
+        start=starts,
+        position=_at(log.time, log.position, starts + delay),
+        velocity=_at(log.time, log.velocity, starts + delay),
+        quaternion=_unit(_at(log.time, log.quaternion, starts + delay)),
+        body_rate=_at(log.time, log.body_rate, starts),
+        row=_row(log.time, starts),
+        step=step,
+        command=command,
+        rotor_speed=_measured_rotor_speed(log, boundary),
+        at=at,
+        true_position=_at(log.time, log.position, ends + delay),
+        true_velocity=_at(log.time, log.velocity, ends + delay),
+        true_quaternion=_unit(_at(log.time, log.quaternion, ends + delay)),
+        true_body_rate=_at(log.time, log.body_rate, ends),
+    )
+
+
+def _plan(time: np.ndarray, t0: float, horizons: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Step boundaries from t0 to the last horizon, the row whose command holds in each step, horizon indices."""
+    ends = t0 + np.asarray(horizons)
+    inside = time[(time > t0 + 1e-9) & (time < ends[-1] - 1e-9)]
+    marks = np.unique(np.concatenate([[t0], inside, ends]))
+    # Two marks that differ by rounding only are one.
+    marks = marks[np.concatenate([[True], np.diff(marks) > 1e-9])]
+    pieces = np.ceil(np.diff(marks) / LONGEST_STEP - 1e-9).astype(int)
+    edges = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(marks[:-1], marks[1:], pieces, strict=True)]
+    edges = np.concatenate([*edges, marks[-1:]])
+    return edges, _row(time, edges[:-1]), np.searchsorted(edges, ends - 2e-9)
+
+
+def _row(time: np.ndarray, instants: np.ndarray) -> np.ndarray:
+    return np.clip(np.searchsorted(time, instants + 1e-9, side="right") - 1, 0, len(time) - 1)
+
+
+def _at(time: np.ndarray, values: np.ndarray, instants: np.ndarray) -> np.ndarray:
+    """Linear interpolation of (n, k) values at instants of any shape."""
+    columns = [np.interp(instants, time, values[:, k]) for k in range(values.shape[1])]
+    return np.stack(columns, axis=-1)
+
+
+def _unit(quaternion: np.ndarray) -> np.ndarray:
+    return quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True)
+
+
+def _measured_rotor_speed(log: FlightLog, instants: np.ndarray) -> np.ndarray:
+    """Linear between rows; NaN where more than two rows in a row lack a valid reading."""
+    if log.rotor_speed is None:
+        return np.full((*instants.shape, 4), np.nan)
+    out = np.empty((*instants.shape, 4))
+    for motor in range(4):
+        valid = np.isfinite(log.rotor_speed[:, motor])
+        if not valid.any():
+            out[..., motor] = np.nan
+            continue
+        time, speed = log.time[valid], log.rotor_speed[valid, motor]
+        out[..., motor] = np.interp(instants, time, speed)
+        after = np.clip(np.searchsorted(time, instants), 1, len(time) - 1)
+        outside = (instants < time[0]) | (instants > time[-1])
+        far = time[after] - time[after - 1] > 3 * log.nominal_interval + 0.5e-3
+        out[..., motor][outside | far] = np.nan
+    return out
