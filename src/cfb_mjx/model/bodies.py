@@ -5,7 +5,7 @@ A body turns a wrench into accelerations; the integrators in `cfb_mjx.model.inte
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 
@@ -15,6 +15,7 @@ from cfb_mjx.model.vector import Vec, rotate
 from cfb_mjx.parameters.parameters import Parameters
 
 
+@runtime_checkable
 class Body(Protocol):
     """What carries the rotors: static (hashable, no arrays); its constants come with every call."""
 

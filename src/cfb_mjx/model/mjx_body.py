@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import io
 from pathlib import Path
 
 import equinox as eqx
@@ -10,8 +12,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
-from mujoco.mjx._src import smooth
+
+with contextlib.redirect_stdout(io.StringIO()):
+    # MJX announces on standard output that its optional warp backend is missing.
+    from mujoco import mjx
+    from mujoco.mjx._src import smooth
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped

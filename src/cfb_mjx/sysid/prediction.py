@@ -15,6 +15,7 @@ from cfb_mjx.model.state import State, stack, unstack
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.sysid.windows import Windows
 
+WINDOWS_PER_BLOCK, STEPS_PER_BLOCK = 128, 160
 _STATE = ("position", "velocity", "quaternion", "body_rate")
 
 
@@ -28,23 +29,25 @@ def predict(model: Quadrotor, windows: Windows, rotor_speed: np.ndarray | None =
             measured rotor speeds instead.
 
     Returns:
-        `State` of numpy arrays (W, H, ...).
+        `State` of numpy arrays (W, H, ...); W must not be 0.
     """
     measured = rotor_speed is None
     start = windows.rotor_speed[:, 0] if measured else rotor_speed
     inputs = windows.rotor_speed[:, 1:] if measured else windows.command
     state = State(*(getattr(windows, name) for name in _STATE), rotor_speed=start)
-    batch = (state, windows.step, inputs)
-    # Rounding shapes up lets logs of different length share one compiled program.
     count, width = windows.step.shape
-    steps = 32 * -(-max(width, 1) // 32)
-    rows = 64 * 2 ** max(0, int(np.ceil(np.log2(max(count, 1) / 64))))
-    state, step, inputs = jax.tree.map(lambda x: _pad(x, rows), batch)
-    step = np.pad(step, ((0, 0), (0, steps - width)))
+    # Blocks of one shape, whatever the logs: the program is compiled once and then comes from the cache.
+    steps = STEPS_PER_BLOCK * -(-max(width, 1) // STEPS_PER_BLOCK)
+    step = np.pad(windows.step, ((0, 0), (0, steps - width)))
     inputs = np.pad(inputs, ((0, 0), (0, steps - width), (0, 0)), mode="edge")
-    trajectory = _predict_batch(model, jax.tree.map(jnp.asarray, state), step, inputs, measured)
-    index = np.arange(count)[:, None], windows.at
-    return jax.tree.map(lambda x: np.asarray(x)[index], trajectory)
+    found = []
+    for first in range(0, count, WINDOWS_PER_BLOCK):
+        chosen = slice(first, min(first + WINDOWS_PER_BLOCK, count))
+        padded = [jax.tree.map(lambda x, c=chosen: _pad(x[c], WINDOWS_PER_BLOCK), x) for x in (state, step, inputs)]
+        trajectory = _predict_batch(model, *padded, measured)
+        index = np.arange(chosen.stop - first)[:, None], windows.at[chosen]
+        found.append(jax.tree.map(lambda x, i=index: np.asarray(x)[i], trajectory))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
 
 
 @eqx.filter_jit
@@ -71,7 +74,7 @@ def _predict_one(model: Quadrotor, state: State, step, inputs, measured: bool) -
 
 def rotor_speed_at_start(model: Quadrotor, time: np.ndarray, command: np.ndarray, windows: Windows) -> np.ndarray:
     """Rotor speeds at the window starts from the motor model driven by the commands since the log began, (W, 4)."""
-    rows = 1024 * -(-len(time) // 1024)
+    rows = 8192 * -(-len(time) // 8192)
     # Padding repeats the last row with zero time between: it changes nothing before it.
     history = _history(model, _pad(time, rows), _pad(command, rows))
     speed = np.asarray(history)[windows.row]

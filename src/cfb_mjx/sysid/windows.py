@@ -13,6 +13,9 @@ START_SPACING = 0.2
 REACH = 0.53
 """A window starts while t0 + REACH lies inside the log, s."""
 GAP_BEFORE, GAP_AFTER = 0.3, 0.5
+COMMAND_TICK = 0.001
+"""A command takes effect at the first tick at or after its row: the firmware's main loop runs at 1 kHz, and time stamps
+are no finer than that. It matters for jittered time stamps only (up to 3 % of an error)."""
 LONGEST_STEP = 0.0051
 """Rows further apart are integrated in equal substeps of at most this, s."""
 
@@ -53,15 +56,17 @@ class Windows:
 
 def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float) -> np.ndarray:
     """Window starts the protocol allows: (W,) s of log time, possibly none."""
-    first, last = log.time[0], log.time[-1]
-    count = int(np.floor((last - first - REACH - FIRST_START) / START_SPACING + 1e-9)) + 1
-    starts = first + FIRST_START + START_SPACING * np.arange(max(count, 0))
+    # Logs count from zero even when their first sample comes a little later; others are taken from their first row.
+    origin = 0.0 if 0 <= log.time[0] < START_SPACING else log.time[0]
+    count = int(np.floor((log.time[-1] - origin - REACH - FIRST_START) / START_SPACING + 1e-9)) + 1
+    starts = origin + FIRST_START + START_SPACING * np.arange(max(count, 0))
     gaps = np.asarray(log.gaps(), dtype=int)
     begin, end = log.time[gaps], log.time[gaps + 1] if len(gaps) else log.time[gaps]
     instants = np.array([0.0, delay, *horizons, *(h + delay for h in horizons)])
     allowed = [
         not np.any((begin >= t0 - GAP_BEFORE) & (begin <= t0 + GAP_AFTER))
-        and not np.any((begin[:, None] < t0 + instants) & (t0 + instants < end[:, None]))
+        # The edges of a gap count as covered: a reading there would rest on rounding.
+        and not np.any((begin[:, None] < t0 + instants + 1e-6) & (t0 + instants - 1e-6 < end[:, None]))
         for t0 in starts
     ]
     return starts[np.array(allowed, dtype=bool)]
@@ -109,6 +114,7 @@ def find_windows(log: FlightLog, horizons: tuple[float, ...], delay: float) -> W
 
 def _plan(time: np.ndarray, t0: float, horizons: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Step boundaries from t0 to the last horizon, the row whose command holds in each step, horizon indices."""
+    time = np.ceil(time / COMMAND_TICK - 1e-6) * COMMAND_TICK
     ends = t0 + np.asarray(horizons)
     inside = time[(time > t0 + 1e-9) & (time < ends[-1] - 1e-9)]
     marks = np.unique(np.concatenate([[t0], inside, ends]))

@@ -1,0 +1,54 @@
+# Two commands do everything on a machine that has Python 3.11 or newer and pip:
+#   make demo   the main job      make test   the tests
+# PYTHON=python3.12 chooses another Python, VENV=dir another place for the virtual environment.
+
+VENV ?= .venv
+PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13; do \
+  "$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo "$$p"; break; }; done)
+BIN = $(VENV)/bin
+INSTALLED = $(VENV)/.installed
+
+.PHONY: demo test lint bench accuracy logs clean help
+
+help:
+	@echo "make demo      set up and run the main job; the page is out/demo/index.html"
+	@echo "make test      set up and run the tests"
+	@echo "make bench     measure speed beside crazyflow, write docs/performance.md"
+	@echo "make accuracy  measure the integrators, write docs/accuracy.md"
+	@echo "make logs      generate the shipped flight logs anew"
+
+demo: $(INSTALLED)
+	$(BIN)/cfb demo -o out/demo
+
+test: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+bench: $(INSTALLED) .venv-peers/.installed
+	$(BIN)/cfb bench --peer-python .venv-peers/bin/python --json benchmarks/results.json --markdown docs/performance.md
+
+accuracy: $(INSTALLED)
+	$(BIN)/python scripts/accuracy.py
+
+logs: $(INSTALLED)
+	$(BIN)/python scripts/make_flight_logs.py
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer found; install one or say PYTHON=/path/to/python3.11."; exit 1; }
+	@if command -v uv >/dev/null 2>&1; then \
+	  uv venv --quiet --allow-existing --python "$(PYTHON)" $(VENV) && \
+	  uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[test]'; \
+	else \
+	  "$(PYTHON)" -m venv $(VENV) && \
+	  $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'; \
+	fi
+	@touch $@
+
+.venv-peers/.installed:
+	"$(PYTHON)" -m venv .venv-peers
+	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check 'crazyflow==0.4.0'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) .venv-peers out dist

@@ -1,0 +1,81 @@
+"""The ``cfb`` command."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+
+from cfb_mjx import __version__
+from cfb_mjx.errors import CfbError
+
+SUMMARY = {
+    "import": "convert a flight log to MCAP",
+    "evaluate": "measure how well a model predicts flights, open loop",
+    "bench": "measure throughput, compile time and memory",
+    "demo": "evaluate a flight, fly 4096 randomised drones, write a page",
+    "version": "print versions",
+}
+"""Kept apart from the commands themselves: help and typing errors answer without loading anything."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point. Exit status: 0 done, 1 a fault in the library, 2 bad input, 130 interrupted."""
+    # Ctrl-C must reach Python even where the caller's shell started us with it ignored (scripts, make -j).
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and sys.stdin is not None and sys.stdin.isatty():
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    # Programs from the compile cache make XLA log an error about tuning hints it takes for processor features; real
+    # errors reach Python as exceptions. Set here, for this process only, because jaxlib reads it when it loads.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    try:
+        status = _dispatch(sys.argv[1:] if arguments is None else arguments)
+        sys.stdout.flush()
+    except CfbError as error:
+        return _fail(str(error), 2)
+    except KeyboardInterrupt:
+        return _fail("interrupted; earlier results are as they were.", 130)
+    except BrokenPipeError:
+        # The reader of our output has gone (`cfb ... | head`); say nothing, and nothing at exit either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EACCES, errno.EROFS):
+            raise
+        return _fail(f"{error.filename or 'output'}: {error.strerror}; earlier results are as they were.", 2)
+    except MemoryError:
+        return _fail("out of memory; use fewer drones or shorter logs.", 2)
+    return status
+
+
+def _dispatch(arguments: list[str]) -> int:
+    name = arguments[0] if arguments else "--help"
+    if name in ("-h", "--help", "help"):
+        print(_help())
+        return 0 if arguments else 2
+    if name in ("-V", "--version"):
+        print(f"cfb_mjx {__version__}")
+        return 0
+    if name not in SUMMARY:
+        raise CfbError(f"there is no command {name!r}; the commands are {', '.join(SUMMARY)}.")
+    from cfb_mjx.cli.commands import run
+
+    try:
+        run(name, arguments[1:])
+    except SystemExit as stop:  # the parser has already explained itself
+        return stop.code if isinstance(stop.code, int) else 2
+    return 0
+
+
+def _help() -> str:
+    width = max(map(len, SUMMARY))
+    rows = "\n".join(f"  {name:<{width}}  {text}" for name, text in SUMMARY.items())
+    return (
+        f"usage: cfb COMMAND ...\n\nCrazyflie Brushless: simulate, identify, train. cfb_mjx {__version__}\n\n"
+        f"commands:\n{rows}\n\n'cfb COMMAND --help' explains a command."
+    )
+
+
+def _fail(message: str, status: int) -> int:
+    print(f"cfb: {message}", file=sys.stderr)
+    return status

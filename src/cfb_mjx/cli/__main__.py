@@ -1,0 +1,7 @@
+"""``python -m cfb_mjx.cli``."""
+
+import sys
+
+from cfb_mjx.cli import main
+
+sys.exit(main())

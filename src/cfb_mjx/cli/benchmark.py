@@ -1,0 +1,174 @@
+"""``cfb bench``: throughput beside the peers, from one run on one machine."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import jax
+
+from cfb_mjx.cli import workloads
+from cfb_mjx.cli.runtime import environment
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import write_json, write_text
+
+PEER_STEPS = 500
+
+
+class Peer:
+    """A crazyflow process that times one run per request, so that its runs can alternate with ours."""
+
+    name = "crazyflow"
+
+    def __init__(self, python: Path, drones: int):
+        script = Path(__file__).with_name("peers") / "crazyflow_peer.py"
+        try:
+            self.process = subprocess.Popen(
+                [str(python), str(script), str(drones)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+            )
+        except OSError as error:
+            raise CfbError(f"--peer-python {python}: cannot be run ({error.strerror}).") from None
+        answer = self.process.stdout.readline().split()
+        if len(answer) != 3 or answer[0] != "ready":
+            last = (self.process.communicate()[1].strip().splitlines() or ["no output"])[-1]
+            raise CfbError(f"--peer-python {python}: crazyflow does not run there ({last}).")
+        self.version, self.compile_s, self.drones = answer[1], float(answer[2]), drones
+
+    def seconds(self) -> float:
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+        return float(self.process.stdout.readline())
+
+    def close(self) -> None:
+        self.process.stdin.close()
+        self.process.wait()
+        self.process.stdout.close()
+        self.process.stderr.close()
+
+
+def run_bench(drones: list[int], json: Path | None, markdown: Path | None, peer_python: Path | None, quick: bool):
+    """Measure, print, write.
+
+    Raises:
+        CfbError: impossible batch sizes, no such peer, outputs that cannot be written.
+    """
+    if not drones or min(drones) < 1:
+        raise CfbError("--drones must be whole numbers from 1.")
+    for output in (json, markdown):
+        if output is not None and not output.parent.is_dir():
+            raise CfbError(f"{output}: the folder {output.parent} does not exist; create it first.")
+    # A program from the cache would make compile time look like nothing.
+    jax.config.update("jax_enable_compilation_cache", False)
+    repetitions = 2 if quick else 7
+    rows, peers = [], []
+    print(f"{'what':<20}{'body':<12}{'drones':>7}{'steps/s':>12}{'compile s':>11}{'memory MB':>11}")
+    for count in drones:
+        group = [workloads.rollout(count), workloads.rollout_randomised(count)]
+        peer = Peer(peer_python, count) if peer_python is not None else None
+        group += [peer] if peer else []
+        times = _alternate(group, repetitions)
+        if not quick:
+            slow = [workloads.rollout(count, "mjx"), workloads.rollout(count, "mjx-floor"), workloads.stock_mjx(count)]
+            if count <= 8192:
+                slow.append(workloads.rollout_gradient(count))
+            times += _alternate(slow, 3)
+            group += slow
+        for item, seconds in zip(group, times, strict=True):
+            if item is peer:
+                peers.append(
+                    {"name": item.name, "version": item.version, "drones": count}
+                    | {"steps_per_s": count * PEER_STEPS / seconds, "compile_s": item.compile_s}
+                )
+                print(
+                    f"{'rollout':<20}{item.name:<12}{count:>7}{peers[-1]['steps_per_s']:>12.3g}{item.compile_s:>11.2f}"
+                )
+                continue
+            row = {"what": item.what, "body": item.body, "drones": count, "steps_per_s": count * item.steps / seconds}
+            row |= {"compile_s": item.compile_s, "peak_mb": item.peak_mb}
+            rows.append(row)
+            print(
+                f"{item.what:<20}{item.body:<12}{count:>7}{row['steps_per_s']:>12.3g}"
+                f"{item.compile_s:>11.2f}{item.peak_mb:>11.1f}",
+                flush=True,
+            )
+        if peer:
+            peer.close()
+    result = {"rows": rows, "peers": peers, "environment": environment()}
+    for line in ratios(result):
+        print(line)
+    if json is not None:
+        write_json(json, result)
+    if markdown is not None:
+        write_text(markdown, page(result))
+
+
+def _alternate(items: list, repetitions: int) -> list[float]:
+    """Best time of each; the runs take turns, so that a busy moment of the machine hits all of them."""
+    best = [float("inf")] * len(items)
+    for _ in range(repetitions):
+        for index, item in enumerate(items):
+            best[index] = min(best[index], item.seconds())
+    return best
+
+
+def _speed(result: dict, what: str, body: str, drones: int) -> float | None:
+    for row in result["rows"]:
+        if (row["what"], row["body"], row["drones"]) == (what, body, drones):
+            return row["steps_per_s"]
+    return None
+
+
+def ratios(result: dict) -> list[str]:
+    """Side-by-side sentences for every batch size."""
+    lines = []
+    for drones in sorted({row["drones"] for row in result["rows"]}):
+        ours = _speed(result, "rollout", "rigid", drones)
+        for peer in result["peers"]:
+            if peer["drones"] == drones:
+                lines.append(
+                    f"{drones} drones: closed form {ours / peer['steps_per_s']:.1f} x {peer['name']} {peer['version']}"
+                )
+        free, floor, stock = (_speed(result, "rollout", b, drones) for b in ("mjx", "mjx-floor", "mjx-stock"))
+        if free and floor and stock:
+            lines.append(f"{drones} drones: MJX without floor {free / stock:.2f} x stock mjx.step")
+            lines.append(f"{drones} drones: MJX without floor {free / floor:.1f} x MJX with floor")
+    return lines
+
+
+def page(result: dict) -> str:
+    """The results as a Markdown page."""
+    facts = ", ".join(f"{name} {value}" for name, value in result["environment"].items())
+    table = ["| what | body | drones | steps/s | compile, s | memory, MB |", "|---|---|---:|---:|---:|---:|"]
+    for row in result["rows"]:
+        table.append(
+            f"| {row['what']} | {row['body']} | {row['drones']} | {row['steps_per_s']:.3g} "
+            f"| {row['compile_s']:.2f} | {row['peak_mb']:.1f} |"
+        )
+    for peer in result["peers"]:
+        name = f"{peer['name']} {peer['version']}"
+        table.append(f"| rollout | {name} | {peer['drones']} | {peer['steps_per_s']:.3g} | {peer['compile_s']:.2f} | |")
+    gpu = "" if jax.default_backend() != "cpu" else "GPU: not measured (none on this machine).\n"
+    comparison = "\n".join(f"- {line}" for line in ratios(result))
+    return f"""# Performance
+
+Written by `make bench` (`cfb bench --peer-python ... --markdown docs/performance.md`); do not edit.
+
+{facts}
+
+Steps per second of all drones together, float32; the best of several runs that take turns with the peer's.
+`rollout`: open loop, {workloads.STEPS} steps of 4 ms (MJX fewer), one command held per drone, final state only.
+`rollout_randomised`: the same, every drone with its own parameters. `rollout_gradient`: reverse-mode gradient of a
+100-step rollout with respect to all parameters. Bodies: `rigid` closed form; `mjx` MuJoCo XLA without contact;
+`mjx-floor` with floor contact; `mjx-stock` plain `mjx.step` on the same MJCF without contact. crazyflow runs
+first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`. Memory is the compiled program's
+arguments, results and temporaries.
+
+{comparison}
+
+{gpu}
+{chr(10).join(table)}
+"""

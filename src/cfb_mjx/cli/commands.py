@@ -1,0 +1,111 @@
+"""What each subcommand takes. Kept light: ``cfb --help`` must not load jax, so the work is imported when it starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from cfb_mjx.errors import CfbError
+
+Output = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")]
+Model = Annotated[str, tyro.conf.arg(metavar="MODEL")]
+
+
+def import_log(
+    source: tyro.conf.Positional[Path],
+    output: Output,
+    format: Literal["auto", "tabular", "idsia", "mcap"] = "auto",
+    motor_shift: float | None = None,
+) -> None:
+    """Convert a flight log to MCAP.
+
+    Checks units, frames and time stamps on the way, and says what it changed.
+
+    Args:
+        source: log to read (parquet, csv or MCAP).
+        output: MCAP file to write.
+        format: layout of the source; auto looks at its content.
+        motor_shift: s by which to delay the motor columns of an IDSIA log instead of the estimated shift.
+    """
+    from cfb_mjx.cli.importing import run_import
+
+    run_import(source, output, None if format == "auto" else format, motor_shift)
+
+
+def evaluate(
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")],
+    model: Model = "cfb-guards",
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    figure: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+) -> None:
+    """Measure how well a model predicts flights, open loop, at 50, 100, 200 and 500 ms.
+
+    Windows start from measured states; the logged commands (and, where measured, the rotor speeds) go in; errors are
+    compared with "hold", which assumes constant velocity and constant body rate.
+
+    Args:
+        logs: flight logs (MCAP, parquet, csv).
+        model: preset (cfb-guards, cfb, cf21b-500) or model YAML.
+        set: parameters to change, for instance mass=0.045.
+        json: write the results here.
+        figure: draw prediction against measurement here (.png, .svg, .pdf).
+    """
+    if not logs:
+        raise CfbError("evaluate needs at least one log; see 'cfb evaluate --help'.")
+    from cfb_mjx.cli.evaluating import run_evaluate
+
+    run_evaluate(list(logs), model, list(set), json, figure)
+
+
+def bench(
+    drones: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N...")] = (1, 64, 1024, 8192, 65536),
+    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    markdown: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    peer_python: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    quick: bool = False,
+) -> None:
+    """Measure throughput: simulation steps per second of every body, compile time and memory.
+
+    Args:
+        drones: batch sizes.
+        json: write the results here.
+        markdown: write the results as a Markdown page here.
+        peer_python: a Python that has crazyflow installed, to measure it side by side.
+        quick: fewer rows and repetitions, for a first look.
+    """
+    from cfb_mjx.cli.benchmark import run_bench
+
+    run_bench(list(drones), json, markdown, peer_python, quick)
+
+
+def demo(output: Output = Path("out/demo"), real: Path | None = None) -> None:
+    """Show the library at work: evaluate a flight, draw it, fly 4096 randomised drones, write a page.
+
+    Args:
+        output: folder to write to.
+        real: folder with real flights in the IDSIA layout (validation/*.parquet).
+    """
+    from cfb_mjx.cli.demo import run_demo
+    from cfb_mjx.cli.runtime import configure_jax
+
+    configure_jax(x64=True)
+    run_demo(output, real)
+
+
+def version() -> None:
+    """Print the versions of the library and of what it computes with."""
+    from cfb_mjx.cli.runtime import environment
+
+    for name, value in environment().items():
+        print(f"{name}: {value}")
+
+
+COMMANDS = {"import": import_log, "evaluate": evaluate, "bench": bench, "demo": demo, "version": version}
+
+
+def run(name: str, arguments: list[str]) -> None:
+    """Parse the arguments of subcommand ``name`` and run it."""
+    tyro.cli(COMMANDS[name], prog=f"cfb {name}", args=arguments)

@@ -1,0 +1,59 @@
+"""``cfb import``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import estimate_command_shift, read_log, write_mcap
+
+
+def run_import(source: Path, output: Path, format: str | None, motor_shift: float | None) -> None:
+    """Convert ``source`` to the MCAP ``output`` and report what was read.
+
+    Raises:
+        CfbError: see `cfb_mjx.logs.read_log`; or the output is not an .mcap, or is the source itself.
+    """
+    if output.suffix != ".mcap":
+        raise CfbError(f"{output}: the output must end in .mcap.")
+    if output.exists() and source.exists() and output.samefile(source):
+        raise CfbError(f"{output}: is the source itself; choose another name.")
+    options = {} if motor_shift is None else {"motor_shift": motor_shift}
+    log = read_log(source, format, **options)
+    alignment = log.metadata.get("alignment")
+    if alignment is None and motor_shift is None:
+        alignment = {**estimate_command_shift(log).report(), "applied": False}
+        log = log.replace(metadata={"alignment": alignment})
+    write_mcap(log, output)
+    gaps = len(log.gaps())
+    rate = 1 / log.nominal_interval
+    print(
+        f"{output}: {len(log.time)} rows, {log.duration:.1f} s at {rate:.0f} Hz, {gaps} gap{'s' if gaps != 1 else ''}"
+    )
+    print(f"  rotor speed {'measured' if log.rotor_speed is not None else 'not measured'}", end="; ")
+    voltage = log.battery_voltage
+    print(
+        f"battery {np.nanmin(voltage):.2f} to {np.nanmax(voltage):.2f} V"
+        if voltage is not None
+        else "no battery voltage"
+    )
+    for key, value in (log.metadata.get("cleaning") or {}).items():
+        if value and (key.startswith("dropped") or key in ("held_rows_kept", "invalid_rotor_speeds")):
+            print(f"  {key.replace('_', ' ')}: {value}")
+    print(f"  {describe_alignment(alignment)}")
+
+
+def describe_alignment(alignment: dict | None) -> str:
+    """One line about the shift between motor columns and gyro."""
+    if not alignment:
+        return "motor columns against gyro: not estimated"
+    if "shift_ms" not in alignment:
+        return f"motor columns delayed by {alignment.get('applied_ms', 0.0):.1f} ms as asked"
+    text = f"motor columns lead the gyro by {alignment['shift_ms']:.1f} +- {alignment['shift_std_ms']:.1f} ms"
+    if not alignment.get("reliable", True):
+        return f"{text} (too little excitation to be sure)"
+    if alignment.get("applied"):
+        return f"{text}; delayed by {alignment['applied_ms']:.1f} ms"
+    return text

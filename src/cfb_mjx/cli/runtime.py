@@ -1,0 +1,70 @@
+"""How the commands run jax: precision, compile cache, versions, progress."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+from datetime import date
+from importlib import metadata
+from pathlib import Path
+
+
+def configure_jax(x64: bool) -> None:
+    """Set precision and the persistent compile cache. Commands call this; importing the library never does.
+
+    The cache lies in the user's cache folder (``XDG_CACHE_HOME`` is honoured); ``JAX_COMPILATION_CACHE_DIR`` overrides
+    it.
+    """
+    import jax
+
+    jax.config.update("jax_enable_x64", x64)
+    # Tensor-core formats round inputs to 10 bits: enough to change a trained policy.
+    jax.config.update("jax_default_matmul_precision", "highest")
+    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "cfb_mjx" / "jax"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            return  # Without a writable home the cache is simply off.
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def environment() -> dict[str, str]:
+    """Date, machine and versions, to stand beside every measured number."""
+    import jax
+
+    versions = {name: metadata.version(name) for name in ("cfb_mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")}
+    return {
+        "date": date.today().isoformat(),
+        "processor": f"{_processor()}, {os.cpu_count()} cores",
+        "device": f"{jax.devices()[0].device_kind} x {jax.device_count()}",
+        "python": platform.python_version(),
+        **versions,
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+class Progress:
+    """One line on standard error, rewritten in place on a terminal and silent elsewhere."""
+
+    def __init__(self, what: str):
+        self.what = what
+        self.live = sys.stderr.isatty()
+
+    def __call__(self, done: int, total: int) -> None:
+        if not self.live:
+            return
+        filled = round(30 * done / max(total, 1))
+        end = "\n" if done >= total else ""
+        print(
+            f"\r{self.what} [{'#' * filled}{'.' * (30 - filled)}] {done}/{total}", end=end, file=sys.stderr, flush=True
+        )

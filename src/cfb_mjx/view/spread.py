@@ -1,0 +1,70 @@
+"""How far randomised drones spread when all receive the same commands."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from cfb_mjx.view import style
+
+BANDS = ((5.0, 95.0, "5 to 95 %", 0.22), (25.0, 75.0, "25 to 75 %", 0.42))
+
+
+def spread_figure(
+    time: np.ndarray,
+    position: np.ndarray,
+    tilt: np.ndarray,
+    path: str | os.PathLike,
+    *,
+    reference: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
+    reference_label: str = "measured",
+    title: str = "",
+) -> None:
+    """Draw quantile bands over many drones.
+
+    Args:
+        time: (T,) s.
+        position: (N, T, 3) m.
+        tilt: (N, T) angle between the body's and the world's z axis, deg.
+        path: file to write, ``.svg``, ``.png`` or ``.pdf``.
+        reference: time (K,), position (K, 3) and tilt (K,) of one flight to compare with, same units.
+        reference_label: what that flight is called in the legend.
+        title: heading.
+
+    Raises:
+        CfbError: an unknown ending, or the file cannot be written.
+    """
+    path = style.check_path(path)
+    panels = [(f"position {axis}", "m", position[..., i]) for i, axis in enumerate(style.AXES)]
+    panels.append(("tilt", "deg", tilt))
+    with style.context():
+        figure = style.new_figure(12.0, 3.7)
+        for index, (axes, (name, unit, values)) in enumerate(
+            zip(figure.subplots(1, 4, sharex=True), panels, strict=True)
+        ):
+            for low, high, label, alpha in BANDS:
+                lower, upper = np.percentile(values, [low, high], axis=0)
+                axes.fill_between(
+                    time, lower, upper, color=style.COLOURS["commands_in"], alpha=alpha, linewidth=0, label=label
+                )
+            axes.plot(time, np.median(values, axis=0), color=style.COLOURS["commands_in"], label="median")
+            if reference is not None:
+                at, measured_position, measured_tilt = reference
+                measured = measured_tilt if index == 3 else measured_position[:, index]
+                axes.plot(at, measured, color=style.MEASURED, linewidth=1.2, linestyle="--", label=reference_label)
+            axes.set_title(name)
+            axes.set_ylabel(f"{unit}")
+            axes.set_xlabel("time, s")
+            axes.margins(x=0)
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        if title:
+            figure.suptitle(title, fontsize=11)
+        style.save(figure, path)
+
+
+def tilt_deg(quaternion: np.ndarray) -> np.ndarray:
+    """Angle between body z and world z, deg, of [w, x, y, z] quaternions (..., 4)."""
+    _, x, y, _ = np.moveaxis(quaternion, -1, 0)
+    # From the sine of the half angle: exact near zero, where arccos of the matrix entry is not.
+    return np.degrees(2 * np.arcsin(np.clip(np.hypot(x, y), 0.0, 1.0)))

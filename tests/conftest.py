@@ -1,0 +1,27 @@
+"""Settings of the whole test session: float64, a compilation cache, and shape checks of the model's annotations."""
+
+from __future__ import annotations
+
+import os
+
+# XLA logs two harmless pages ("prefer-no-gather is not supported on the host machine") for every program it loads from
+# the compilation cache. Has to be set before jax is imported.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+import jax  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
+
+# Float64 so that tests can tell a wrong term from rounding; test_precision.py covers float32.
+jax.config.update("jax_enable_x64", True)
+
+# Annotated shapes and dtypes are checked in tests only. Must run before anything imports these packages.
+install_import_hook(["cfb_mjx.model", "cfb_mjx.parameters"], "beartype.beartype")
+
+
+def pytest_configure(config) -> None:
+    """Keep compiled programs beside pytest's own cache: a second run then spends its time on running."""
+    cache = getattr(config, "cache", None)
+    if cache is None:  # run with -p no:cacheprovider
+        return
+    jax.config.update("jax_compilation_cache_dir", str(cache.mkdir("jax")))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
