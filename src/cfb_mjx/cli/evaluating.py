@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cfb_mjx.cli.importing import describe_alignment
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_json
 from cfb_mjx.logs import FlightLog, estimate_command_shift, read_log
-from cfb_mjx.parameters import ModelFile, load_model_file
+
+if TYPE_CHECKING:
+    from cfb_mjx.parameters import ModelFile
 
 _LABELS = {"commands_in": "commands in", "rotor_speed_in": "rotor speed in", "hold": "hold"}
 _ROWS = (("position", "m"), ("velocity", "mps"), ("attitude", "deg"), ("rate", "radps"))
@@ -25,9 +28,9 @@ def run_evaluate(paths: list[Path], model: str, changes: list[str], json: Path |
     for output in (json, figure):
         if output is not None and not output.parent.is_dir():
             raise CfbError(f"{output}: the folder {output.parent} does not exist; create it first.")
-    described = changed_model(model, changes)
-    logs = [read_log(path) for path in paths]
+    logs = [read_log(path) for path in paths]  # before jax loads: a bad log is refused at once
     configure_jax(x64=True)
+    described = changed_model(model, changes)
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid import evaluate
 
@@ -62,6 +65,8 @@ def changed_model(model: str, changes: list[str]) -> ModelFile:
         except ValueError:
             raise CfbError(f"--set {change}: write NAME=VALUE with a number, or numbers separated by commas.") from None
         values[name] = numbers if len(numbers) > 1 else numbers[0]
+    from cfb_mjx.parameters import load_model_file
+
     described = load_model_file(model)
     return described.with_values("command line", **values) if values else described
 

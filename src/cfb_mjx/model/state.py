@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.vector import Vec, rotate
+
+AnyArray = Array | np.ndarray
 
 
 class State(eqx.Module):
     """State of the drone, or a batch or trajectory of states (leading axes). Conventions: ``docs/conventions.md``."""
 
-    position: Float[Array, "*batch 3"]
+    position: Float[AnyArray, "*batch 3"]
     """Centre of the rotors, world, m."""
-    velocity: Float[Array, "*batch 3"]
+    velocity: Float[AnyArray, "*batch 3"]
     """Velocity of that point, world, m/s."""
-    quaternion: Float[Array, "*batch 4"]
+    quaternion: Float[AnyArray, "*batch 4"]
     """Attitude [w, x, y, z], body to world, unit norm."""
-    body_rate: Float[Array, "*batch 3"]
+    body_rate: Float[AnyArray, "*batch 3"]
     """Angular velocity, body axes, rad/s."""
-    rotor_speed: Float[Array, "*batch 4"]
+    rotor_speed: Float[AnyArray, "*batch 4"]
     """Rotor speeds, motors M1..M4, rad/s."""
 
     @classmethod

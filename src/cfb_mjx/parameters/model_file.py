@@ -82,10 +82,10 @@ def load_model_file(name_or_path: str | Path) -> ModelFile:
     if not isinstance(raw, dict):
         raise CfbError(f"{path}: 'parameters' must be a mapping of names to {{value, unit, source}}.")
     _refuse_unknown(raw, set(SPECIFICATIONS), path, "parameters.")
+    entries = {key: _entry(key, raw[key], path) for key in raw}
     missing = [key for key in SPECIFICATIONS if key not in raw and key not in DEFAULTS]
     if missing:
         raise CfbError(f"{path}: missing parameters {', '.join(missing)}; add them with value, unit and source.")
-    entries = {key: _entry(key, raw[key], path) for key in raw}
     for key in SPECIFICATIONS:
         if key not in entries:
             entries[key] = Entry(_value(key, DEFAULTS[key], path), "neutral value (not given in the file)")

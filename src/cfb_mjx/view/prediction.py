@@ -52,6 +52,7 @@ def prediction_figure(
     path = style.check_path(path)
     chosen = _choose(evaluation, log_name)
     alone = Evaluation((chosen,), evaluation.horizons)
+    results = {v: (alone.metrics(v), alone.intervals(v)) for v in VARIANTS if alone.metrics(v) is not None}
     with style.context():
         figure = style.new_figure(15.0, 9.6)
         grid = figure.add_gridspec(4, 5, width_ratios=[1, 1, 1, 0.04, 0.95])
@@ -65,10 +66,11 @@ def prediction_figure(
                 if row == 3:
                     axes.set_xlabel("time, s")
             axes = figure.add_subplot(grid[row, 4])
-            _draw_error(axes, alone, quantity)
+            _draw_error(axes, results, evaluation.horizons, quantity)
             if row == 3:
                 axes.set_xlabel("horizon, s")
-        _legend(figure, alone)
+        _legend(figure, list(results))
+        figure.align_ylabels()
         name = title or chosen.log.name
         figure.suptitle(
             f"{name}: measurement and {max(evaluation.horizons):g} s open-loop predictions "
@@ -165,9 +167,13 @@ def _draw_component(axes, chosen: LogEvaluation, horizons: tuple[float, ...], qu
             near = np.interp(at[:, 0], time[known], values[known])
             predicted = predicted + 360.0 * np.round((near - predicted[:, 0]) / 360.0)[:, None]
         colour = style.COLOURS[variant]
-        for x, y in zip(at, predicted, strict=True):
-            axes.plot(x, y, color=colour, linewidth=1.3, alpha=0.9, zorder=3)
-            axes.plot(x[1:], y[1:], style.MARKERS[variant], color=colour, markersize=2.8, zorder=4)
+        # One line with breaks draws faster than a line for each window.
+        broken = np.full((len(chain), 1), np.nan)
+        x, y = np.hstack([at, broken]), np.hstack([predicted, broken])
+        axes.plot(x.ravel(), y.ravel(), color=colour, linewidth=1.3, alpha=0.9, zorder=3)
+        axes.plot(
+            at[:, 1:].ravel(), predicted[:, 1:].ravel(), style.MARKERS[variant], color=colour, markersize=2.8, zorder=4
+        )
         axes.plot(
             at[:, 0], predicted[:, 0], "o", markersize=4.2, markerfacecolor="white", markeredgecolor="black", zorder=5
         )
@@ -176,17 +182,13 @@ def _draw_component(axes, chosen: LogEvaluation, horizons: tuple[float, ...], qu
     margin = max(0.35 * (high - low), {"position": 0.05, "velocity": 0.2, "attitude": 3.0, "rate": 0.2}[quantity])
     axes.set_ylim(low - margin, high + margin)
     axes.set_xlim(begin, end)
-    axes.set_ylabel(f"{_COMPONENTS[quantity][column]}, {unit}", labelpad=2)
-    axes.set_title(f"{name} {_COMPONENTS[quantity][column]}" if quantity != "attitude" else _COMPONENTS[quantity][column])
-    axes.yaxis.set_label_coords(-0.13, 0.5)
+    component = _COMPONENTS[quantity][column]
+    axes.set_ylabel(f"{component}, {unit}" if quantity == "attitude" else f"{name} {component}, {unit}")
 
 
-def _draw_error(axes, evaluation: Evaluation, quantity: str) -> None:
-    horizons, unit = evaluation.horizons, QUANTITIES[quantity]
-    for order, variant in enumerate(VARIANTS):
-        values, intervals = evaluation.metrics(variant), evaluation.intervals(variant)
-        if values is None:
-            continue
+def _draw_error(axes, results: dict[str, tuple[dict, dict]], horizons: tuple[float, ...], quantity: str) -> None:
+    unit = QUANTITIES[quantity]
+    for order, (variant, (values, intervals)) in enumerate(results.items()):
         keys = [f"{quantity}_rmse_{unit}@{horizon:g}s" for horizon in horizons]
         rmse = np.array([values[key] for key in keys])
         low, high = np.array([intervals[key] for key in keys]).T
@@ -205,13 +207,12 @@ def _draw_error(axes, evaluation: Evaluation, quantity: str) -> None:
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xticks(horizons, [f"{horizon:g}" for horizon in horizons])
-    axes.minorticks_off()
+    axes.xaxis.minorticks_off()
     name, label = _TITLES[quantity]
-    axes.set_title(f"{name} error")
-    axes.set_ylabel(f"RMS error, {label}")
+    axes.set_ylabel(f"{name} error, {label}")
 
 
-def _legend(figure, evaluation: Evaluation) -> None:
+def _legend(figure, variants: list[str]) -> None:
     from matplotlib.lines import Line2D
 
     handles = [
@@ -220,7 +221,6 @@ def _legend(figure, evaluation: Evaluation) -> None:
     ]
     handles += [
         Line2D([], [], color=style.COLOURS[v], marker=style.MARKERS[v], markersize=4, label=style.LABELS[v])
-        for v in VARIANTS
-        if evaluation.metrics(v) is not None
+        for v in variants
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9.5)

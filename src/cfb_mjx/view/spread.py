@@ -53,8 +53,7 @@ def spread_figure(
                 at, measured_position, measured_tilt = reference
                 measured = measured_tilt if index == 3 else measured_position[:, index]
                 axes.plot(at, measured, color=style.MEASURED, linewidth=1.2, linestyle="--", label=reference_label)
-            axes.set_title(name)
-            axes.set_ylabel(f"{unit}")
+            axes.set_ylabel(f"{name}, {unit}")
             axes.set_xlabel("time, s")
             axes.margins(x=0)
         figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)

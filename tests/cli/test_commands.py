@@ -1,0 +1,87 @@
+"""The commands as scripts call them: results, help, and how light they start."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+KEYS = ("windows", "commands_in", "rotor_speed_in", "hold", "logs")
+
+
+def test_help_names_every_command_and_loads_nothing_heavy(cfb):
+    done = cfb("--help")
+    assert done.returncode == 0
+    for name in ("import", "evaluate", "bench", "demo"):
+        assert name in done.stdout
+    heavy = "{'jax', 'mujoco', 'tyro', 'numpy'}"
+    code = f"import sys, cfb_mjx.cli as c; c.main(['--help']); print(sorted({heavy} & set(sys.modules)))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).endswith("[]\n")
+
+
+def test_import_of_the_package_loads_nothing_heavy():
+    code = "import sys, cfb_mjx; print(sorted({'jax','mujoco','brax','rerun','matplotlib'} & set(sys.modules)))"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\n"
+
+
+@pytest.mark.parametrize("name", ["import", "evaluate", "bench", "demo"])
+def test_every_command_explains_itself(cfb, name):
+    done = cfb(name, "--help")
+    assert done.returncode == 0
+    assert "usage: cfb " + name in done.stdout
+
+
+def test_evaluate_gives_the_same_numbers_from_every_format(cfb, files, tmp_path):
+    found = {}
+    for kind in ("mcap", "parquet", "csv"):
+        done = cfb("evaluate", files / f"flight.{kind}", "--json", tmp_path / f"{kind}.json")
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ""
+        found[kind] = json.loads((tmp_path / f"{kind}.json").read_text())
+    result = found["mcap"]
+    assert set(KEYS) <= set(result)
+    assert set(result["logs"]["flight"]) == {"windows", "commands_in", "rotor_speed_in", "hold"}
+    assert result["rotor_speed_in"] is None
+    assert result["windows"] == 7
+    for quantity, unit in (("position", "m"), ("velocity", "mps"), ("attitude", "deg"), ("rate", "radps")):
+        for statistic in ("rmse", "mean", "median"):
+            for horizon in ("0.05", "0.1", "0.2", "0.5"):
+                key = f"{quantity}_{statistic}_{unit}@{horizon}s"
+                low, high = result["intervals"]["commands_in"][key]
+                assert low <= high
+                assert result["commands_in"][key] == pytest.approx(found["parquet"]["commands_in"][key], rel=1e-9)
+                assert result["commands_in"][key] == pytest.approx(found["csv"]["commands_in"][key], rel=1e-6)
+    assert result["environment"]["jax"]
+
+
+def test_a_changed_parameter_changes_the_prediction(cfb, files, tmp_path):
+    for name, change in (("a", []), ("b", ["--set", "mass=0.05"])):
+        assert cfb("evaluate", files / "flight.mcap", "--json", tmp_path / f"{name}.json", *change).returncode == 0
+    a, b = (json.loads((tmp_path / f"{n}.json").read_text())["commands_in"] for n in "ab")
+    assert b["velocity_rmse_mps@0.5s"] > 1.05 * a["velocity_rmse_mps@0.5s"]
+
+
+def test_evaluate_draws_a_figure(cfb, files, tmp_path):
+    done = cfb("evaluate", files / "flight.mcap", "--figure", tmp_path / "f.png")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_import_reports_and_reads_back(cfb, files, tmp_path):
+    done = cfb("import", files / "flight.csv", "-o", tmp_path / "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert "625 rows" in done.stdout
+    assert cfb("evaluate", tmp_path / "out.mcap").returncode == 0
+
+
+def test_bench_writes_its_rows(cfb, tmp_path):
+    done = cfb("bench", "--drones", "8", "--quick", "--json", tmp_path / "b.json", "--markdown", tmp_path / "b.md")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "b.json").read_text())["rows"]
+    assert {row["what"] for row in rows} == {"rollout", "rollout_randomised"}
+    for row in rows:
+        assert row["drones"] == 8
+        assert row["steps_per_s"] > 0
+        assert row["compile_s"] > 0
+        assert row["peak_mb"] > 0
+    assert "steps/s" in (tmp_path / "b.md").read_text()

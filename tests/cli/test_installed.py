@@ -1,0 +1,40 @@
+"""The wheel works in a clean environment outside the repository: shipped assets and presets are found."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PROBE = """
+import cfb_mjx, pathlib
+from cfb_mjx.files import shipped
+from cfb_mjx.model import MjxBody, Quadrotor
+from cfb_mjx.parameters import load_randomisation, preset_names
+assert "site-packages" in cfb_mjx.__file__ or "target" in cfb_mjx.__file__, cfb_mjx.__file__
+assert str(shipped("assets", "cfb.xml")).startswith(str(pathlib.Path(cfb_mjx.__file__).parent))
+assert preset_names() == ["cf21b-500", "cfb", "cfb-guards"]
+load_randomisation()
+Quadrotor.from_file("cf21b-500", body=MjxBody(floor=True))
+assert (pathlib.Path(cfb_mjx.__file__).parent / "py.typed").exists()
+print("fine")
+"""
+
+
+def test_wheel_carries_its_data(tmp_path):
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), str(ROOT)]
+    subprocess.run(build, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    target = tmp_path / "target"
+    install = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(target), str(wheel)]
+    subprocess.run(install, check=True, capture_output=True)
+    # The editable install must not shine through: the target comes first on the path, and we are elsewhere.
+    environment = {**os.environ, "PYTHONPATH": str(target)}
+    done = subprocess.run(
+        [sys.executable, "-c", PROBE], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip().endswith("fine")
+    names = {p.name for p in target.iterdir()}
+    assert "assets" not in names
+    assert "configs" not in names

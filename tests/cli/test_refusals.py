@@ -1,0 +1,168 @@
+"""Bad input: one sentence that names the file, exit status 2, no traceback, earlier results as they were."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.csv
+import pytest
+
+CFB = str(Path(sys.executable).with_name("cfb"))
+
+
+def refused(done, *needles):
+    text = done.stdout + done.stderr
+    assert done.returncode == 2, text
+    assert "Traceback" not in text
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, text
+    for needle in needles:
+        assert needle in lines[0], lines[0]
+
+
+@pytest.fixture
+def table(files):
+    return pyarrow.csv.read_csv(files / "flight.csv").to_pydict()
+
+
+def write(path, columns):
+    names = list(columns)
+    rows = zip(*(columns[n] for n in names), strict=True)
+    path.write_text(",".join(names) + "\n" + "\n".join(",".join(map(repr, r)) for r in rows) + "\n")
+    return path
+
+
+def drop(*names):
+    return lambda c: {k: v for k, v in c.items() if k not in names}
+
+
+def change(**functions):
+    return lambda c: {k: functions[k](np.array(v)).tolist() if k in functions else v for k, v in c.items()}
+
+
+def set_at(index, value):
+    def put(column):
+        column[index] = value
+        return column
+
+    return put
+
+
+def scalar_last(columns):
+    w, x, y, z = (columns[k] for k in ("qw", "qx", "qy", "qz"))
+    return columns | {"qw": x, "qx": y, "qy": z, "qz": w}
+
+
+BAD_TABLES = {
+    "missing columns": (drop("vx", "u3"), "vx", "u3"),
+    "NaN": (change(py=set_at(7, float("nan"))), "py"),
+    "time runs backwards": (change(t=set_at(100, 0.1)), "time"),
+    "gyro in deg/s": (change(wx=np.degrees, wy=np.degrees, wz=np.degrees), "deg"),
+    "command as PWM": (change(**{f"u{i}": lambda u: np.round(u * 65535) for i in range(1, 5)}), "65535"),
+    "acceleration in g": (change(**{f"a{k}": lambda a: a / 9.81 for k in "xyz"}), "g"),
+    "quaternion norm": (change(**{f"q{k}": lambda q: 1.3 * q for k in "wxyz"}), "quaternion"),
+    "quaternion order": (scalar_last, "quaternion"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_TABLES)
+def test_bad_tables(cfb, table, tmp_path, name):
+    spoil, *needles = BAD_TABLES[name]
+    path = write(tmp_path / "spoilt.csv", spoil(table))
+    (tmp_path / "keep.json").write_text("{}")
+    refused(cfb("evaluate", path, "--json", tmp_path / "keep.json"), "spoilt.csv", *needles)
+    assert (tmp_path / "keep.json").read_text() == "{}"
+
+
+@pytest.mark.parametrize("kind", ["mcap", "parquet", "csv"])
+@pytest.mark.parametrize("keep", [0, 0.6])
+def test_empty_and_truncated_files(cfb, files, tmp_path, kind, keep):
+    whole = (files / f"flight.{kind}").read_bytes()
+    path = tmp_path / f"cut.{kind}"
+    path.write_bytes(whole[: int(keep * len(whole))])
+    if kind == "csv" and keep:
+        path.write_bytes(path.read_bytes().rsplit(b",", 3)[0])  # the cut falls inside a row
+    refused(cfb("import", path, "-o", tmp_path / "out.mcap"), f"cut.{kind}")
+    assert not (tmp_path / "out.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "needles"),
+    [
+        (["evaluate", "absent.mcap"], ["absent.mcap"]),
+        (["evaluate"], ["log"]),
+        (["fly-away"], ["fly-away", "evaluate"]),
+        (["evaluate", "FLIGHT", "--model", "cfb-unknown"], ["cfb-unknown", "cfb-guards"]),
+        (["evaluate", "FLIGHT", "--set", "mass=heavy"], ["mass=heavy"]),
+        (["evaluate", "FLIGHT", "--set", "mass=-1"], ["mass"]),
+        (["evaluate", "FLIGHT", "--set", "weight=1"], ["weight"]),
+        (["evaluate", "FLIGHT", "FLIGHT"], ["flight", "name"]),
+        (["evaluate", "FLIGHT", "--json", "nowhere/x.json"], ["nowhere"]),
+        (["import", "FLIGHT", "-o", "out.csv"], ["out.csv"]),
+        (["import", "FLIGHT", "-o", "FLIGHT"], ["source"]),
+        (["bench", "--drones", "0"], ["drones"]),
+        (["bench", "--drones", "1", "--quick", "--peer-python", "absent-python"], ["absent-python"]),
+    ],
+)
+def test_bad_arguments(cfb, files, tmp_path, arguments, needles):
+    arguments = [str(files / "flight.mcap") if a == "FLIGHT" else a for a in arguments]
+    refused(cfb(*arguments, cwd=tmp_path), *needles)
+    assert (files / "flight.mcap").stat().st_size > 1000
+
+
+@pytest.mark.parametrize(
+    ("text", "needle"),
+    [
+        ("format: cfb_mjx model 1\nparameters: {colour: {value: 1, unit: kg, source: x}}", "colour"),
+        ("format: cfb_mjx model 1\nparameters: {mass: {value: 0.04, source: x}}", "mass"),
+        ("not: [closed", "YAML"),
+        ("", "mapping"),
+    ],
+)
+def test_bad_model_files(cfb, files, tmp_path, text, needle):
+    (tmp_path / "m.yaml").write_text(text)
+    refused(cfb("evaluate", files / "flight.mcap", "--model", tmp_path / "m.yaml"), "m.yaml", needle)
+
+
+def test_a_full_disk_costs_nothing(cfb, files, tmp_path):
+    """A limit on file size makes the write fail half way, as a full disk would."""
+    target = tmp_path / "out.mcap"
+    target.write_text("earlier")
+
+    def limit():
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
+
+    done = cfb("import", files / "flight.csv", "-o", target, preexec_fn=limit)
+    refused(done, "out.mcap")
+    assert target.read_text() == "earlier"
+    assert [p.name for p in tmp_path.iterdir()] == ["out.mcap"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write anywhere")
+def test_a_folder_without_permission(cfb, files, tmp_path):
+    tmp_path.chmod(0o500)
+    refused(cfb("import", files / "flight.csv", "-o", tmp_path / "out.mcap"), "out.mcap")
+
+
+def test_ctrl_c_leaves_earlier_results(files, tmp_path):
+    (tmp_path / "keep.json").write_text("{}")
+    process = subprocess.Popen(
+        [CFB, "evaluate", str(files / "flight.mcap"), "--json", str(tmp_path / "keep.json")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    time.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=120)
+    assert process.returncode == 130, out + err
+    assert "interrupted" in err
+    assert "Traceback" not in err
+    assert (tmp_path / "keep.json").read_text() == "{}"

@@ -1,0 +1,108 @@
+"""Prediction windows follow the protocol: starts, gaps, delay, what is held and what is interpolated."""
+
+import numpy as np
+import pytest
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.sysid.windows import find_starts, find_windows
+
+HORIZONS = (0.05, 0.1, 0.2, 0.5)
+
+
+def make_log(time, rotor_speed=None, **metadata):
+    n = len(time)
+    ramp = np.asarray(time, dtype=float)
+    return FlightLog(
+        time=ramp,
+        position=np.stack([ramp, 2 * ramp, 0 * ramp], axis=1),
+        velocity=np.tile([1.0, 2.0, 0.0], (n, 1)),
+        quaternion=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        body_rate=np.stack([ramp, 0 * ramp, 0 * ramp], axis=1),
+        specific_force=np.tile([0.0, 0.0, 9.81], (n, 1)),
+        command=np.tile(np.arange(n)[:, None] / n, (1, 4)),
+        rotor_speed=rotor_speed,
+        battery_voltage=None,
+        metadata={"name": "made", "source": "made.csv", "format": "tabular", "observation_delay": None, **metadata},
+    )
+
+
+def test_starts_are_every_fifth_of_a_second_from_six_tenths():
+    starts = find_starts(make_log(np.arange(0, 2.0001, 0.004)), HORIZONS, 0.008)
+    # 1.4 + 0.53 lies inside 2.0, 1.6 + 0.53 does not.
+    np.testing.assert_allclose(starts, [0.6, 0.8, 1.0, 1.2, 1.4])
+
+
+def test_a_first_sample_a_little_late_does_not_shift_the_windows():
+    starts = find_starts(make_log(0.0039 + np.arange(0, 2.0, 0.004)), HORIZONS, 0.008)
+    assert starts[0] == 0.6
+
+
+def test_a_log_that_starts_elsewhere_counts_from_its_first_row():
+    starts = find_starts(make_log(1000.0 + np.arange(0, 2.0001, 0.004)), HORIZONS, 0.008)
+    np.testing.assert_allclose(starts[0], 1000.6)
+
+
+def test_too_short_a_log_has_no_window():
+    log = make_log(np.arange(0, 1.0, 0.004))
+    assert len(find_starts(log, HORIZONS, 0.008)) == 0
+    assert len(find_windows(log, HORIZONS, 0.008)) == 0
+
+
+@pytest.mark.parametrize(
+    ("gap_begin", "gap_end", "lost"),
+    [
+        (2.0, 2.1, [1.6, 1.8, 2.0, 2.2]),  # begins in [t0 - 0.3, t0 + 0.5]
+        (2.104, 2.150, [1.8, 2.0, 2.2, 2.4]),  # 1.6 + 0.508 = 2.108 falls in the gap too
+        (2.0, 2.012, []),  # three missing intervals are no gap
+        (2.0, 2.5, [1.6, 1.8, 2.0, 2.2, 2.4]),  # 2.4 starts inside the gap
+    ],
+)
+def test_gaps_end_windows(gap_begin, gap_end, lost):
+    time = np.arange(0, 4.0001, 0.004)
+    time = time[(time < gap_begin + 1e-9) | (time > gap_end - 1e-9)]
+    starts = find_starts(make_log(time), HORIZONS, 0.008)
+    every = 0.6 + 0.2 * np.arange(15)
+    missing = [round(t, 3) for t in every if not np.any(np.abs(starts - t) < 1e-9)]
+    if gap_begin == 2.104:
+        lost = [1.6, *lost]
+    assert missing == lost
+
+
+def test_pose_is_read_late_by_the_delay_and_gyro_is_not():
+    delay = 0.0065
+    windows = find_windows(make_log(np.arange(0, 3.0, 0.004)), HORIZONS, delay)
+    np.testing.assert_allclose(windows.position[:, 0], windows.start + delay, atol=1e-12)
+    np.testing.assert_allclose(windows.body_rate[:, 0], windows.start, atol=1e-12)
+    ends = windows.start[:, None] + np.array(HORIZONS)
+    np.testing.assert_allclose(windows.true_position[..., 0], ends + delay, atol=1e-12)
+    np.testing.assert_allclose(windows.true_body_rate[..., 0], ends, atol=1e-12)
+
+
+@pytest.mark.parametrize("rate", [250, 100, 48])
+def test_steps_reach_every_horizon_and_hold_each_rows_command(rate):
+    time = np.arange(0, 3.0, 1 / rate)
+    log = make_log(time)
+    windows = find_windows(log, HORIZONS, 0.008)
+    elapsed = np.concatenate([np.zeros((len(windows), 1)), np.cumsum(windows.step, axis=1)], axis=1)
+    reached = np.take_along_axis(elapsed, windows.at, axis=1)
+    np.testing.assert_allclose(reached, np.tile(HORIZONS, (len(windows), 1)), atol=1e-9)
+    assert windows.step.max() <= 0.0051
+    # The mean command over the window, computed from the rows alone at 0.1 ms.
+    fine = windows.start[0] + np.arange(0, 0.5, 1e-4) + 5e-5
+    ticks = np.ceil(time * 1000 - 1e-6) / 1000
+    expected = log.command[np.searchsorted(ticks, fine, side="right") - 1, 0].mean()
+    used = np.sum(windows.command[0, :, 0] * windows.step[0]) / 0.5
+    np.testing.assert_allclose(used, expected, rtol=1e-4)
+
+
+def test_rotor_speed_is_linear_between_rows_and_missing_where_not_measured():
+    time = np.arange(0, 4.0, 0.01)
+    speed = np.tile((1000 + 100 * time)[:, None], (1, 4))
+    speed[150, 0] = np.nan  # one bad reading is bridged
+    speed[250:260, 1] = np.nan  # a run is not
+    windows = find_windows(make_log(time, rotor_speed=speed), HORIZONS, 0.008)
+    measured = np.isfinite(windows.rotor_speed).all(axis=(1, 2))
+    touched = (windows.start <= 2.6) & (windows.start + 0.5 >= 2.49)
+    assert np.array_equal(measured, ~touched)
+    chosen = windows.rotor_speed[measured][:, 0, 0]
+    np.testing.assert_allclose(chosen, 1000 + 100 * windows.start[measured], atol=1e-9)
