@@ -13,7 +13,7 @@ from cfb_mjx.logs import write_tabular
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
-    """Page and numbers of a small demo whose "real" flight is a short simulated one, half a gram lighter."""
+    """Page and numbers of a small demo whose "real" flight is a short simulated one of another mass."""
     folder = tmp_path_factory.mktemp("demo")
     (folder / "real" / "validation").mkdir(parents=True)
     write_tabular(demo.simulated_log(2.0), folder / "real" / "validation" / "random1_a.parquet")

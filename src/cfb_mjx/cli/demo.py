@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -345,7 +344,7 @@ def _spread_text(quantiles: dict[str, float], unit: str) -> str:
 # ------------------------------------------------------------------------------------ a log where none is shipped
 
 
-def simulated_log(seconds: float = 6.0) -> FlightLog:
+def simulated_log(seconds: float = 4.0) -> FlightLog:
     """A flight of the declared model itself, without noise: a hover with gentle swings about all axes."""
     import jax
     import jax.numpy as jnp
@@ -353,42 +352,33 @@ def simulated_log(seconds: float = 6.0) -> FlightLog:
     from cfb_mjx.model import Quadrotor, step, thrust
 
     drone = Quadrotor.from_file(MODEL)
-    fly = jax.jit(lambda state, command: step(drone, state, command))
-    hover = np.asarray(drone.hover_command())
     delay = round(float(drone.parameters.observation_delay) / drone.dt)
-    command_of = _swing_controller(hover)
-    states, commands = [drone.hover_state()], []
-    for index in range(round(seconds / drone.dt) + delay):
-        commands.append(command_of(index * drone.dt, states[-1]))
-        states.append(fly(states[-1], jnp.asarray(commands[-1])))
-    flown = jax.tree.map(lambda *x: np.stack([np.asarray(v) for v in x]), *states[: len(commands)])
-    speed = flown.rotor_speed
-    force = np.asarray(jax.vmap(lambda s: thrust(drone.parameters, s).sum())(jnp.asarray(speed)))
-    late, now = slice(0, len(commands) - delay), slice(delay, None)
-    specific = force[:, None] / float(drone.parameters.mass) * np.array([0.0, 0.0, 1.0])
+    signs = jnp.array([[-1.0, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
+
+    def command(t, state):
+        """Attitude follows slow sines and resists drift; height is held. Gains: command per rad, rad/s, m and m/s."""
+        q, v = state.quaternion, state.velocity
+        target = 0.15 * jnp.sin(jnp.array([2.5, 1.9, 0.8]) * t) + 0.1 * jnp.array([v[1], -v[0], 0.0])
+        turn = jnp.array([0.08, 0.08, 0.2]) * (target - 2 * q[1:]) - jnp.array([0.02, 0.02, 0.1]) * state.body_rate
+        return drone.hover_command() + 0.3 * (1.0 - state.position[2]) - 0.25 * v[2] + turn @ signs
+
+    def fly(state, t):
+        sent = jnp.clip(command(t, state), 0.0, 1.0)
+        return step(drone, state, sent), (state, sent)
+
+    instants = drone.dt * jnp.arange(round(seconds / drone.dt) + delay)
+    _, (flown, sent) = jax.jit(lambda state: jax.lax.scan(fly, state, instants))(drone.hover_state())
+    force = jax.vmap(lambda speed: thrust(drone.parameters, speed).sum())(flown.rotor_speed)
+    specific = (force / drone.parameters.mass)[:, None] * jnp.array([0.0, 0.0, 1.0])
+    late, now = slice(0, len(instants) - delay), slice(delay, None)
     return FlightLog(
-        time=drone.dt * np.arange(len(commands) - delay),
+        time=drone.dt * np.arange(len(instants) - delay),
         position=flown.position[late],
         velocity=flown.velocity[late],
         quaternion=flown.quaternion[late],
         body_rate=flown.body_rate[now],
         specific_force=specific[now],
-        command=np.array(commands)[now],
-        rotor_speed=speed[now],
+        command=sent[now],
+        rotor_speed=flown.rotor_speed[now],
         metadata={"name": "simulated", "source": "cfb demo", "observation_delay": delay * drone.dt},
     )
-
-
-def _swing_controller(hover: np.ndarray) -> Callable:
-    """Attitude follows slow sines and resists drift; height is held. Gains: command per rad, rad/s, m and m/s."""
-    signs = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
-
-    def command(t: float, state) -> np.ndarray:
-        q, rate = np.asarray(state.quaternion), np.asarray(state.body_rate)
-        target = 0.15 * np.array([np.sin(2.5 * t), np.sin(1.9 * t), np.sin(0.8 * t)])
-        target[:2] += 0.1 * np.array([state.velocity[1], -state.velocity[0]])
-        roll_pitch_yaw = np.array([0.08, 0.08, 0.2]) * (target - 2 * q[1:]) - np.array([0.02, 0.02, 0.1]) * rate
-        lift = 0.3 * (1.0 - float(state.position[2])) - 0.25 * float(state.velocity[2])
-        return np.clip(hover + lift + roll_pitch_yaw @ signs, 0.0, 1.0)
-
-    return command

@@ -51,9 +51,9 @@ def describe_alignment(alignment: dict | None) -> str:
         return "motor columns against gyro: not estimated"
     if "shift_ms" not in alignment:
         return f"motor columns delayed by {alignment.get('applied_ms', 0.0):.1f} ms as asked"
-    text = f"motor columns lead the gyro by {alignment['shift_ms']:.1f} +- {alignment['shift_std_ms']:.1f} ms"
     if not alignment.get("reliable", True):
-        return f"{text} (too little excitation to be sure)"
+        return "motor columns against gyro: too little excitation to estimate their shift"
+    text = f"motor columns lead the gyro by {alignment['shift_ms']:.1f} +- {alignment['shift_std_ms']:.1f} ms"
     if alignment.get("applied"):
         return f"{text}; delayed by {alignment['applied_ms']:.1f} ms"
     return text

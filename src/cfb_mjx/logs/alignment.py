@@ -56,7 +56,7 @@ class AlignmentEstimate:
         """The estimate in JSON terms, milliseconds."""
         return {
             "shift_ms": self.shift_s * 1e3,
-            "shift_std_ms": self.std_s * 1e3,
+            "shift_std_ms": self.std_s * 1e3 if np.isfinite(self.std_s) else None,  # JSON has no infinity
             "correlation": self.correlation,
             "method": self.method,
             "band_hz": list(self.band_hz),

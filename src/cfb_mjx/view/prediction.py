@@ -55,7 +55,7 @@ def prediction_figure(
     results = {v: (alone.metrics(v), alone.intervals(v)) for v in VARIANTS if alone.metrics(v) is not None}
     with style.context():
         figure = style.new_figure(15.0, 9.6)
-        grid = figure.add_gridspec(4, 5, width_ratios=[1, 1, 1, 0.04, 0.95])
+        grid = figure.add_gridspec(4, 4, left=0.046, right=0.99, top=0.95, bottom=0.095, wspace=0.27, hspace=0.15)
         first = None
         for row, quantity in enumerate(QUANTITIES):
             for column in range(3):
@@ -65,8 +65,9 @@ def prediction_figure(
                 axes.tick_params(labelbottom=row == 3)
                 if row == 3:
                     axes.set_xlabel("time, s")
-            axes = figure.add_subplot(grid[row, 4])
+            axes = figure.add_subplot(grid[row, 3])
             _draw_error(axes, results, evaluation.horizons, quantity)
+            axes.tick_params(labelbottom=row == 3)
             if row == 3:
                 axes.set_xlabel("horizon, s")
         _legend(figure, list(results))
@@ -76,6 +77,7 @@ def prediction_figure(
             f"{name}: measurement and {max(evaluation.horizons):g} s open-loop predictions "
             f"({len(chosen.windows)} windows; right: RMS error over all of them, 95 % interval)",
             fontsize=11,
+            y=0.985,
         )
         style.save(figure, path)
 
@@ -223,4 +225,4 @@ def _legend(figure, variants: list[str]) -> None:
         Line2D([], [], color=style.COLOURS[v], marker=style.MARKERS[v], markersize=4, label=style.LABELS[v])
         for v in variants
     ]
-    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), fontsize=9.5)
+    figure.legend(handles=handles, loc="lower center", ncols=len(handles), fontsize=9.5)

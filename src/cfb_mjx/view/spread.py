@@ -56,9 +56,10 @@ def spread_figure(
             axes.set_ylabel(f"{name}, {unit}")
             axes.set_xlabel("time, s")
             axes.margins(x=0)
-        figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        figure.subplots_adjust(left=0.055, right=0.99, top=0.9, bottom=0.23, wspace=0.28)
+        figure.legend(*axes.get_legend_handles_labels(), loc="lower center", ncols=4)
         if title:
-            figure.suptitle(title, fontsize=11)
+            figure.suptitle(title, fontsize=11, y=0.985)
         style.save(figure, path)
 
 

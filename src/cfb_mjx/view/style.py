@@ -51,7 +51,8 @@ def new_figure(width: float, height: float):
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
+    # Callers give margins themselves: matplotlib's constrained layout would draw everything twice.
+    figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
     return figure
 

@@ -1,0 +1,197 @@
+"""Measure the integrators against SciPy's DOP853 and write docs/accuracy.md.
+
+    python scripts/accuracy.py [-o docs/accuracy.md]
+
+The reference is the oracle of the tests (``tests/helpers.py``): the paper's equations in plain NumPy, sharing no code
+with the library.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import os
+import platform
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import equinox as eqx  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+import helpers  # noqa: E402
+
+from cfb_mjx.files import write_text  # noqa: E402
+from cfb_mjx.model import Quadrotor, rollout  # noqa: E402
+from cfb_mjx.parameters import load_model_file  # noqa: E402
+
+INTERVAL = 0.008  # the longest step measured; commands change at its multiples
+STEPS = (0.008, 0.004, 0.002, 0.001)
+HORIZONS = (0.2, 0.5)
+SEEDS = range(4)
+METHODS = [(i, loads) for i in ("euler", "rk4") for loads in ("instant", "mean")]
+MANOEUVRES = {"aggressive": helpers.aggressive_manoeuvre, "gentle": helpers.gentle_manoeuvre}
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    arguments.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "accuracy.md")
+    output = arguments.parse_args().output
+    parameters = load_model_file("cfb-guards").parameters()
+    flights = {name: reference(parameters, make) for name, make in MANOEUVRES.items()}
+    errors, tumbling = {}, {}
+    for dt in STEPS:
+        for integrator, loads in METHODS:
+            model = Quadrotor(parameters, dt=dt, integrator=integrator, rotor_loads=loads)
+            fly = jax.jit(jax.vmap(rollout, in_axes=(None, 0, 0)))
+            for name, (starts, commands, truth) in flights.items():
+                repeated = np.repeat(commands, round(INTERVAL / dt), axis=1)
+                states = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(helpers.state_of(y) for y in starts))
+                flown = helpers.pack(fly(model, states, jnp.asarray(repeated)))
+                errors[name, dt, integrator, loads] = compare(
+                    flown[:, round(INTERVAL / dt) - 1 :: round(INTERVAL / dt)], truth
+                )
+            print(f"{integrator} {loads} at {1e3 * dt:g} ms done", flush=True)
+        for integrator in ("euler", "rk4"):
+            tumbling[dt, integrator] = tumble(Quadrotor(parameters, dt=dt, integrator=integrator))
+    peak = {name: np.abs(truth[:, :, 10:13]).max() for name, (_, _, truth) in flights.items()}
+    write_text(output, page(errors, tumbling, euler_rule(parameters), peak))
+    print(f"wrote {output}")
+
+
+def reference(parameters, make) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Starts, commands and DOP853's states of one kind of manoeuvre, one row per seed."""
+    constants = helpers.constants_of(parameters)
+    pairs = [make(max(HORIZONS) + INTERVAL, INTERVAL, seed) for seed in SEEDS]
+    truth = np.array([helpers.fly(constants, y, commands, INTERVAL) for y, commands in pairs])
+    return np.array([y for y, _ in pairs]), np.array([c for _, c in pairs]), truth
+
+
+def compare(flown: np.ndarray, truth: np.ndarray) -> list[tuple[float, float]]:
+    """Worst position [m] and attitude [deg] error over the seeds, at each horizon."""
+    rows = []
+    for horizon in HORIZONS:
+        # Not every horizon is a multiple of the command interval: take the state just after it.
+        at = int(np.ceil(horizon / INTERVAL - 1e-9)) - 1
+        distance = np.linalg.norm(flown[:, at, :3] - truth[:, at, :3], axis=-1).max()
+        angle = helpers.attitude_error(flown[:, at, 6:10], truth[:, at, 6:10]).max()
+        rows.append((float(distance), float(np.degrees(angle))))
+    return rows
+
+
+def tumble(model: Quadrotor, duration: float = 2.0) -> tuple[float, float]:
+    """Relative drift of rotational energy and of angular momentum, rotors off, over ``duration`` s."""
+    y, _ = helpers.aggressive_manoeuvre(0.1)
+    y[10:13], y[13:] = [12.0, -5.0, 8.0], 0.0
+    count = round(duration / model.dt)
+    flown = helpers.pack(jax.jit(rollout)(model, helpers.state_of(y), jnp.zeros((count, 4))))
+    inertia = np.asarray(model.parameters.inertia)
+
+    def mechanics(state):
+        rate = state[10:13]
+        return 0.5 * rate @ (inertia * rate), helpers.rotation_matrix(state[6:10]) @ (inertia * rate)
+
+    energy, momentum = mechanics(y)
+    later = [mechanics(state) for state in flown]
+    return (
+        max(abs(e - energy) for e, _ in later) / energy,
+        max(np.linalg.norm(m - momentum) for _, m in later) / np.linalg.norm(momentum),
+    )
+
+
+def euler_rule(parameters) -> list[tuple[float, float, float]]:
+    """(time, error, dt/2 a t) of Euler at 4 ms climbing at constant acceleration a."""
+    model = Quadrotor(parameters, integrator="euler")
+    y = np.zeros(17)
+    y[6], y[13:] = 1.0, 0.8 * 2900
+    flown = helpers.pack(eqx.filter_jit(rollout)(model, helpers.state_of(y), jnp.full((125, 4), 0.8)))
+    thrust, _ = helpers.rotor_forces(helpers.constants_of(parameters), y[13:])
+    acceleration = thrust.sum() / float(parameters.mass) - float(parameters.gravity)
+    return [(t, flown[round(t / 0.004) - 1, 2] - 0.5 * acceleration * t**2, 0.002 * acceleration * t) for t in HORIZONS]
+
+
+def machine() -> str:
+    """Processor and operating system, as far as the system tells."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [
+            line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")
+        ]
+        model = names[0] if names else model
+    return f"{model}, {os.cpu_count()} cores, {platform.system()}, JAX on {jax.default_backend()}"
+
+
+def page(errors, tumbling, rule, peak) -> str:
+    """The Markdown page."""
+    packages = ", ".join(f"{name} {version(name)}" for name in ("jax", "equinox", "numpy", "scipy"))
+    lines = [
+        "# Accuracy of the simulation",
+        "",
+        f"Measured {datetime.date.today().isoformat()} on {machine()}, Python {platform.python_version()}, {packages}, "
+        "float64, by",
+        "",
+        "    python scripts/accuracy.py",
+        "",
+        "which writes this page. Reference: SciPy's DOP853 (rtol 1e-10) on the paper's equations written in NumPy",
+        "(`tests/helpers.py`), the `cfb-guards` preset, commands held for 8 ms. Worst of "
+        f"{len(SEEDS)} manoeuvres of each kind. Rotor speeds are exact (1e-12 relative) in every row.",
+        "",
+    ]
+    texts = {
+        "aggressive": f"Aggressive: flips with commands over the full range, body rates up to {peak['aggressive']:.0f} rad/s",
+        "gentle": f"Gentle: commands within 0.05 of hover, body rates up to {peak['gentle']:.1f} rad/s",
+    }
+    for name, text in texts.items():
+        lines += [
+            f"## {text}",
+            "",
+            "| step | integrator | `rotor_loads` | position, 200 ms | position, 500 ms | attitude, 200 ms | attitude, 500 ms |",
+            "|---|---|---|---|---|---|---|",
+        ]
+        for dt in STEPS:
+            for integrator, loads in METHODS:
+                (p0, a0), (p1, a1) = errors[name, dt, integrator, loads]
+                cells = f"{1e3 * p0:.2g} mm | {1e3 * p1:.2g} mm | {a0:.2g} deg | {a1:.2g} deg"
+                lines.append(f"| {1e3 * dt:g} ms | {integrator} | {loads} | {cells} |")
+        lines.append("")
+    lines += [
+        "## Free tumbling, 2 s at 15 rad/s, rotors off",
+        "",
+        "| step | integrator | rotational energy drift | angular momentum drift |",
+        "|---|---|---|---|",
+    ]
+    for (dt, integrator), (energy, momentum) in tumbling.items():
+        lines.append(f"| {1e3 * dt:g} ms | {integrator} | {energy:.1e} | {momentum:.1e} |")
+    rules = "; ".join(
+        f"after {1e3 * t:.0f} ms the error is {1e3 * e:.2f} mm and the rule says {1e3 * r:.2f} mm" for t, e, r in rule
+    )
+    lines += [
+        "",
+        "## What to choose",
+        "",
+        "- **`euler`** is MuJoCo's semi-implicit Euler: first order. It moves with the velocity at the end of the step, so",
+        f"  its position is off by about dt/2 x acceleration x time. Climbing at constant acceleration at 4 ms, {rules}.",
+        "  It also gains or loses rotational energy when tumbling. Use it for parity with MuJoCo and for speed.",
+        '- **`rk4` with `rotor_loads="instant"`** evaluates thrust and torque on the exact rotor path at every stage:',
+        "  fourth order, the most accurate choice at every step measured.",
+        '- **`rotor_loads="mean"`** replaces the loads by their exact means over the step, so the impulse of thrust and',
+        "  torque (the yaw kick J_m dOmega above all) is exact at any step. What is lost is where within the step the",
+        "  load acts, which makes `rk4` second order; at 4 ms it stays below 1 mm and 0.2 deg over 200 ms of flips. With",
+        "  `euler` the means remove the error of holding the loads of the step's start, not that of the position update,",
+        "  which can have the opposite sign: the table decides, and in it `mean` is not uniformly better.",
+        "- Where the integrator must not be seen (evaluating a model on logs, fitting), use `rk4`.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
