@@ -141,8 +141,8 @@ def page(errors, tumbling, rule, peak) -> str:
         "    python scripts/accuracy.py",
         "",
         "which writes this page. Reference: SciPy's DOP853 (rtol 1e-10) on the paper's equations written in NumPy",
-        "(`tests/helpers.py`), the `cfb-guards` preset, commands held for 8 ms. Worst of "
-        f"{len(SEEDS)} manoeuvres of each kind. Rotor speeds are exact (1e-12 relative) in every row.",
+        '(`tests/helpers.py`), the `cfb-guards` preset, commands held for 8 ms (so "500 ms" is 504 ms,',
+        f"the next multiple). Worst of {len(SEEDS)} manoeuvres of each kind. Rotor speeds are exact (1e-12 relative).",
         "",
     ]
     texts = {

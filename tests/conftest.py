@@ -8,10 +8,10 @@ import os
 # the compilation cache. Has to be set before jax is imported.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-import jax  # noqa: E402
-from jaxtyping import install_import_hook  # noqa: E402
+import jax
+from jaxtyping import install_import_hook
 
-# Float64 so that tests can tell a wrong term from rounding; test_precision.py covers float32.
+# Float64 so that tests can tell a wrong term from rounding; model/test_rollout.py covers float32.
 jax.config.update("jax_enable_x64", True)
 
 # Annotated shapes and dtypes are checked in tests only. Must run before anything imports these packages.

@@ -18,6 +18,10 @@ ROTOR_X = np.array([1.0, -1.0, -1.0, 1.0])
 ROTOR_Y = np.array([-1.0, -1.0, 1.0, 1.0])
 YAW = np.array([-1.0, 1.0, -1.0, 1.0])
 
+# For tests that compile much and run little: XLA's fusion makes RK4's gradient take minutes to compile instead of
+# seconds. What is computed is the same; the convergence tests compile with the defaults.
+QUICK_COMPILE = {"xla_disable_hlo_passes": "fusion", "xla_backend_optimization_level": 0}
+
 NAMES = ("position", "velocity", "quaternion", "body_rate", "rotor_speed")
 SLICES = dict(zip(NAMES, (slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13), slice(13, 17)), strict=True))
 
@@ -145,7 +149,13 @@ def fly(constants: Constants, y: np.ndarray, commands: np.ndarray, interval: flo
     for command in np.asarray(commands, dtype=float):
         # A new integration per command: the right-hand side jumps when the command does.
         solution = solve_ivp(
-            ode(constants, command), (0.0, interval), y, method="DOP853", rtol=1e-10, atol=1e-11, first_step=interval / 2
+            ode(constants, command),
+            (0.0, interval),
+            y,
+            method="DOP853",
+            rtol=1e-10,
+            atol=1e-11,
+            first_step=interval / 2,
         )
         y = solution.y[:, -1]
         trajectory.append(y)

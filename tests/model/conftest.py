@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import equinox as eqx
+import helpers
 import jax
 import jax.numpy as jnp
 import pytest
@@ -38,10 +39,8 @@ def fleet(drones) -> Parameters:
 
 @pytest.fixture(scope="session")
 def fly_fleet():
-    """``rollout`` vmapped over models, one state and one command sequence for all; ``hold`` is static."""
+    """``rollout`` vmapped over models, one state and one command sequence for all."""
     return _fly_fleet
 
 
-@eqx.filter_jit
-def _fly_fleet(models, state, commands, hold: int = 1):
-    return jax.vmap(lambda model: rollout(model, state, commands, hold=hold))(models)
+_fly_fleet = jax.jit(jax.vmap(rollout, in_axes=(0, None, None)), compiler_options=helpers.QUICK_COMPILE)

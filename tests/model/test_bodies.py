@@ -22,11 +22,12 @@ def _random_flight(steps: int = 500) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
-def test_bodies_agree_over_two_seconds_of_random_commands(integrator, fleet, fly_fleet):
+def test_bodies_agree_over_two_seconds_of_random_commands(integrator, fleet):
     y, commands = _random_flight()
+    fly = jax.jit(jax.vmap(rollout, in_axes=(0, None, None)), compiler_options=helpers.QUICK_COMPILE)
     flown = [
         helpers.pack(
-            fly_fleet(Quadrotor(fleet, body=body, integrator=integrator), helpers.state_of(y), jnp.asarray(commands))
+            fly(Quadrotor(fleet, body=body, integrator=integrator), helpers.state_of(y), jnp.asarray(commands))
         )
         for body in (RigidBody(), MjxBody(floor=False))
     ]
@@ -71,6 +72,7 @@ def test_inverse_weights_equal_mujocos(guards):
     """Contact softness scales with body_invweight0, which `prepare` overwrites without mj_setConst."""
     body = MjxBody(floor=True)
     prepared = body.prepare(guards)
+    # The compiled model still says what mj_setConst computed from the MJCF.
     np.testing.assert_allclose(prepared.model.body_invweight0[1], body.mujoco_model.body("cfb").invweight0, rtol=1e-9)
 
 
@@ -78,15 +80,16 @@ def test_mjx_follows_mujoco_c_in_free_flight(guards):
     y, commands = _random_flight(250)
     body = MjxBody(floor=False)
     model = Quadrotor(guards, body=body, integrator="euler", rotor_loads="instant")
-    flown = helpers.pack(jax.jit(rollout)(model, helpers.state_of(y), jnp.asarray(commands)))
+    fly = jax.jit(rollout, compiler_options=helpers.QUICK_COMPILE)
+    flown = helpers.pack(fly(model, helpers.state_of(y), jnp.asarray(commands)))
     np.testing.assert_allclose(flown, _mujoco_c(body.mujoco_model, y, commands), rtol=1e-8, atol=1e-8)
 
 
 @pytest.fixture(scope="module")
-def falling(fly_fleet):
+def falling():
     """Rollout of three drones at once on the floor model: compiled once for all tests below."""
     body = MjxBody(floor=True)
-    compiled = jax.jit(jax.vmap(rollout, in_axes=(0, 0, None)))
+    compiled = jax.jit(jax.vmap(rollout, in_axes=(0, 0, None)), compiler_options=helpers.QUICK_COMPILE)
 
     def fly(parameters, states, commands):
         return helpers.pack(compiled(Quadrotor(parameters, body=body, rotor_loads="instant"), states, commands))
@@ -102,7 +105,9 @@ def _still(height: float, rotation_vector=(0.0, 0.0, 0.0)) -> np.ndarray:
     angle = np.linalg.norm(rotation_vector)
     y = np.zeros(17)
     y[2] = height
-    y[6:10] = [1, 0, 0, 0] if angle == 0 else [np.cos(angle / 2), *(np.sin(angle / 2) / angle * np.array(rotation_vector))]
+    y[6:10] = (
+        [1, 0, 0, 0] if angle == 0 else [np.cos(angle / 2), *(np.sin(angle / 2) / angle * np.array(rotation_vector))]
+    )
     return y
 
 

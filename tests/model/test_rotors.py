@@ -22,7 +22,10 @@ QUICK = settings(max_examples=25, deadline=None, derandomize=True)
 PARAMETERS = eqx.tree_at(
     lambda p: (p.motor_time_constant, p.thrust_scale, p.torque_scale, p.motor_speed_offset),
     load_model_file("cfb-guards").parameters(),
-    tuple(jnp.array(x) for x in ([0.03, 0.05, 0.07, 0.1], [0.9, 1.0, 1.1, 1.2], [1.2, 1.0, 0.8, 0.9], [0.0, 50.0, 100.0, 5.0])),
+    tuple(
+        jnp.array(x)
+        for x in ([0.03, 0.05, 0.07, 0.1], [0.9, 1.0, 1.1, 1.2], [1.2, 1.0, 0.8, 0.9], [0.0, 50.0, 100.0, 5.0])
+    ),
 )
 CONSTANTS = helpers.constants_of(PARAMETERS)
 four = lambda low, high: st.lists(st.floats(low, high), min_size=4, max_size=4).map(np.array)  # noqa: E731

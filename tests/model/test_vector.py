@@ -90,8 +90,8 @@ def test_known_zeros_cost_nothing_and_change_nothing(v):
         atol=1e-12,
     )
     assert Vec(0.0, 0.0, 0.0).dot(_vec(v)) == 0.0
-    np.testing.assert_allclose((_vec(v) + Vec(0.0, 0.0, 1.0)).stack(), v + [0, 0, 1])
-    np.testing.assert_allclose((Vec(0.0, 0.0, 1.0) - _vec(v)).stack(), [0, 0, 1] - v)
+    np.testing.assert_allclose((_vec(v) + Vec(0.0, 0.0, 1.0)).stack(), v + np.array([0, 0, 1]))
+    np.testing.assert_allclose((Vec(0.0, 0.0, 1.0) - _vec(v)).stack(), np.array([0, 0, 1]) - v)
 
 
 def test_vec_is_an_immutable_pytree():

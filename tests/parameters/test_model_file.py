@@ -253,7 +253,7 @@ def test_bytes_that_are_not_text_are_refused(tmp_path):
 def test_missing_file_unknown_preset_and_folder_are_refused(tmp_path):
     with pytest.raises(CfbError, match=r"nowhere\.yaml"):
         load_model_file(tmp_path / "nowhere.yaml")
-    with pytest.raises(CfbError, match="cfb-gards.*cfb-guards"):
+    with pytest.raises(CfbError, match=r"cfb-gards.*cfb-guards"):
         load_model_file("cfb-gards")
     (tmp_path / "folder.yaml").mkdir()
     with pytest.raises(CfbError, match=r"folder\.yaml"):

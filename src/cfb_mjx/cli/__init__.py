@@ -13,6 +13,7 @@ from cfb_mjx.errors import CfbError
 SUMMARY = {
     "import": "convert a flight log to MCAP",
     "evaluate": "measure how well a model predicts flights, open loop",
+    "fit": "refit the model to flights, with uncertainty",
     "bench": "measure throughput, compile time and memory",
     "demo": "evaluate a flight, fly 4096 randomised drones, write a page",
     "version": "print versions",

@@ -60,6 +60,41 @@ def evaluate(
     run_evaluate(list(logs), model, list(set), json, figure)
 
 
+def fit(
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")],
+    output: Output,
+    parameters: str | None = None,
+    held_out: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG...")] = (),
+    model: Model = "cfb-guards",
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    commands_only: bool = False,
+    compare: bool = False,
+) -> None:
+    """Refit the model to flights, with uncertainty, and judge it on data kept from the fit.
+
+    The estimator allows for feedback and for unmodelled disturbances. What the flights cannot tell is named instead of
+    being given a number.
+
+    Args:
+        logs: flight logs to fit.
+        output: model YAML to write.
+        parameters: names or groups, comma separated: inertia (or inertia_xx, ...), rotor_inertia (J_m), motor
+            (motor_time_constant, motor_gain), thrust_scale, torque_scale, mass, cog (cog_x, cog_y).
+        held_out: logs to judge on; without them the last quarter of every log is kept from the fit.
+        model: preset or model YAML to start from.
+        set: parameters to set before, for instance mass=0.045 (weigh the drone: flights cannot tell it).
+        json: write the results here.
+        commands_only: do not use measured rotor speeds to drive the body.
+        compare: show what multiple shooting, blind to feedback, would say.
+    """
+    if not logs:
+        raise CfbError("fit needs at least one log; see 'cfb fit --help'.")
+    from cfb_mjx.cli.fitting import run_fit
+
+    run_fit(list(logs), list(held_out), output, parameters, model, list(set), json, commands_only, compare)
+
+
 def bench(
     drones: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N...")] = (1, 64, 1024, 8192, 65536),
     json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
@@ -103,7 +138,7 @@ def version() -> None:
         print(f"{name}: {value}")
 
 
-COMMANDS = {"import": import_log, "evaluate": evaluate, "bench": bench, "demo": demo, "version": version}
+COMMANDS = {"import": import_log, "evaluate": evaluate, "fit": fit, "bench": bench, "demo": demo, "version": version}
 
 
 def run(name: str, arguments: list[str]) -> None:

@@ -4,25 +4,34 @@ Importing this package loads numpy only; pyarrow, mcap and protobuf are loaded b
 """
 
 from cfb_mjx.logs.alignment import AlignmentEstimate, apply_shift, estimate_command_shift
+from cfb_mjx.logs.crazyswarm import read_crazyswarm
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.idsia import read_idsia
 from cfb_mjx.logs.mcap_reader import read_mcap
 from cfb_mjx.logs.mcap_writer import write_mcap
+from cfb_mjx.logs.radio_csv import read_radio_csv
 from cfb_mjx.logs.reading import FORMATS, read_log
 from cfb_mjx.logs.resample import resample
 from cfb_mjx.logs.tabular import read_tabular, write_tabular
+from cfb_mjx.logs.usd_card import read_usd_card
 from cfb_mjx.logs.validation import validate
+from cfb_mjx.logs.variables import VariableMap, load_mapping
 
 __all__ = [
     "FORMATS",
     "AlignmentEstimate",
     "FlightLog",
+    "VariableMap",
     "apply_shift",
     "estimate_command_shift",
+    "load_mapping",
+    "read_crazyswarm",
     "read_idsia",
     "read_log",
     "read_mcap",
+    "read_radio_csv",
     "read_tabular",
+    "read_usd_card",
     "resample",
     "validate",
     "write_mcap",

@@ -52,11 +52,19 @@ def predict(model: Quadrotor, windows: Windows, rotor_speed: np.ndarray | None =
 
 @eqx.filter_jit
 def _predict_batch(model: Quadrotor, state: State, step, inputs, measured: bool) -> State:
-    return jax.vmap(lambda *x: _predict_one(model, *x, measured))(state, step, inputs)
+    return jax.vmap(lambda *x: predict_one(model, *x, measured))(state, step, inputs)
 
 
-def _predict_one(model: Quadrotor, state: State, step, inputs, measured: bool) -> State:
-    """Trajectory (S + 1) including the initial state."""
+def predict_one(model: Quadrotor, state: State, step, inputs, measured: bool) -> State:
+    """Trajectory (S + 1) of one window, the initial state first; differentiable.
+
+    Args:
+        model: the drone.
+        state: at the window's start.
+        step: (S,) integration steps, s; 0 where the window has ended.
+        inputs: (S, 4) commands held in each step, or rotor speeds at its end if ``measured``.
+        measured: what ``inputs`` are.
+    """
     center = Vec.unstack(model.parameters.center_of_gravity)
 
     def advance(components, row):

@@ -12,8 +12,8 @@ _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; max-width: 74rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; }
 p { max-width: 52rem; } img { width: 100%; border: 1px solid #e4e4e4; margin: .6rem 0; }
-table { border-collapse: collapse; font-size: .92rem; } caption { text-align: left; padding: .3rem 0; color: #555; }
-th, td { padding: .2rem .8rem; text-align: right; border-bottom: 1px solid #e4e4e4; white-space: nowrap; }
+table { border-collapse: collapse; font-size: .8rem; } caption { text-align: left; padding: .3rem 0; color: #555; }
+th, td { padding: .15rem .5rem; text-align: right; border-bottom: 1px solid #e4e4e4; white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; } .table { overflow-x: auto; }
 footer { margin-top: 2.5rem; color: #555; font-size: .9rem; }
 """

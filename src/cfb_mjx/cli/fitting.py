@@ -1,0 +1,152 @@
+"""``cfb fit``."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import replace
+from datetime import date
+from hashlib import sha256
+from pathlib import Path
+
+from cfb_mjx import __version__
+from cfb_mjx.cli.evaluating import changed_model
+from cfb_mjx.cli.runtime import Progress, configure_jax, environment
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import write_json
+from cfb_mjx.logs import FlightLog, read_log
+
+HELD_OUT_SHARE = 0.25
+"""Without --held-out, this last share of every log is kept from the fit and judged on."""
+
+
+def run_fit(
+    paths: list[Path],
+    held_out: list[Path],
+    output: Path,
+    parameters: str | None,
+    model: str,
+    changes: list[str],
+    json: Path | None,
+    commands_only: bool,
+    compare: bool,
+) -> None:
+    """Fit, print a table, write the model.
+
+    Raises:
+        CfbError: bad logs, parameters or outputs.
+    """
+    for path in (output, json):
+        if path is not None and not path.parent.is_dir():
+            raise CfbError(f"{path}: the folder {path.parent} does not exist; create it first.")
+    if output.suffix not in (".yaml", ".yml"):
+        raise CfbError(f"{output}: the output is a model and must end in .yaml.")
+    logs = [read_log(path) for path in paths]
+    judged = [read_log(path) for path in held_out] or [_last(log) for log in logs]
+    fitted = logs if held_out else [_first(log) for log in logs]
+    configure_jax(x64=True)
+    from cfb_mjx.model import Quadrotor
+    from cfb_mjx.parameters import save_model_file
+    from cfb_mjx.sysid import evaluate
+    from cfb_mjx.sysid.fitting import default_parameters, fit
+
+    base = changed_model(model, changes)
+    request = parameters or default_parameters(fitted)
+    result = fit(fitted, base.parameters(), request, not commands_only, Progress("fitting"))
+    corrected = replace(
+        result.model_file(base, f"cfb fit on {len(paths)} log(s), {date.today().isoformat()}"),
+        name=output.stem,
+        description=f"{base.name} refitted to {', '.join(log.name for log in logs)}",
+        provenance=_provenance(paths, held_out, base.name),
+    )
+    naive = _naive(fitted, base, request, not commands_only) if compare else None
+    before = evaluate(Quadrotor.from_file(base), judged)
+    after = evaluate(Quadrotor.from_file(corrected), judged)
+    save_model_file(corrected, output)
+    _print(result, naive, before, after)
+    print(f"model: {output}")
+    if json is not None:
+        write_json(json, _json(result, naive, before, after))
+        print(f"results: {json}")
+
+
+def _first(log: FlightLog) -> FlightLog:
+    return log.slice(log.time[0], log.time[0] + (1 - HELD_OUT_SHARE) * log.duration)
+
+
+def _last(log: FlightLog) -> FlightLog:
+    return log.slice(log.time[0] + (1 - HELD_OUT_SHARE) * log.duration, log.time[-1])
+
+
+def _naive(logs, base, request, use_measured) -> dict[str, float] | None:
+    import jax.numpy as jnp
+
+    from cfb_mjx.sysid.shooting import shoot
+
+    try:
+        unknowns, vector, _ = shoot(logs, base.parameters(), request, use_measured=use_measured)
+    except CfbError:
+        return None
+    return dict(zip(unknowns.names, map(float, unknowns.values(jnp.asarray(vector))), strict=True))
+
+
+def _provenance(paths: list[Path], held_out: list[Path], base: str) -> dict:
+    hashes = {path.name: sha256(path.read_bytes()).hexdigest() for path in paths}
+    return {
+        "command": shlex.join(["cfb", "fit", *(Path(a).name if "/" in a else a for a in sys.argv[2:])]),
+        "base_model": base,
+        "fit_logs_sha256": hashes,
+        "held_out": [path.name for path in held_out] or f"last {HELD_OUT_SHARE:.0%} of each log",
+        "cfb_mjx": __version__,
+        "environment": environment(),
+    }
+
+
+def _json(result, naive, before, after) -> dict:
+    return {
+        "parameters": {
+            name: {"value": e.value, "std": e.std, "unit": e.unit, "preset": e.preset}
+            for name, e in result.estimates.items()
+        },
+        "unidentifiable": list(result.unidentifiable),
+        "unidentifiable_because": result.unidentifiable,
+        "correlation": {"names": result.names, "matrix": result.uncertainty.correlation},
+        "multiple_shooting": naive,
+        "innovation_lag_one_correlation": result.whiteness,
+        "rows": result.rows,
+        "held_out": {
+            stage: evaluation.metrics("commands_in") for stage, evaluation in (("before", before), ("after", after))
+        }
+        | {
+            f"{stage}_rotor_speed_in": evaluation.metrics("rotor_speed_in")
+            for stage, evaluation in (("before", before), ("after", after))
+        }
+        | {"hold": before.metrics("hold")},
+        "environment": environment(),
+    }
+
+
+def _print(result, naive, before, after) -> None:
+    print(f"{'parameter':<22}{'value':>12}{'std':>11}  {'unit':<8}{'preset':>11}{'change':>9}", end="")
+    print(f"{'multiple shooting':>20}" if naive else "")
+    for name, e in result.estimates.items():
+        change = f"{e.value / e.preset - 1:+.1%}" if e.preset else ""
+        print(f"{name:<22}{e.value:>12.4g}{e.std:>11.2g}  {e.unit:<8}{e.preset:>11.4g}{change:>9}", end="")
+        print(f"{naive[name]:>20.4g}" if naive else "")
+    for reason in dict.fromkeys(result.unidentifiable.values()):
+        print(f"not identifiable: {reason}")
+    if naive:
+        print("multiple shooting ignores feedback and disturbances: on flights under feedback it is biased.")
+    windows = sum(len(log.windows) for log in before.logs)
+    print(f"\nheld-out RMS error, {windows} windows    before       after        hold")
+    hold = before.metrics("hold")
+    for variant, label in (("commands_in", "commands in"), ("rotor_speed_in", "rotor speed in")):
+        old, new = before.metrics(variant), after.metrics(variant)
+        if old is None:
+            continue
+        for key in ("velocity_rmse_mps", "attitude_rmse_deg", "rate_rmse_radps"):
+            for horizon in ("0.2", "0.5"):
+                name = f"{key}@{horizon}s"
+                quantity, _, unit = key.split("_")
+                text = f"{label}, {quantity} {unit}, {horizon} s"
+                print(f"{text:<40}{old[name]:>10.4g}{new[name]:>12.4g}{hold[name]:>12.4g}")

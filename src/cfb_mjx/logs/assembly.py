@@ -1,0 +1,266 @@
+"""From streams of logged variables to a `FlightLog`: choosing variables, converting units, merging onto one clock."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import rotation
+from cfb_mjx.logs.flight_log import REQUIRED, FlightLog, quantise_time
+from cfb_mjx.logs.streams import Stream, central_difference, hold
+from cfb_mjx.logs.variables import Choice, VariableMap
+
+_LATE = 0.002  # s of average age of a held pose worth a note: a quarter of the observation delay assumed otherwise
+COMMAND_NOTE = (
+    "motor.m1..m4 is what the ESC is told: the command after battery compensation and thrust limit, where the firmware "
+    "has them."
+)
+
+
+@dataclasses.dataclass
+class Import:
+    """What an importer has read: streams, and what it has to say about them.
+
+    Attributes:
+        format: name of the format.
+        streams: with time in s on one clock; their origin is ``origin``.
+        preferred: name of the stream whose rows the log should have, if it holds the gyro.
+        notes: facts about the data. ``warnings``: reasons to doubt them.
+        metadata: more entries for the log's metadata.
+    """
+
+    format: str
+    streams: list[Stream]
+    preferred: str | None = None
+    notes: list[str] = dataclasses.field(default_factory=list)
+    warnings: list[str] = dataclasses.field(default_factory=list)
+    metadata: dict = dataclasses.field(default_factory=dict)
+
+
+def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
+    """Merge the streams onto the rows of the one that holds the gyro; the rest is held from its last sample.
+
+    Rows before the first sample of a required variable, and rows whose required sample is older than three intervals of
+    its stream + 0.5 ms, are dropped (so a pause becomes a gap). A rotor speed that old becomes NaN; a battery voltage
+    is held however old it is, and rows before its first sample get that first sample.
+
+    Raises:
+        CfbError: required variables are missing (all are listed), or fewer than two rows remain.
+    """
+    streams = [s for s in read.streams if len(s.time)]
+    home = _homes(streams)
+    spoiled = _spoiled_quaternions(streams, mapping, home)
+    read.notes.extend(f"{v} travelled as float32, which cannot hold its 32 bits; it was not used." for v in spoiled)
+    chosen = mapping.choose(set(home) - set(spoiled), path)
+    reference = _reference(streams, home, chosen, read.preferred)
+    for name in reference.values:
+        home[name] = reference
+    merger = _Merger(reference, home)
+    fields = {f: merger.field(f, c) for f, c in chosen.items() if not c.derived}
+    if chosen["velocity"].derived:
+        fields["velocity"] = merger.derivative(chosen["position"])
+        read.notes.append("velocity: central differences of the logged positions, which look one sample ahead.")
+    _into_frames(fields, chosen)
+    if "battery_voltage" in fields:
+        fields["battery_voltage"] = _backfilled(fields["battery_voltage"][:, 0])
+    keep = np.all([merger.usable[f] for f in chosen if f in REQUIRED], axis=0)
+    if keep.sum() < 2:
+        raise CfbError(
+            f"{path}: {int(keep.sum())} of {len(keep)} rows of {reference.name} have every required variable, at least "
+            "2 are needed; log all of them during the same time."
+        )
+    rows = reference.time[keep]
+    fields = {f: None if v is None else v[keep] for f, v in fields.items()}
+    if fields.get("rotor_speed") is not None and np.isnan(fields["rotor_speed"]).all():
+        fields["rotor_speed"] = None
+    held = merger.report()
+    if (late := max((held[s.name]["mean_age_ms"] for s in merger.poses(chosen)), default=0.0)) > _LATE * 1e3:
+        read.notes.append(
+            f"pose or velocity are held from samples {late:.1f} ms old on average; this adds to the observation delay."
+        )
+    names = ("position", "velocity", "quaternion", "body_rate", "specific_force", "command")
+    log = FlightLog(
+        time=quantise_time(rows - rows[0]),
+        **{f: fields[f] for f in names},
+        rotor_speed=fields.get("rotor_speed"),
+        battery_voltage=fields.get("battery_voltage"),
+        metadata={
+            "name": path.stem,
+            "source": path.name,
+            "format": read.format,
+            "observation_delay": mapping.observation_delay,
+            "firmware": {**mapping.firmware, "command": COMMAND_NOTE},
+            "variables": {"mapping": mapping.name, **{f: c.report() for f, c in chosen.items()}},
+            "merging": {
+                "rows_of": reference.name,
+                "held": held,
+                "dropped_rows": int((~keep).sum()),
+                "time_of_first_row": float(rows[0]),
+            },
+            **read.metadata,
+        },
+    )
+    _check_rate_unit(log, chosen["body_rate"], path)
+    return log.replace(metadata={"notes": read.notes, "warnings": read.warnings})
+
+
+def _homes(streams: Sequence[Stream]) -> dict[str, Stream]:
+    """For each variable the stream with the most samples of it."""
+    home: dict[str, Stream] = {}
+    for stream in streams:
+        for name in stream.values:
+            if name not in home or len(stream.time) > len(home[name].time):
+                home[name] = stream
+    return home
+
+
+def _spoiled_quaternions(streams, mapping: VariableMap, home: dict[str, Stream]) -> list[str]:
+    compressed = [c.variables[0] for c in mapping.choices.get("quaternion", ()) if c.form == "compressed"]
+    return [name for name in compressed if name in home and home[name].float32]
+
+
+def _reference(streams, home, chosen: dict[str, Choice], preferred: str | None) -> Stream:
+    gyro = chosen["body_rate"].variables
+    for stream in streams:
+        if stream.name == preferred and all(v in stream.values for v in gyro):
+            return stream
+    return home[gyro[0]]
+
+
+class _Merger:
+    """Brings variables onto the rows of the reference stream, field by field, and keeps account of it."""
+
+    def __init__(self, reference: Stream, home: dict[str, Stream]):
+        self.reference, self.home = reference, home
+        self.usable: dict[str, np.ndarray] = {}
+        self._held: dict[str, tuple[Stream, np.ndarray, np.ndarray]] = {}
+
+    def field(self, field: str, choice: Choice) -> np.ndarray:
+        """(rows, columns) in SI units, not yet rotated; NaN where a variable has no sample."""
+        columns, usable = zip(*(self._column(v) for v in choice.variables), strict=True)
+        self.usable[field] = np.all(usable, axis=0)
+        raw = np.stack(columns, axis=1)
+        if field == "rotor_speed":
+            raw = np.where(self.usable[field][:, None] & ~np.isin(raw, choice.invalid), raw, np.nan)
+        elif choice.invalid:
+            bad = np.isin(raw, choice.invalid).any(axis=1)
+            self.usable[field] &= ~bad
+        if choice.form == "compressed":
+            return decompress_quaternion(raw[:, 0])
+        values = raw * choice.factors
+        return from_euler(values) if choice.form == "euler" else values
+
+    def derivative(self, choice: Choice) -> np.ndarray:
+        """Velocity, m/s, from the positions that ``choice`` selects, each differentiated over its own samples."""
+        columns, usable = [], []
+        for name, factor in zip(choice.variables, choice.factors, strict=True):
+            stream = self.home[name]
+            column, ok = self._place(stream, central_difference(stream, stream.values[name]) * factor)
+            columns.append(column)
+            usable.append(ok & ~np.isnan(column))
+        self.usable["velocity"] = np.all(usable, axis=0)
+        return np.stack(columns, axis=1)
+
+    def _column(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        stream = self.home[name]
+        return self._place(stream, stream.values[name])
+
+    def _place(self, stream: Stream, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if stream is self.reference:
+            return values, np.ones(len(values), dtype=bool)
+        if stream.name not in self._held:
+            self._held[stream.name] = (stream, *hold(stream, self.reference.time))
+        _, index, age = self._held[stream.name]
+        return np.where(np.isnan(age), np.nan, values[index]), np.isfinite(age)
+
+    def poses(self, chosen: dict[str, Choice]) -> list[Stream]:
+        """The held streams that position, velocity and quaternion come from."""
+        names = {v for f in ("position", "velocity", "quaternion") for v in chosen[f].variables}
+        return [s for s, *_ in self._held.values() if names & set(s.values)]
+
+    def report(self) -> dict:
+        """Per held stream its interval and the age of the samples used, ms."""
+        out = {}
+        for name, (stream, _, age) in self._held.items():
+            fresh = age[np.isfinite(age)]
+            out[name] = {
+                "interval_ms": round(stream.interval * 1e3, 6),
+                "mean_age_ms": round(float(fresh.mean()) * 1e3, 6) if len(fresh) else 0.0,
+                "max_age_ms": round(float(fresh.max()) * 1e3, 6) if len(fresh) else 0.0,
+                "rows_before_first": int(np.isnan(age).sum()),
+                "rows_too_old": int(np.isinf(age).sum()),
+            }
+        return out
+
+
+def _into_frames(fields: dict[str, np.ndarray], chosen: dict[str, Choice]) -> None:
+    """Rotate a velocity logged in body axes to world, and a specific force logged in world axes to body."""
+    if chosen["velocity"].frame != "body" and chosen["specific_force"].frame != "world":
+        return
+    norm = np.linalg.norm(fields["quaternion"], axis=1, keepdims=True)
+    q = fields["quaternion"] / np.where(norm > 0, norm, np.nan)
+    if chosen["velocity"].frame == "body":
+        fields["velocity"] = rotation.to_world(q, fields["velocity"])
+    if chosen["specific_force"].frame == "world":
+        fields["specific_force"] = rotation.to_body(q, fields["specific_force"])
+
+
+def _backfilled(values: np.ndarray) -> np.ndarray | None:
+    known = np.flatnonzero(~np.isnan(values))
+    if not len(known):
+        return None
+    return np.where(np.arange(len(values)) < known[0], values[known[0]], values)
+
+
+def decompress_quaternion(packed: np.ndarray) -> np.ndarray:
+    """Unit quaternions ``[w, x, y, z]`` (n, 4) from the firmware's 32-bit form (n,); NaN stays NaN.
+
+    The two top bits say which of x, y, z, w is largest and left out (positive); the others follow in that order, ten
+    bits each: a sign and nine bits of magnitude in units of 1 / (511 sqrt 2). Resolution 0.0014, so about 0.2 degrees.
+    Source: ``quatcompress.h`` of bitcraze/crazyflie-firmware (J. A. Preiss).
+    """
+    packed = np.asarray(packed, dtype=np.float64)
+    valid = (packed >= 0) & (packed < 2.0**32)
+    bits = np.where(valid, packed, 0.0).astype(np.uint64)
+    largest = (bits >> np.uint64(30)).astype(int)
+    small = np.empty((len(bits), 3))
+    for i, shift in enumerate((20, 10, 0)):
+        part = (bits >> np.uint64(shift)) & np.uint64(0x3FF)
+        small[:, i] = (part & np.uint64(0x1FF)) / (511.0 * np.sqrt(2.0)) * np.where(part >> np.uint64(9), -1.0, 1.0)
+    rest = np.sqrt(np.maximum(1.0 - np.sum(small**2, axis=1), 0.0))
+    xyzw = np.empty((len(bits), 4))
+    for k in range(4):
+        others = [i for i in range(4) if i != k]
+        mine = largest == k
+        xyzw[np.ix_(mine, others)] = small[mine]
+        xyzw[mine, k] = rest[mine]
+    return np.where(valid[:, None], xyzw[:, [3, 0, 1, 2]], np.nan)
+
+
+def from_euler(angles: np.ndarray) -> np.ndarray:
+    """Quaternions (n, 4) of roll, pitch, yaw (n, 3), rad: the rotation R_z(yaw) R_y(pitch) R_x(roll)."""
+    roll, pitch, yaw = (rotation.exponential(angles[:, [i]] * np.eye(3)[i]) for i in range(3))
+    return rotation.multiply(yaw, rotation.multiply(pitch, roll))
+
+
+def _check_rate_unit(log: FlightLog, choice: Choice, path: Path) -> None:
+    """Refuse a gyro far slower than the attitude turns: rad/s read as deg/s. `validate` sees the opposite mistake."""
+    stride = max(1, round(0.1 / log.nominal_interval))
+    a = np.arange(0, len(log) - stride, stride)
+    turned = rotation.rotation_vector(
+        rotation.multiply(rotation.conjugate(log.quaternion[a]), log.quaternion[a + stride])
+    )
+    rate = turned / (log.time[a + stride] - log.time[a])[:, None]
+    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(log.body_rate, axis=0)])
+    gyro = (sums[a + stride] - sums[a]) / stride
+    xx, yy, xy = float(np.sum(rate**2)), float(np.sum(gyro**2)), float(np.sum(rate * gyro))
+    # The attitude must really turn (0.2 rad/s rms), or the quantised pose of a drone at rest would decide.
+    if len(a) >= 5 and xx > 0.04 * len(a) and yy > 0 and xy > 0.7 * np.sqrt(xx * yy) and xy / xx < 0.05:
+        raise CfbError(
+            f"{path}: the attitude turns {xx / xy:.0f} times faster than the gyro ({' '.join(choice.variables)}, read "
+            f"as {choice.unit}) says; give its unit in a mapping file (mapping=..., see docs/logs.md)."
+        )

@@ -1,0 +1,316 @@
+"""Reader of ROS 2 bags (MCAP) recorded with Crazyswarm2.
+
+The bag describes its messages; what it does not hold are the names of the variables in a custom log topic
+(``crazyflie_interfaces/LogDataGeneric``: header, firmware time stamp in ms, values). They stand in the
+``crazyflies.yaml`` the server was started with, under ``firmware_logging: custom_topics: NAME: {frequency, vars}`` of
+``all``, the robot's type or the robot (later ones win, as in IMRCLab/crazyswarm2).
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+from collections import defaultdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs.assembly import Import, assemble
+from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.streams import RADIO_WRAP_MS, Stream, ordered, unwrap
+from cfb_mjx.logs.variables import VariableMap, load_mapping, read_yaml
+
+_MAGIC = b"\x89MCAP0\r\n"
+_GENERIC = "LogDataGeneric"
+# Message type (without its package) to the prefix of the variables made of it.
+_TYPES = {_GENERIC: "", "PoseStamped": "pose", "Odometry": "odom", "Status": "status"}
+_BIN = 5.0  # s over which the fastest packet is looked for when two clocks are compared
+_STEPPED = 0.02  # s: fastest packets that scatter more than this mean that the computer's clock was set meanwhile
+
+
+class _Message(NamedTuple):
+    topic: str
+    kind: str
+    logged_ns: int
+    content: Any
+    float32: bool
+
+
+def recognises(path: str | os.PathLike) -> bool:
+    """Whether an MCAP holds ROS 2 messages: its profile says so, or its summary lists ROS 2 schemas."""
+    with open(path, "rb") as file:
+        head = file.read(85)  # magic, record type (1 byte), its length (8), length of the profile (4), profile
+        file.seek(max(0, file.seek(0, os.SEEK_END) - (1 << 18)))
+        tail = file.read()
+    return head[21 : 21 + int.from_bytes(head[17:21], "little")] == b"ros2" or b"ros2msg" in tail
+
+
+def read_crazyswarm(
+    path: str | os.PathLike,
+    mapping: str | os.PathLike | VariableMap | None = None,
+    topics_yaml: str | os.PathLike | None = None,
+    robot: str | None = None,
+) -> FlightLog:
+    """Read one robot's flight from a bag. `read_log` also validates the content.
+
+    Custom log topics are placed by their firmware time stamps. Other messages have only the time at which the computer
+    stamped them; it is brought onto the firmware's clock through the fastest packets of the custom topics, so what
+    travels by radio too is placed right but for its own jitter, and motion capture is early by the unknown shortest
+    time of a packet. Without firmware time stamps all rests on the computer's clock.
+
+    Args:
+        path: the ``.mcap`` of the bag.
+        mapping: which variable is which column; a mapping file, or None for ``configs/logs/crazyflie.yaml``. Poses are
+            ``pose.x .. pose.qz``, odometry ``odom.x .. odom.wz``, the battery of Status ``status.battery_voltage``.
+        topics_yaml: the ``crazyflies.yaml`` in use; without it custom log topics cannot be read.
+        robot: its name, the first part of its topics; needed when the bag has several.
+
+    Raises:
+        CfbError: unreadable or damaged file, no or several robots, a custom topic whose number of values differs from
+            its number of names, time that goes back, required variables that were not logged, fewer than two rows.
+    """
+    path = Path(path)
+    mapping = mapping if isinstance(mapping, VariableMap) else load_mapping(mapping)
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise CfbError(f"{path}: there is no such file; check the path.") from None
+    except OSError as error:
+        raise CfbError(
+            f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions."
+        ) from None
+    if not data.startswith(_MAGIC):
+        raise CfbError(f"{path}: this is not an MCAP file; give the .mcap inside the bag's folder.")
+    notes: list[str] = []
+    warnings: list[str] = []
+    messages = _messages(data, path, warnings)
+    robot = _robot(messages, robot, path)
+    by_topic: dict[str, list[_Message]] = defaultdict(list)
+    for message in messages:
+        if message.topic.startswith(f"/{robot}/"):
+            by_topic[message.topic[len(robot) + 2 :]].append(message)
+    names = {} if topics_yaml is None else _custom_topics(Path(topics_yaml), robot)
+    tables = [t for topic, group in by_topic.items() if (t := _table(topic, group, names, path, notes)) is not None]
+    if topics_yaml is None and any(group[0].kind == _GENERIC for group in by_topic.values()):
+        notes.append("custom log topics were left out: their variable names are in the crazyflies.yaml (topics_yaml=).")
+    streams, clock = _one_clock(tables, path, notes, warnings)
+    if any(s.name == "odom" for s in streams):
+        notes.append(
+            "Crazyswarm2's cflib server publishes odometry with the pitch inverted, rates in deg/s and velocity in "
+            "body axes; log stateEstimate.* and gyro.* in custom topics instead."
+        )
+    read = Import("crazyswarm", streams, None, notes, warnings, {"robot": robot, "clock": clock})
+    try:
+        return assemble(read, mapping, path)
+    except CfbError as error:
+        left_out = [n for n in notes if "left out: their variable names" in n or "float32" in n]
+        raise CfbError(" ".join([str(error), *left_out])) from None
+
+
+class _Table(NamedTuple):
+    """Messages of one topic: computer time (ns), firmware time (ms, 0 where unknown) and values by name."""
+
+    topic: str
+    stamp_ns: np.ndarray
+    ticks_ms: np.ndarray | None
+    values: dict[str, np.ndarray]
+    float32: bool
+
+
+def _messages(data: bytes, path: Path, warnings: list[str]) -> list[_Message]:
+    """Messages of the types of interest in file order; what cannot be read any more goes into ``warnings``."""
+    from mcap.records import Channel, Message, Schema
+    from mcap.stream_reader import StreamReader
+    from mcap_ros2.decoder import DecoderFactory
+
+    factory, schemas, channels, out, foreign = DecoderFactory(), {}, {}, [], set()
+    try:
+        for item in StreamReader(io.BytesIO(data), validate_crcs=True, record_size_limit=len(data)).records:
+            if isinstance(item, Schema):
+                schemas[item.id] = item
+            elif isinstance(item, Channel):
+                channels[item.id] = item
+            elif isinstance(item, Message):
+                channel = channels[item.channel_id]
+                schema = schemas[channel.schema_id]
+                kind = schema.name.rpartition("/")[2]
+                if kind not in _TYPES or channel.topic.count("/") < 2:
+                    continue
+                decode = factory.decoder_for(channel.message_encoding, schema)
+                if decode is None:
+                    foreign.add(f"{channel.topic} ({channel.message_encoding}, {schema.encoding})")
+                    continue
+                single = re.search(rb"float32\[\]\s+values", schema.data) is not None
+                out.append(_Message(channel.topic, kind, item.log_time, decode(item.data), single))
+    except Exception as error:  # the MCAP library lets struct, codec and lookup errors of damaged bytes through
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        kind = "cut short" if not data.endswith(_MAGIC) else "damaged"
+        if not out:
+            raise CfbError(f"{path}: the MCAP file is {kind} ({reason}); copy the bag again.") from None
+        warnings.append(f"the MCAP file is {kind} ({reason}); what follows in it was left out.")
+    if foreign:
+        raise CfbError(
+            f"{path}: {', '.join(sorted(foreign))} is not encoded as CDR with ros2msg descriptions, which is what this "
+            "library reads; record the bag again with a newer rosbag2 (storage mcap)."
+        )
+    return out
+
+
+def _robot(messages: list[_Message], robot: str | None, path: Path) -> str:
+    robots = sorted({m.topic.split("/")[1] for m in messages})
+    listed = ", ".join(robots) or "none"
+    if robot is not None and robot.strip("/") not in robots:
+        raise CfbError(f"{path}: there is no robot {robot!r} in the bag; its robots are {listed}.")
+    if robot is None and len(robots) != 1:
+        what = "holds several robots" if robots else "holds no pose, odometry or log topic like /cf231/pose"
+        raise CfbError(f"{path}: the bag {what} (found: {listed}); choose one with robot=NAME.")
+    return robots[0] if robot is None else robot.strip("/")
+
+
+def _custom_topics(path: Path, robot: str) -> dict[str, list[str]]:
+    """Variable names per custom topic of the robot."""
+    document = read_yaml(path)
+    robots = _mapping(document.get("robots"), path, "robots")
+    own = _mapping(robots.get(robot), path, f"robots.{robot}")
+    types = _mapping(document.get("robot_types"), path, "robot_types")
+    topics: dict[str, list[str]] = {}
+    blocks = {
+        "all": document.get("all"),
+        f"robot_types.{own.get('type')}": types.get(own.get("type")),
+        f"robots.{robot}": own,
+    }
+    for where, block in blocks.items():
+        where = f"{where}.firmware_logging"
+        logging = _mapping(_mapping(block, path, where).get("firmware_logging"), path, where)
+        for name, topic in _mapping(logging.get("custom_topics"), path, f"{where}.custom_topics").items():
+            names = _mapping(topic, path, f"{where}.custom_topics.{name}").get("vars")
+            if not isinstance(names, list) or not names or not all(isinstance(v, str) for v in names):
+                raise CfbError(f"{path}: {where}.custom_topics.{name}.vars must list the names of the variables.")
+            topics[str(name)] = names
+    return topics
+
+
+def _mapping(value: Any, path: Path, where: str) -> dict:
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise CfbError(f"{path}: {where} must be a mapping, found {type(value).__name__}.")
+    return value
+
+
+def _table(topic: str, group: list[_Message], names: dict, path: Path, notes: list[str]) -> _Table | None:
+    kind = group[0].kind
+    logged = np.array([m.logged_ns for m in group], dtype=np.uint64).astype(np.int64)
+    headers = [m.content.header.stamp for m in group]
+    stamps = np.array([int(s.sec) * 1_000_000_000 + int(s.nanosec) for s in headers], dtype=np.int64)
+    if (stamps == 0).any():
+        notes.append(f"{topic}: headers without a time stamp; the time of recording was used.")
+        stamps = logged
+    ticks, single = None, False
+    if kind == _GENERIC:
+        if topic not in names:
+            if names:
+                notes.append(f"{topic}: not in topics_yaml; left out.")
+            return None
+        values = _generic(topic, group, names[topic], path)
+        ticks = np.array([m.content.timestamp for m in group], dtype=np.int64)
+        ticks, single = None if (ticks == 0).all() else ticks, group[0].float32
+    else:
+        rows = np.array([_row(kind, m.content) for m in group], dtype=np.float64)
+        values = dict(zip(_columns(kind), rows.T, strict=True))
+    return _Table(topic, stamps, ticks, values, single)
+
+
+def _generic(topic: str, group: list[_Message], names: list[str], path: Path) -> dict[str, np.ndarray]:
+    for row, message in enumerate(group):
+        if len(message.content.values) != len(names):
+            raise CfbError(
+                f"{path}: message {row} of {topic} has {len(message.content.values)} values, but topics_yaml names "
+                f"{len(names)} ({', '.join(names)}); give the crazyflies.yaml that was in use."
+            )
+    rows = np.array([m.content.values for m in group], dtype=np.float64)
+    return dict(zip(names, rows.T, strict=True))
+
+
+def _columns(kind: str) -> list[str]:
+    prefix = _TYPES[kind]
+    pose = ["x", "y", "z", "qw", "qx", "qy", "qz"]
+    rest = {"PoseStamped": pose, "Odometry": [*pose, "vx", "vy", "vz", "wx", "wy", "wz"], "Status": ["battery_voltage"]}
+    return [f"{prefix}.{c}" for c in rest[kind]]
+
+
+def _row(kind: str, message: Any) -> list[float]:
+    if kind == "Status":
+        return [message.battery_voltage]
+    pose = message.pose if kind == "PoseStamped" else message.pose.pose
+    p, q = pose.position, pose.orientation
+    row = [p.x, p.y, p.z, q.w, q.x, q.y, q.z]
+    if kind == "Odometry":
+        v, w = message.twist.twist.linear, message.twist.twist.angular
+        row += [v.x, v.y, v.z, w.x, w.y, w.z]
+    return row
+
+
+def _one_clock(tables: list[_Table], path: Path, notes: list[str], warnings: list[str]) -> tuple[list[Stream], dict]:
+    """Streams in s on the firmware's clock where it is known, else on the computer's, and a report of how."""
+    if not tables:
+        return [], {"of": "none"}
+    origin = min(int(t.stamp_ns.min()) for t in tables)
+    computer = [(t.stamp_ns - origin) / 1e9 for t in tables]
+    firmware: list[np.ndarray | None] = []
+    reference = None
+    for table, seconds in zip(tables, computer, strict=True):
+        if table.ticks_ms is None:
+            firmware.append(None)
+            continue
+        ticks, wraps = unwrap(table.ticks_ms, RADIO_WRAP_MS)
+        # A topic that starts after an overflow of the 24-bit counter must land beside those that began before it.
+        lag = float(np.median(seconds - ticks / 1e3))
+        reference = lag if reference is None else reference
+        ticks = ticks + RADIO_WRAP_MS * round((lag - reference) / (RADIO_WRAP_MS / 1e3))
+        if wraps:
+            notes.append(f"{table.topic}: the 24-bit time stamp overflowed {wraps} times; it was continued.")
+        firmware.append(ticks / 1e3)
+    pairs = [(f, c) for f, c in zip(firmware, computer, strict=True) if f is not None]
+    if pairs:
+        slope, offset, clock = _fastest_packets(*(np.concatenate(p) for p in zip(*pairs, strict=True)))
+        if clock["scatter_ms"] > _STEPPED * 1e3:
+            warnings.append(
+                f"the computer's clock wandered by {clock['scatter_ms']:.0f} ms against the firmware's; poses may be "
+                "out of step with the gyro."
+            )
+        placed = [(c - offset) / slope if f is None else f for f, c in zip(firmware, computer, strict=True)]
+    else:
+        clock = {"of": "computer"}
+        notes.append("no topic has firmware time stamps; rows carry the time at which the computer stamped them.")
+        placed = computer
+    streams = []
+    for table, time in zip(tables, placed, strict=True):
+        streams.append(ordered(Stream(table.topic, time, table.values, table.float32), path, notes))
+    return streams, clock
+
+
+def _fastest_packets(firmware: np.ndarray, computer: np.ndarray) -> tuple[float, float, dict]:
+    """Computer time as slope * firmware time + offset through the packets that travelled fastest, in bins of 5 s."""
+    delay = computer - firmware
+    bins = np.floor((firmware - firmware.min()) / _BIN).astype(int)
+    order = np.lexsort((delay, bins))
+    first = order[np.concatenate([[True], np.diff(bins[order]) > 0])]
+    if len(first) >= 4:
+        drift, offset = np.polyfit(firmware[first], delay[first], 1)
+    else:
+        drift, offset = 0.0, float(delay.min())
+    late = delay - offset - drift * firmware
+    return (
+        1.0 + float(drift),
+        float(offset),
+        {
+            "of": "firmware",
+            "drift_ppm": round(float(drift) * 1e6, 3),
+            "median_lateness_ms": round(float(np.median(late)) * 1e3, 3),
+            "scatter_ms": round(float(np.abs(late[first]).max()) * 1e3, 3),
+        },
+    )

@@ -1,0 +1,212 @@
+"""Which logged variable is which `FlightLog` column: the mapping file, its units and its choices.
+
+The shipped mapping is ``configs/logs/crazyflie.yaml``, which also explains the keys. Names, units and signs follow the
+log groups of bitcraze/crazyflie-firmware.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import shipped
+from cfb_mjx.logs.flight_log import OPTIONAL, REQUIRED
+
+FORMAT = "cfb_mjx.variables/1"
+DEFAULT = "crazyflie"
+_RPM = 2.0 * math.pi / 60.0
+# Factors to SI. g: the firmware scales its accelerometer so that rest reads 1, so 1 g is the model's gravity.
+UNITS: dict[str, dict[str, float]] = {
+    "position": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "quaternion": {"1": 1.0, "deg": math.pi / 180.0, "rad": 1.0},
+    "body_rate": {"rad/s": 1.0, "deg/s": math.pi / 180.0, "mrad/s": 1e-3},
+    "specific_force": {"m/s^2": 1.0, "mm/s^2": 1e-3, "g": 9.81},
+    "command": {"1": 1.0, "percent": 1e-2, "pwm16": 1.0 / 65535.0},
+    "rotor_speed": {"rad/s": 1.0, "rpm": _RPM, "erpm": _RPM / 6.0},  # 12 poles: 6 electrical turns per turn
+    "battery_voltage": {"V": 1.0, "mV": 1e-3},
+}
+FIELDS = tuple(f for f in (*REQUIRED, *OPTIONAL) if f != "time")
+_WIDTH = {"quaternion": 4, "command": 4, "rotor_speed": 4, "battery_voltage": 1}
+_FORM_WIDTH = {"components": 4, "compressed": 1, "euler": 3}
+_FRAMES = {"velocity": "world", "specific_force": "body"}  # the only fields with a choice, and its default
+_CHOICE_KEYS = {"variables", "unit", "sign", "frame", "form", "invalid"}
+_FIRMWARE_KEYS = ("version", "battery_compensation", "thrust_limit")
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """One way to fill a field.
+
+    Attributes:
+        variables: logged names in the order of the field's columns; empty for a velocity derived from positions.
+        unit: of the logged numbers, a key of `UNITS` of the field.
+        factors: to SI, sign included, one per variable.
+        frame: ``world`` or ``body``, for velocity and specific force.
+        form: of a quaternion: ``components``, ``compressed`` or ``euler``.
+        invalid: logged numbers that stand for a missing measurement.
+    """
+
+    variables: tuple[str, ...]
+    unit: str = ""
+    factors: tuple[float, ...] = ()
+    frame: str = ""
+    form: str = ""
+    invalid: tuple[float, ...] = ()
+
+    @property
+    def derived(self) -> bool:
+        """Whether this velocity is to be derived from the positions."""
+        return not self.variables
+
+    def report(self) -> dict:
+        """What was read, in JSON terms."""
+        if self.derived:
+            return {"derived": "position"}
+        extra = {k: getattr(self, k) for k in ("frame", "form") if getattr(self, k)}
+        signs = [1 if f > 0 else -1 for f in self.factors]
+        return {"variables": list(self.variables), "unit": self.unit, **extra} | (
+            {"sign": signs} if -1 in signs else {}
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class VariableMap:
+    """A mapping file: the choices of every field in order of preference, and what the user states about the vehicle."""
+
+    name: str
+    choices: dict[str, tuple[Choice, ...]]
+    firmware: dict[str, Any]
+    observation_delay: float | None
+
+    def choose(self, available: Collection[str], path: Path) -> dict[str, Choice]:
+        """The first choice of each field whose variables are all available; optional fields may be absent.
+
+        Raises:
+            CfbError: a required field has none; the message lists what is missing and what was found.
+        """
+        found = {}
+        for field in FIELDS:
+            for choice in self.choices.get(field, ()):
+                usable = "position" in found if choice.derived else all(v in available for v in choice.variables)
+                if usable:
+                    found[field] = choice
+                    break
+        missing = [f for f in FIELDS if f in REQUIRED and f not in found]
+        if missing:
+            wanted = "; ".join(f"{f} ({self._wanted(f, available)})" for f in missing)
+            listed = ", ".join(sorted(available)) or "none"
+            raise CfbError(
+                f"{path}: no logged variables for {wanted}. Found: {listed}. Log the missing ones too, or say under "
+                "which names and units they are with a mapping file (mapping=..., a changed copy of "
+                "configs/logs/crazyflie.yaml, see docs/logs.md)."
+            )
+        return found
+
+    def _wanted(self, field: str, available: Collection[str]) -> str:
+        options = [c for c in self.choices.get(field, ()) if not c.derived]
+        if not options:
+            return "the mapping names none"
+        # The choice that lacks the fewest variables is the one the user most likely meant.
+        best = min(options, key=lambda c: sum(v not in available for v in c.variables) / len(c.variables))
+        return "missing " + " ".join(v for v in best.variables if v not in available)
+
+
+def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
+    """Read a mapping file; None is the shipped one for a Crazyflie.
+
+    Raises:
+        CfbError: missing file, broken YAML, unknown keys, fields or units, wrong number of variables.
+    """
+    path = shipped("configs", "logs", f"{DEFAULT}.yaml") if source is None else Path(source)
+    document = read_yaml(path)
+    _only(document, {"format", "name", "fields", "firmware", "observation_delay"}, path, "the file")
+    if document.get("format") != FORMAT:
+        raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
+    fields = document.get("fields")
+    if not isinstance(fields, dict):
+        raise CfbError(f"{path}: 'fields' must map field names to lists of choices.")
+    _only(fields, set(FIELDS), path, "fields")
+    choices = {}
+    for field, listed in fields.items():
+        if not isinstance(listed, list) or not all(isinstance(c, dict) for c in listed):
+            raise CfbError(f"{path}: fields.{field} must be a list of choices, each a mapping with 'variables'.")
+        choices[field] = tuple(_choice(field, c, path) for c in listed)
+    firmware = document.get("firmware") or {}
+    if not isinstance(firmware, dict):
+        raise CfbError(f"{path}: 'firmware' must be a mapping of {', '.join(_FIRMWARE_KEYS)}.")
+    _only(firmware, set(_FIRMWARE_KEYS), path, "firmware")
+    delay = document.get("observation_delay")
+    if delay is not None and not (_is_number(delay) and 0.0 <= delay < 1.0):
+        raise CfbError(f"{path}: 'observation_delay' must be in seconds, from 0 to 1, or null; found {delay!r}.")
+    return VariableMap(
+        name=str(document.get("name", path.stem)),
+        choices=choices,
+        firmware={k: firmware.get(k) for k in _FIRMWARE_KEYS},
+        observation_delay=None if delay is None else float(delay),
+    )
+
+
+def read_yaml(path: str | os.PathLike) -> dict:
+    """Read a YAML file that holds a mapping.
+
+    Raises:
+        CfbError: the file is missing, unreadable, not YAML, or holds something else.
+    """
+    import yaml
+
+    try:
+        document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise CfbError(f"{path}: there is no such file; check the path.") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CfbError(f"{path}: cannot be read as text ({error}).") from None
+    except (yaml.YAMLError, RecursionError, ValueError) as error:
+        raise CfbError(f"{path}: is not valid YAML ({' '.join(str(error).split())}).") from None
+    if not isinstance(document, dict):
+        raise CfbError(f"{path}: must hold a YAML mapping, found {type(document).__name__}.")
+    return document
+
+
+def _choice(field: str, raw: dict, path: Path) -> Choice:
+    where = f"fields.{field}"
+    if "derived" in raw:
+        if field != "velocity" or raw != {"derived": "position"}:
+            raise CfbError(f"{path}: {where}: 'derived: position' stands alone and exists for the velocity only.")
+        return Choice(())
+    _only(raw, _CHOICE_KEYS, path, where)
+    form = raw.get("form", "components") if field == "quaternion" else ""
+    if (field != "quaternion" and "form" in raw) or (form and form not in _FORM_WIDTH):
+        raise CfbError(f"{path}: {where}: 'form' is for quaternions and one of {', '.join(_FORM_WIDTH)}.")
+    frame = raw.get("frame", _FRAMES.get(field, ""))
+    if frame not in (("world", "body") if field in _FRAMES else ("",)):
+        raise CfbError(f"{path}: {where}: 'frame' is for velocity and specific_force, world or body; found {frame!r}.")
+    names, width = raw.get("variables"), _FORM_WIDTH.get(form) or _WIDTH.get(field, 3)
+    if not isinstance(names, list) or len(names) != width or not all(isinstance(v, str) for v in names):
+        raise CfbError(f"{path}: {where}: 'variables' must list {width} name{'s' * (width > 1)}; found {names!r}.")
+    unit = str(raw.get("unit", "1" if "1" in UNITS[field] else ""))
+    if unit not in UNITS[field] or (field == "quaternion" and (unit == "1") == (form == "euler")):
+        raise CfbError(f"{path}: {where}: unit {unit!r} is not one of {', '.join(UNITS[field])} or does not fit.")
+    if form == "compressed" and "sign" in raw:
+        raise CfbError(f"{path}: {where}: a compressed quaternion has no 'sign'; leave it out.")
+    sign, invalid = raw.get("sign", [1] * width), raw.get("invalid", [])
+    if not isinstance(sign, list) or len(sign) != width or any(isinstance(s, bool) or s not in (1, -1) for s in sign):
+        raise CfbError(f"{path}: {where}: 'sign' must list {width} times 1 or -1; found {sign!r}.")
+    if not isinstance(invalid, list) or not all(_is_number(v) for v in invalid):
+        raise CfbError(f"{path}: {where}: 'invalid' must be a list of numbers; found {invalid!r}.")
+    factors = tuple(s * UNITS[field][unit] for s in sign)
+    return Choice(tuple(names), unit, factors, frame, form, tuple(float(v) for v in invalid))
+
+
+def _only(mapping: dict, allowed: set[str], path: Path, where: str) -> None:
+    if unknown := [str(k) for k in mapping if k not in allowed]:
+        raise CfbError(f"{path}: {where} has unknown key {unknown[0]!r}; allowed are {', '.join(sorted(allowed))}.")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -1,0 +1,133 @@
+"""A log prepared for fitting: contiguous segments on rows, padded to one shape, and the noise its sensors show."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from cfb_mjx.logs import FlightLog
+
+ROWS_PER_SEGMENT = 512
+"""Long flights are cut into segments of this many rows: they run side by side, and are the blocks of the bootstrap."""
+
+
+class Segments(eqx.Module):
+    """S contiguous pieces of flight, N rows each; the last row of a short piece is repeated with zero time between."""
+
+    interval: Float[Array, "s n"]
+    """Time from the previous row, s; 0 at the first row and in the padding."""
+    valid: Float[Array, "s n"]
+    """1 for rows that are measured, 0 for the padding."""
+    command: Float[Array, "s n 4"]
+    rotor_speed: Float[Array, "s n 4"]
+    """Measured, rad/s; what it holds where ``measured`` is 0 means nothing."""
+    measured: Float[Array, "s"]
+    """1 where every rotor speed of the piece was measured."""
+    warm_up: Float[Array, "s n"]
+    """1 for rows used to find the rotor speed and the filter's state only."""
+    body_rate: Float[Array, "s n 3"]
+    specific_force: Float[Array, "s n 3"]
+
+
+@dataclass(frozen=True)
+class FlightData:
+    """Segments of several logs together."""
+
+    segments: Segments
+    log_of_segment: np.ndarray
+    rate_noise: np.ndarray
+    """(3,) gyro noise, rad/s."""
+    specific_force_noise: np.ndarray
+    """(3,) accelerometer noise, m/s^2."""
+    rotor_speed_noise: float
+    """rad/s; NaN where none was measured."""
+
+    @property
+    def rows(self) -> int:
+        """Measured rows."""
+        return int(np.sum(np.asarray(self.segments.valid)))
+
+
+def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
+    """Cut logs at their gaps into segments that overlap by ``warm_up`` seconds.
+
+    Args:
+        logs: flights.
+        warm_up: time at the start of each segment in which the motor model forgets its guessed start, s (eight motor
+            time constants).
+    """
+    pieces, owners = [], []
+    for index, log in enumerate(logs):
+        lead = max(2, round(warm_up / log.nominal_interval))
+        edges = np.concatenate([[0], log.gaps() + 1, [len(log.time)]]).astype(int)
+        for begin, end in itertools.pairwise(edges):
+            first = begin
+            while end - first > lead + 16:
+                last = min(first + lead + ROWS_PER_SEGMENT, end)
+                pieces.append((log, first, last, lead))
+                owners.append(index)
+                first = last - lead
+                if last == end:
+                    break
+    width = max((last - first for _, first, last, _ in pieces), default=1)
+    built = [_segment(*piece, width) for piece in pieces]
+    stacked = {key: np.stack([b[key] for b in built]) for key in built[0]} if built else None
+    noise = [_noise(log) for log in logs]
+    return FlightData(
+        segments=Segments(**stacked) if stacked else None,
+        log_of_segment=np.array(owners, dtype=int),
+        rate_noise=np.median([n[0] for n in noise], axis=0),
+        specific_force_noise=np.median([n[1] for n in noise], axis=0),
+        rotor_speed_noise=float(np.median([n[2] for n in noise])),
+    )
+
+
+def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> dict[str, np.ndarray]:
+    rows = slice(first, last)
+    count = last - first
+    speed = np.zeros((count, 4)) if log.rotor_speed is None else log.rotor_speed[rows].copy()
+    measured = log.rotor_speed is not None
+    for motor in range(4 if measured else 0):
+        good = np.isfinite(speed[:, motor])
+        # A bad reading or two is bridged; a motor that is silent for longer makes the piece unmeasured.
+        longest = max((len(list(run)) for run in _runs(~good)), default=0)
+        if longest > 2 or not good.any():
+            measured = False
+            speed[:, motor] = 0.0
+        else:
+            speed[:, motor] = np.interp(np.arange(count), np.flatnonzero(good), speed[good, motor])
+
+    def pad(values):
+        return np.concatenate([values, np.repeat(values[-1:], width - count, axis=0)])
+
+    padding = np.arange(width) >= count
+    return {
+        "interval": np.where(padding, 0.0, pad(np.concatenate([[0.0], np.diff(log.time[rows])]))),
+        "valid": (~padding).astype(float),
+        "command": pad(np.clip(log.command[rows], 0, 1)),
+        "rotor_speed": pad(speed),
+        "measured": np.array(float(measured)),
+        "warm_up": (np.arange(width) < lead).astype(float),
+        "body_rate": pad(log.body_rate[rows]),
+        "specific_force": pad(log.specific_force[rows]),
+    }
+
+
+def _runs(mask: np.ndarray):
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    return [range(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _noise(log: FlightLog) -> tuple[np.ndarray, np.ndarray, float]:
+    """White noise of a smooth signal from its third differences (variance factor 20), robustly."""
+
+    def level(values):
+        third = np.diff(values, n=3, axis=0)
+        return 1.4826 * np.nanmedian(np.abs(third), axis=0) / np.sqrt(20.0)
+
+    speed = np.nan if log.rotor_speed is None else float(np.nanmean(level(log.rotor_speed)))
+    return level(log.body_rate), level(log.specific_force), speed
