@@ -8,9 +8,7 @@ The bag describes its messages; what it does not hold are the names of the varia
 
 from __future__ import annotations
 
-import io
 import os
-import re
 from collections import defaultdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,32 +18,24 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.assembly import Import, assemble
 from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.ros_bag import (
+    GENERIC,
+    MAGIC,
+    ODOMETRY,
+    POSE,
+    STATUS,
+    VARIABLES,
+    BagMessage,
+    lacks_checksums,
+    read_messages,
+)
 from cfb_mjx.logs.streams import RADIO_WRAP_MS, Stream, ordered, unwrap
-from cfb_mjx.logs.variables import VariableMap, load_mapping, read_yaml
+from cfb_mjx.logs.variables import FIELDS, VariableMap, load_mapping, read_yaml
 
-_MAGIC = b"\x89MCAP0\r\n"
-_GENERIC = "LogDataGeneric"
-# Message type (without its package) to the prefix of the variables made of it.
-_TYPES = {_GENERIC: "", "PoseStamped": "pose", "Odometry": "odom", "Status": "status"}
+_TICK = 0.001  # s: the firmware's stamps are no finer, nor can another clock be brought closer to them
+_OVERTAKING = 0.1  # s by which messages may overtake each other on their way into the bag
 _BIN = 5.0  # s over which the fastest packet is looked for when two clocks are compared
 _STEPPED = 0.02  # s: fastest packets that scatter more than this mean that the computer's clock was set meanwhile
-
-
-class _Message(NamedTuple):
-    topic: str
-    kind: str
-    logged_ns: int
-    content: Any
-    float32: bool
-
-
-def recognises(path: str | os.PathLike) -> bool:
-    """Whether an MCAP holds ROS 2 messages: its profile says so, or its summary lists ROS 2 schemas."""
-    with open(path, "rb") as file:
-        head = file.read(85)  # magic, record type (1 byte), its length (8), length of the profile (4), profile
-        file.seek(max(0, file.seek(0, os.SEEK_END) - (1 << 18)))
-        tail = file.read()
-    return head[21 : 21 + int.from_bytes(head[17:21], "little")] == b"ros2" or b"ros2msg" in tail
 
 
 def read_crazyswarm(
@@ -82,32 +72,41 @@ def read_crazyswarm(
         raise CfbError(
             f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions."
         ) from None
-    if not data.startswith(_MAGIC):
+    if not data.startswith(MAGIC):
         raise CfbError(f"{path}: this is not an MCAP file; give the .mcap inside the bag's folder.")
     notes: list[str] = []
     warnings: list[str] = []
-    messages = _messages(data, path, warnings)
+    messages = read_messages(data, path, warnings)
+    if lacks_checksums(data):
+        notes.append("the bag has no checksums, so damage to values in it would go unnoticed.")
     robot = _robot(messages, robot, path)
-    by_topic: dict[str, list[_Message]] = defaultdict(list)
+    by_topic: dict[str, list[BagMessage]] = defaultdict(list)
     for message in messages:
         if message.topic.startswith(f"/{robot}/"):
             by_topic[message.topic[len(robot) + 2 :]].append(message)
     names = {} if topics_yaml is None else _custom_topics(Path(topics_yaml), robot)
-    tables = [t for topic, group in by_topic.items() if (t := _table(topic, group, names, path, notes)) is not None]
-    if topics_yaml is None and any(group[0].kind == _GENERIC for group in by_topic.values()):
+    try:
+        read = [_table(topic, group, names, path, notes) for topic, group in by_topic.items()]
+    except AttributeError as error:  # a message of a known name with other fields
+        raise CfbError(f"{path}: a message is not what Crazyswarm2 records ({error}); record the bag again.") from None
+    tables = [t for t in read if t is not None]
+    if topics_yaml is None and any(group[0].kind == GENERIC for group in by_topic.values()):
         notes.append("custom log topics were left out: their variable names are in the crazyflies.yaml (topics_yaml=).")
     streams, clock = _one_clock(tables, path, notes, warnings)
-    if any(s.name == "odom" for s in streams):
-        notes.append(
-            "Crazyswarm2's cflib server publishes odometry with the pitch inverted, rates in deg/s and velocity in "
-            "body axes; log stateEstimate.* and gyro.* in custom topics instead."
-        )
-    read = Import("crazyswarm", streams, None, notes, warnings, {"robot": robot, "clock": clock})
     try:
-        return assemble(read, mapping, path)
+        imported = Import("crazyswarm", streams, None, notes, warnings, {"robot": robot, "clock": clock})
+        log = assemble(imported, mapping, path)
     except CfbError as error:
         left_out = [n for n in notes if "left out: their variable names" in n or "float32" in n]
         raise CfbError(" ".join([str(error), *left_out])) from None
+    used = log.metadata["variables"]
+    from_odometry = [f for f in FIELDS if f in used and used[f].get("variables", [""])[0].startswith("odom.")]
+    if from_odometry:
+        warnings.append(
+            f"{', '.join(from_odometry)} come from Odometry, which Crazyswarm2's cflib server fills with an inverted "
+            "pitch, rates in deg/s and a velocity in body axes; log stateEstimate.* and gyro.* in custom topics instead."
+        )
+    return log.replace(metadata={"warnings": warnings})
 
 
 class _Table(NamedTuple):
@@ -120,46 +119,7 @@ class _Table(NamedTuple):
     float32: bool
 
 
-def _messages(data: bytes, path: Path, warnings: list[str]) -> list[_Message]:
-    """Messages of the types of interest in file order; what cannot be read any more goes into ``warnings``."""
-    from mcap.records import Channel, Message, Schema
-    from mcap.stream_reader import StreamReader
-    from mcap_ros2.decoder import DecoderFactory
-
-    factory, schemas, channels, out, foreign = DecoderFactory(), {}, {}, [], set()
-    try:
-        for item in StreamReader(io.BytesIO(data), validate_crcs=True, record_size_limit=len(data)).records:
-            if isinstance(item, Schema):
-                schemas[item.id] = item
-            elif isinstance(item, Channel):
-                channels[item.id] = item
-            elif isinstance(item, Message):
-                channel = channels[item.channel_id]
-                schema = schemas[channel.schema_id]
-                kind = schema.name.rpartition("/")[2]
-                if kind not in _TYPES or channel.topic.count("/") < 2:
-                    continue
-                decode = factory.decoder_for(channel.message_encoding, schema)
-                if decode is None:
-                    foreign.add(f"{channel.topic} ({channel.message_encoding}, {schema.encoding})")
-                    continue
-                single = re.search(rb"float32\[\]\s+values", schema.data) is not None
-                out.append(_Message(channel.topic, kind, item.log_time, decode(item.data), single))
-    except Exception as error:  # the MCAP library lets struct, codec and lookup errors of damaged bytes through
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        kind = "cut short" if not data.endswith(_MAGIC) else "damaged"
-        if not out:
-            raise CfbError(f"{path}: the MCAP file is {kind} ({reason}); copy the bag again.") from None
-        warnings.append(f"the MCAP file is {kind} ({reason}); what follows in it was left out.")
-    if foreign:
-        raise CfbError(
-            f"{path}: {', '.join(sorted(foreign))} is not encoded as CDR with ros2msg descriptions, which is what this "
-            "library reads; record the bag again with a newer rosbag2 (storage mcap)."
-        )
-    return out
-
-
-def _robot(messages: list[_Message], robot: str | None, path: Path) -> str:
+def _robot(messages: list[BagMessage], robot: str | None, path: Path) -> str:
     robots = sorted({m.topic.split("/")[1] for m in messages})
     listed = ", ".join(robots) or "none"
     if robot is not None and robot.strip("/") not in robots:
@@ -201,7 +161,7 @@ def _mapping(value: Any, path: Path, where: str) -> dict:
     return value
 
 
-def _table(topic: str, group: list[_Message], names: dict, path: Path, notes: list[str]) -> _Table | None:
+def _table(topic: str, group: list[BagMessage], names: dict, path: Path, notes: list[str]) -> _Table | None:
     kind = group[0].kind
     logged = np.array([m.logged_ns for m in group], dtype=np.uint64).astype(np.int64)
     headers = [m.content.header.stamp for m in group]
@@ -210,7 +170,7 @@ def _table(topic: str, group: list[_Message], names: dict, path: Path, notes: li
         notes.append(f"{topic}: headers without a time stamp; the time of recording was used.")
         stamps = logged
     ticks, single = None, False
-    if kind == _GENERIC:
+    if kind == GENERIC:
         if topic not in names:
             if names:
                 notes.append(f"{topic}: not in topics_yaml; left out.")
@@ -220,11 +180,11 @@ def _table(topic: str, group: list[_Message], names: dict, path: Path, notes: li
         ticks, single = None if (ticks == 0).all() else ticks, group[0].float32
     else:
         rows = np.array([_row(kind, m.content) for m in group], dtype=np.float64)
-        values = dict(zip(_columns(kind), rows.T, strict=True))
+        values = dict(zip(VARIABLES[kind], rows.T, strict=True))
     return _Table(topic, stamps, ticks, values, single)
 
 
-def _generic(topic: str, group: list[_Message], names: list[str], path: Path) -> dict[str, np.ndarray]:
+def _generic(topic: str, group: list[BagMessage], names: list[str], path: Path) -> dict[str, np.ndarray]:
     for row, message in enumerate(group):
         if len(message.content.values) != len(names):
             raise CfbError(
@@ -235,20 +195,13 @@ def _generic(topic: str, group: list[_Message], names: list[str], path: Path) ->
     return dict(zip(names, rows.T, strict=True))
 
 
-def _columns(kind: str) -> list[str]:
-    prefix = _TYPES[kind]
-    pose = ["x", "y", "z", "qw", "qx", "qy", "qz"]
-    rest = {"PoseStamped": pose, "Odometry": [*pose, "vx", "vy", "vz", "wx", "wy", "wz"], "Status": ["battery_voltage"]}
-    return [f"{prefix}.{c}" for c in rest[kind]]
-
-
 def _row(kind: str, message: Any) -> list[float]:
-    if kind == "Status":
+    if kind == STATUS:
         return [message.battery_voltage]
-    pose = message.pose if kind == "PoseStamped" else message.pose.pose
+    pose = message.pose if kind == POSE else message.pose.pose
     p, q = pose.position, pose.orientation
     row = [p.x, p.y, p.z, q.w, q.x, q.y, q.z]
-    if kind == "Odometry":
+    if kind == ODOMETRY:
         v, w = message.twist.twist.linear, message.twist.twist.angular
         row += [v.x, v.y, v.z, w.x, w.y, w.z]
     return row
@@ -288,8 +241,10 @@ def _one_clock(tables: list[_Table], path: Path, notes: list[str], warnings: lis
         notes.append("no topic has firmware time stamps; rows carry the time at which the computer stamped them.")
         placed = computer
     streams = []
-    for table, time in zip(tables, placed, strict=True):
-        streams.append(ordered(Stream(table.topic, time, table.values, table.float32), path, notes))
+    for table, time, ticks in zip(tables, placed, firmware, strict=True):
+        slack = _TICK if pairs and ticks is None else Stream.slack
+        stream = Stream(table.topic, time, table.values, table.float32, slack)
+        streams.append(ordered(stream, path, notes, _OVERTAKING))
     return streams, clock
 
 

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs import crazyswarm, idsia, mcap_reader, radio_csv, tabular, usd_card
+from cfb_mjx.logs import crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, usd_card
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.validation import validate
 
@@ -72,7 +72,7 @@ def _detect(path: Path):
     if head.startswith(usd_card.MAGIC):
         return "usd_card", None
     if head == _MCAP_MAGIC:
-        return ("crazyswarm" if crazyswarm.recognises(path) else "mcap"), None
+        return ("crazyswarm" if ros_bag.recognises(path) else "mcap"), None
     if path.suffix == ".mcap":
         return "mcap", None
     table = tabular.read_table(path)

@@ -21,12 +21,15 @@ class Stream:
         time: (n,) s, increasing, on a clock that all streams of a file share.
         values: logged name to (n,) float64 as logged; NaN where a sample is missing.
         float32: the numbers travelled as float32, so integers above 2^24 have lost their low bits.
+        slack: s by which a sample may be stamped after a row and still count as known then.
     """
 
     name: str
     time: np.ndarray
     values: dict[str, np.ndarray]
     float32: bool = False
+    # Half a nanosecond: stamps of one clock may differ by rounding after a change of origin.
+    slack: float = 0.5e-9
 
     @property
     def interval(self) -> float:
@@ -50,13 +53,23 @@ def unwrap(ticks: np.ndarray, modulus: int) -> tuple[np.ndarray, int]:
     return ticks + modulus * np.concatenate([[0], np.cumsum(overflows)]), int(overflows.sum())
 
 
-def ordered(stream: Stream, path: Path, notes: list[str]) -> Stream:
-    """The stream without samples that repeat the time of the one before (counted in ``notes``).
+def ordered(stream: Stream, path: Path, notes: list[str], overtaking: float = 0.0) -> Stream:
+    """The stream in order of time, without samples that repeat the time of the one before (counted in ``notes``).
+
+    Args:
+        overtaking: s by which a sample may be earlier than the one before and is then put in its place.
 
     Raises:
-        CfbError: time goes back: the file holds two recordings, or the vehicle restarted.
+        CfbError: time goes back further: the file holds two recordings, or the vehicle restarted.
     """
     steps = np.diff(stream.time)
+    if overtaking and (steps < 0).any() and steps.min() >= -overtaking:
+        notes.append(f"{stream.name}: {int((steps < 0).sum())} samples arrived out of order and were sorted.")
+        order = np.argsort(stream.time, kind="stable")
+        stream = dataclasses.replace(
+            stream, time=stream.time[order], values={k: v[order] for k, v in stream.values.items()}
+        )
+        steps = np.diff(stream.time)
     if (steps < 0).any():
         row = int(np.argmax(steps < 0)) + 1
         raise CfbError(
@@ -77,8 +90,7 @@ def hold(stream: Stream, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     The age is NaN before the first sample and infinite where the sample is older than the stream's gap threshold, so
     that a pause of one stream becomes a gap of the log instead of a frozen value.
     """
-    # Half a nanosecond of slack: stamps of one clock may differ by rounding after a change of origin.
-    index = np.searchsorted(stream.time, rows + 0.5e-9, side="right") - 1
+    index = np.searchsorted(stream.time, rows + stream.slack, side="right") - 1
     age = np.where(index >= 0, rows - stream.time[np.maximum(index, 0)], np.nan)
     stale = age > stream.gap_threshold
     return np.maximum(index, 0), np.where(stale, np.inf, np.maximum(age, 0.0))

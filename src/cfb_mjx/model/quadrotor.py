@@ -32,8 +32,8 @@ class Quadrotor(eqx.Module):
         dt: time between commands, s.
         substeps: integration steps per command.
         integrator: ``"euler"`` (MuJoCo's semi-implicit Euler, the parity reference) or ``"rk4"``.
-        rotor_loads: ``"mean"`` applies the exact impulse of thrust and torque over each integration step;
-            ``"instant"`` evaluates them at the integrator's stages.
+        rotor_loads: ``"instant"`` evaluates thrust and torque at the integrator's stages; ``"mean"`` applies their
+            exact impulses over each integration step (``docs/accuracy.md`` says what that buys).
     """
 
     parameters: Parameters
@@ -42,7 +42,7 @@ class Quadrotor(eqx.Module):
     dt: float = eqx.field(static=True, default=0.004)
     substeps: int = eqx.field(static=True, default=1)
     integrator: Literal["euler", "rk4"] = eqx.field(static=True, default="euler")
-    rotor_loads: Literal["mean", "instant"] = eqx.field(static=True, default="mean")
+    rotor_loads: Literal["instant", "mean"] = eqx.field(static=True, default="instant")
 
     def __check_init__(self):
         if self.integrator not in INTEGRATORS:

@@ -93,8 +93,7 @@ def fit(
         if progress is not None:
             progress(done + 1, ROUNDS)
     residual, jacobian = (np.asarray(x) for x in _linearise(unknowns, vector, noise, segments, use_measured))
-    k = len(unknowns.names)
-    uncertainty = assess(jacobian.reshape(len(residual), -1, k), residual.reshape(len(residual), -1), unknowns.names)
+    uncertainty = assess(residual, jacobian @ np.linalg.inv(unknowns.slope(vector)), unknowns.names)
     return _result(unknowns, vector, noise, uncertainty, data.rows, residual)
 
 
@@ -148,8 +147,7 @@ def _linearise(unknowns: Unknowns, vector, noise: Noise, segments, use_measured:
 
 def _result(unknowns, vector, noise, uncertainty: Uncertainty, rows: int, residual: np.ndarray) -> Fit:
     values = np.asarray(unknowns.values(vector))
-    slope = np.asarray(jax.jacfwd(unknowns.values)(vector))
-    std = np.sqrt(np.maximum(np.diag(slope @ uncertainty.covariance @ slope.T), 0))
+    std = uncertainty.std * unknowns.scale(vector)
     preset = np.asarray(unknowns.values(unknowns.start))
     known = [i for i, name in enumerate(unknowns.names) if name not in uncertainty.names]
     explained = "; identified: " + ", ".join(uncertainty.combinations) if uncertainty.combinations else ""

@@ -67,9 +67,11 @@ def shoot(
 
     found = _solve(unknowns, prepared)
     residual, jacobian = (np.asarray(x) for x in _linearise(unknowns, found, prepared))
-    k = len(unknowns.names)
-    blocks = jacobian.reshape(len(residual), -1, k), residual.reshape(len(residual), -1)
-    return unknowns, np.asarray(found), assess(*blocks, unknowns.names)
+    return (
+        unknowns,
+        np.asarray(found),
+        assess(residual, jacobian @ np.linalg.inv(unknowns.slope(found)), unknowns.names),
+    )
 
 
 def _residual(vector, unknowns: Unknowns, prepared: list[_LogWindows]):

@@ -14,7 +14,7 @@ SHARE = 0.3
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of a parameter vector (logarithms and centimetres).
+    """Of the named quantities: relative, or in cm for offsets.
 
     Attributes:
         covariance: (k, k), of the identified part.
@@ -36,12 +36,12 @@ class Uncertainty:
         return np.sqrt(np.diag(self.covariance))
 
 
-def assess(jacobian: np.ndarray, residual: np.ndarray, names: tuple[str, ...], bootstraps: int = 400) -> Uncertainty:
+def assess(residual: np.ndarray, jacobian: np.ndarray, names: tuple[str, ...], bootstraps: int = 400) -> Uncertainty:
     """Uncertainty at the optimum.
 
     Args:
-        jacobian: (blocks, rows, k) of the whitened residual.
-        residual: (blocks, rows) whitened.
+        residual: (blocks, ...) whitened; the first axis is what the bootstrap resamples.
+        jacobian: (blocks, ..., k) its derivatives by relative changes of the named quantities (offsets: by cm).
         names: of the k parameters.
         bootstraps: resamples of the blocks.
 
@@ -49,6 +49,7 @@ def assess(jacobian: np.ndarray, residual: np.ndarray, names: tuple[str, ...], b
     bootstrap sees correlation within a block and a noise model that is not quite right.
     """
     k = len(names)
+    residual, jacobian = residual.reshape(len(residual), -1), jacobian.reshape(len(residual), -1, k)
     flat = jacobian.reshape(-1, k)
     # QR first: the SVD of the small triangle has the same singular values without squaring the condition number.
     triangle = np.linalg.qr(flat, mode="r")

@@ -7,6 +7,7 @@ second moments of its mass distribution, so that every possible rigid body can b
 from __future__ import annotations
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -110,6 +111,15 @@ class Unknowns(eqx.Module):
         }
         return jnp.stack([known[name] for name in self.names])
 
+    def scale(self, vector: Float[Array, "k"]) -> np.ndarray:
+        """(k,) what one unit of a relative change is in SI: the value itself, or a cm for offsets."""
+        values = np.asarray(self.values(vector))
+        return np.array([_LENGTH if n.startswith("cog") else v for n, v in zip(self.names, values, strict=True)])
+
+    def slope(self, vector: Float[Array, "k"]) -> np.ndarray:
+        """(k, k) derivative of the relative changes of the quantities by the vector."""
+        return np.asarray(jax.jacfwd(self.values)(vector)) / self.scale(vector)[:, None]
+
 
 def choose(request: str | tuple[str, ...], nominal: Parameters) -> Unknowns:
     """Unknowns from names and group names (``inertia``, ``motor``, ``cog``, ``J_m``), comma separated or as a tuple.
@@ -130,8 +140,3 @@ def choose(request: str | tuple[str, ...], nominal: Parameters) -> Unknowns:
         raise CfbError("--parameters: name at least one parameter.")
     order = list(UNITS)
     return Unknowns(tuple(sorted(names, key=order.index)), nominal)
-
-
-def relative_scale(unknowns: Unknowns) -> np.ndarray:
-    """What one unit of each vector entry means for the reader: 1 for logarithms, cm for offsets."""
-    return np.array([_LENGTH if name.startswith("cog") else 1.0 for name in unknowns.names])
