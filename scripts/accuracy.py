@@ -146,7 +146,9 @@ def page(errors, tumbling, rule, peak) -> str:
         "",
     ]
     texts = {
-        "aggressive": f"Aggressive: flips, commands over the full range, body rates up to {peak['aggressive']:.0f} rad/s",
+        "aggressive": (
+            f"Aggressive: flips, commands over the full range, body rates up to {peak['aggressive']:.0f} rad/s"
+        ),
         "gentle": f"Gentle: commands within 0.05 of hover, body rates up to {peak['gentle']:.1f} rad/s",
     }
     for name, text in texts.items():
@@ -179,14 +181,17 @@ def page(errors, tumbling, rule, peak) -> str:
         "## What to choose",
         "",
         "- **`euler`** is MuJoCo's semi-implicit Euler: first order. It moves with the velocity at the step's end, so",
-        f"  its position is off by about dt/2 x acceleration x time. In a climb at constant acceleration, 4 ms, {rules}.",
+        "  its position is off by about dt/2 x acceleration x time. "
+        f"In a climb at constant acceleration, 4 ms, {rules}.",
         "  It also gains or loses rotational energy when tumbling. Use it for parity with MuJoCo and for speed.",
         '- **`rk4` with `rotor_loads="instant"`** evaluates thrust and torque on the exact rotor path at each stage:',
         "  fourth order, the most accurate choice at every step measured.",
-        '- **`rotor_loads="mean"`** replaces the loads by their exact means over the step, so the impulse of thrust and',
+        '- **`rotor_loads="mean"`** replaces the loads by their '
+        "exact means over the step, so the impulse of thrust and",
         "  torque (the yaw kick J_m dOmega above all) is exact at any step. What is lost is where within the step the",
         "  load acts, which makes `rk4` second order; at 4 ms it stays below 1 mm and 0.2 deg over 200 ms of flips.",
-        "  With `euler` the means remove the error of holding the loads of the step's start, but not that of the position",
+        "  With `euler` the means remove the error of holding the "
+        "loads of the step's start, but not that of the position",
         "  update, which can have the opposite sign: in the tables `mean` is not uniformly better there.",
         "- Where the integrator must not be seen (evaluating a model on logs, fitting), use `rk4`.",
         "",

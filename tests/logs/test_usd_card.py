@@ -337,6 +337,17 @@ def test_an_interrupted_log_keeps_every_whole_record(small, path):
         assert "cut short" in log.metadata["warnings"][0]
 
 
+def test_an_impossible_value_in_a_damaged_file_ends_it(small, path):
+    truth = read_from(path, small)
+    broken = bytearray(small)
+    place = len(small) - 4 - 10 * RECORD + 10 + 16 * 4  # motor.m1 of the record of row 30
+    broken[place : place + 4] = b"\x00\x00\x00\x70"
+    path.write_bytes(broken)
+    log = read_log(path)
+    assert np.array_equal(log.command, truth.command[:30])
+    assert "row 30 (0.300 s) holds values that no flight has" in log.metadata["warnings"][1]
+
+
 def test_a_right_checksum_over_an_invalid_record(small, path):
     truth = read_from(path, small)
     body = small[:-4] + b"\x07\x00" + bytes(20)

@@ -175,7 +175,7 @@ SPOILED = [
     (["parameters", "mass", "value"], 0.0, "parameters.mass"),
     (["parameters", "mass", "value"], float("nan"), "parameters.mass"),
     (["parameters", "mass", "value"], float("inf"), "parameters.mass"),
-    (["parameters", "mass", "value"], 10**400, "parameters.mass"),
+    pytest.param(["parameters", "mass", "value"], 10**400, "parameters.mass", id="huge integer"),
     (["parameters", "mass", "value"], True, "parameters.mass"),
     (["parameters", "mass", "value"], "heavy", "parameters.mass"),
     (["parameters", "mass", "value"], None, "parameters.mass"),
@@ -231,7 +231,7 @@ def test_a_spoiled_file_is_refused_with_file_and_key(keys, value, named, documen
         ("x: &a [*a\n", "YAML"),
         ("name: 2026-13-45\n", "YAML"),
         ("name: !!int abc\n", "YAML"),
-        ("name: " + 3000 * "[" + "\n", "YAML"),
+        pytest.param("name: " + 3000 * "[" + "\n", "YAML", id="deeply nested"),
         ("\tname: x\n", "YAML"),
     ],
 )

@@ -104,7 +104,7 @@ def read_crazyswarm(
     if from_odometry:
         warnings.append(
             f"{', '.join(from_odometry)} come from Odometry, which Crazyswarm2's cflib server fills with an inverted "
-            "pitch, rates in deg/s and a velocity in body axes; log stateEstimate.* and gyro.* in custom topics instead."
+            "pitch, rates in deg/s and a velocity in body axes; log stateEstimate.* and gyro.* in custom topics."
         )
     return log.replace(metadata={"warnings": warnings})
 

@@ -31,6 +31,8 @@ _SECONDS_PER_TICK = {1: 1e-3, 2: 1e-6}
 # The firmware uses bBhHiIfe; the rest is what else the struct module could mean without doubt.
 _TYPES = {c: np.dtype(f"<{c}") for c in "bBhHiIqQefd"}  # numpy and struct agree on these
 _VARIABLE = re.compile(r"([A-Za-z_][\w.]*)\((.)\)")
+# In a damaged file a row with more than this (SI) is damage: twice the range of the sensors, an arena of 1 km.
+_IMPOSSIBLE = {"position": 1e3, "velocity": 1e2, "body_rate": 70.0, "specific_force": 500.0, "rotor_speed": 6000.0}
 _MAX_JUMP = 10.0  # s; in a damaged file a longer step of the clock is taken for damage
 
 
@@ -81,7 +83,26 @@ def read_usd_card(path: str | os.PathLike, mapping: str | os.PathLike | Variable
         "checksum": "ok" if intact else "mismatch",
         "records": {e.name: len(e.offsets) for e in events},
     }
-    return assemble(read, mapping if isinstance(mapping, VariableMap) else load_mapping(mapping), path)
+    log = assemble(read, mapping if isinstance(mapping, VariableMap) else load_mapping(mapping), path)
+    return log if intact else _cut_at_impossible(log)
+
+
+def _cut_at_impossible(log: FlightLog) -> FlightLog:
+    """The rows of a damaged file before the first that no flight could have."""
+    bad = (np.abs(np.linalg.norm(log.quaternion, axis=1) - 1.0) > 0.05) | (np.abs(log.command - 0.5) > 0.501).any(
+        axis=1
+    )
+    for field, limit in _IMPOSSIBLE.items():
+        if (values := getattr(log, field)) is not None:
+            bad |= (np.abs(values) > limit).any(axis=1)
+    first = int(np.argmax(bad))
+    # Nearly all rows impossible is a wrong unit rather than damage; validation will say which.
+    if first < 2 or not bad.any():
+        return log
+    warning = (
+        f"row {first} ({log.time[first]:.3f} s) holds values that no flight has; it and what follows were left out."
+    )
+    return log.rows(slice(0, first)).replace(metadata={"warnings": [*log.metadata["warnings"], warning]})
 
 
 def _header(data: bytes, path: Path) -> tuple[int, list[_Event], int]:

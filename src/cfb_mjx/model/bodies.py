@@ -21,8 +21,8 @@ class Body(Protocol):
 
     name: str
 
-    def prepare(self, parameters: Parameters) -> object:
-        """Quantities computed once per rollout."""
+    def prepare(self, parameters: Parameters, dt) -> object:
+        """Quantities computed once per rollout with integration steps of ``dt`` seconds."""
 
     def accelerations(self, prepared, state: Components, wrench: Wrench) -> tuple[Vec, Vec]:
         """Acceleration of the centre of gravity (world, m/s^2) and angular acceleration (body, rad/s^2).
@@ -43,7 +43,7 @@ class RigidBody:
 
     name = "rigid"
 
-    def prepare(self, parameters: Parameters) -> _Prepared:
+    def prepare(self, parameters: Parameters, dt) -> _Prepared:
         inertia = Vec.unstack(parameters.inertia)
         return _Prepared(1 / parameters.mass, parameters.gravity, inertia, inertia.map(lambda x: 1 / x))
 

@@ -49,6 +49,8 @@ class DelayLine(eqx.Module):
         weights = jnp.maximum(0.0, 1.0 - jnp.abs(jnp.arange(count) - at))
 
         def blend(line):
+            # A count or a flag is blended as a number; weights cast to integers would lose it.
+            line = line if jnp.issubdtype(line.dtype, jnp.inexact) else line.astype(weights.dtype)
             return jnp.tensordot(weights.astype(line.dtype), line, axes=1)
 
         def read_node(node):

@@ -63,7 +63,7 @@ class MjxBody:
         self.mjcf = None if mjcf is None else str(mjcf)
         self.mujoco_model = _compile(self.mjcf, self.floor)
 
-    def prepare(self, parameters: Parameters) -> _Prepared:
+    def prepare(self, parameters: Parameters, dt) -> _Prepared:
         template = _on_device(self.mjcf, self.floor, jax.config.jax_enable_x64)
         model, data = jax.tree.map(jnp.asarray, template)
         body = _body_index(self.mujoco_model)
@@ -73,10 +73,16 @@ class MjxBody:
         # Contact softness is scaled with the inverse inertia of the free body: exact, not a fresh mj_setConst.
         inverse = jnp.stack([1 / mass, jnp.mean(1 / inertia)])
         model = model.replace(
-            opt=model.opt.replace(gravity=jnp.stack([jnp.zeros_like(mass), jnp.zeros_like(mass), -parameters.gravity])),
+            opt=model.opt.replace(
+                gravity=jnp.stack([jnp.zeros_like(mass), jnp.zeros_like(mass), -parameters.gravity]),
+                # Contacts are kept softer than the step can resolve.
+                timestep=jnp.asarray(dt, model.opt.timestep.dtype),
+            ),
             body_mass=model.body_mass.at[body].set(mass),
             body_subtreemass=model.body_subtreemass.at[body].set(mass).at[0].set(mass),
             body_inertia=model.body_inertia.at[body].set(inertia),
+            body_ipos=model.body_ipos.at[body].set(0.0),
+            body_iquat=model.body_iquat.at[body].set(jnp.array([1.0, 0.0, 0.0, 0.0])),
             # The body frame sits at the centre of gravity (see Components), so it is the geoms that move.
             geom_pos=jnp.where(moving[:, None], model.geom_pos - center, model.geom_pos),
             body_invweight0=model.body_invweight0.at[body].set(inverse),
@@ -92,7 +98,7 @@ class MjxBody:
             qfrc_applied=jnp.concatenate([rotate(state.quaternion, wrench.force).stack(), wrench.torque.stack()]),
         )
         if self.floor:
-            acceleration = mjx.forward(model, data).qacc
+            acceleration = _with_contact(model, data)
         else:
             acceleration = _contact_free(model, data)
         return Vec.unstack(acceleration[:3]), Vec.unstack(acceleration[3:])
@@ -107,6 +113,13 @@ class MjxBody:
         return f"MjxBody(floor={self.floor}, mjcf={self.mjcf!r})"
 
 
+# Both are traced once, however many stages an integrator has.
+@jax.jit
+def _with_contact(model: mjx.Model, data: mjx.Data) -> jax.Array:
+    return mjx.forward(model, data).qacc
+
+
+@jax.jit
 def _contact_free(model: mjx.Model, data: mjx.Data) -> jax.Array:
     """qacc of `mjx.forward` where nothing touches: its stages without geoms, sites, actuators and constraints."""
     data = mjx.kinematics(model, data)

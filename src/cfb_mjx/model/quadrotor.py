@@ -49,7 +49,7 @@ class Quadrotor(eqx.Module):
             raise CfbError(f"integrator must be one of {', '.join(INTEGRATORS)}, found {self.integrator!r}.")
         if self.rotor_loads not in ("mean", "instant"):
             raise CfbError(f"rotor_loads must be 'mean' or 'instant', found {self.rotor_loads!r}.")
-        if not (isinstance(self.dt, int | float) and self.dt > 0):
+        if not (isinstance(self.dt, int | float) and 0 < self.dt < float("inf")):
             raise CfbError(f"dt must be a positive number of seconds, found {self.dt!r}.")
         if not (isinstance(self.substeps, int) and self.substeps >= 1):
             raise CfbError(f"substeps must be a whole number from 1, found {self.substeps!r}.")
@@ -91,7 +91,7 @@ def prepare(model: Quadrotor, dt: float | Float[Array, ""] | None = None) -> Pre
     dt = model.dt / model.substeps if dt is None else dt
     dt = jnp.asarray(dt, model.parameters.mass.dtype)
     parameters = _unstacked(model.parameters)
-    return Prepared(model, parameters, rotors.prepare(parameters, dt), model.body.prepare(parameters), dt)
+    return Prepared(model, parameters, rotors.prepare(parameters, dt), model.body.prepare(parameters, dt), dt)
 
 
 def _unstacked(parameters: Parameters) -> Parameters:
@@ -151,10 +151,11 @@ def _integrate(prepared: Prepared, state: Components, path: rotors.RotorPath) ->
             )
             for effect in model.effects:
                 loads = effect.rotors(loads, condition)
-        # Every component of the acceleration needs the wrench; without the barrier XLA recomputes it for each.
-        wrench = jax.lax.optimization_barrier(wrench_of(parameters, loads))
+        wrench = wrench_of(parameters, loads)
         for effect in model.effects:
             wrench = effect.body(wrench, condition)
+        # Every component of the acceleration needs the wrench; without the barrier XLA recomputes it for each.
+        wrench = jax.lax.optimization_barrier(wrench)
         about_center = Wrench(wrench.force, wrench.torque - parameters.center_of_gravity.cross(wrench.force))
         return model.body.accelerations(prepared.body, at, about_center)
 

@@ -89,6 +89,8 @@ def in_chunks(function: Callable, size: int, *arguments, progress: Callable[[int
         The pytree of stacked results as numpy arrays.
     """
     total = len(jax.tree.leaves(arguments)[0])
+    if size < 1 or total < 1:
+        raise ValueError(f"{total} examples cannot be run {size} at a time")
     batched = eqx.filter_jit(jax.vmap(function))
     pieces = []
     for start in range(0, total, size):

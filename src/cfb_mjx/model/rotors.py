@@ -170,7 +170,8 @@ def torque(parameters: Parameters, speed: Float[Array, "4"]) -> Float[Array, "4"
 
 
 def _at_least_zero(x):
-    return jnp.maximum(x, 0.0)
+    # Not maximum: its derivative at a rotor at rest would be half the negative slope of the cubic.
+    return jnp.where(x > 0, x, 0.0)
 
 
 def hover_rotor_speed(parameters: Parameters) -> Float[Array, "4"]:
@@ -189,7 +190,9 @@ def hover_rotor_speed(parameters: Parameters) -> Float[Array, "4"]:
         return s - (((c3 * s + c2) * s + c1) * s - wanted) / ((3 * c3 * s + 2 * c2) * s + c1)
 
     s = jax.lax.fori_loop(0, 12, newton, jnp.full(4, 0.8, wanted.dtype))
-    return s * parameters.reference_rotor_speed
+    # Beyond the cubic's maximum Newton wanders, possibly back into the range: not a hover, and must not look like one.
+    residual = jnp.abs(((c3 * s + c2) * s + c1) * s - wanted)
+    return jnp.where(residual <= 1e-5 * wanted, s, jnp.inf) * parameters.reference_rotor_speed
 
 
 def hover_command(parameters: Parameters) -> Float[Array, "4"]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import re
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -51,6 +51,8 @@ class ModelFile:
             CfbError: an unknown name or an impossible value.
         """
         where = f"model {self.name}"
+        if not source:
+            raise CfbError(f"{where}: new values need a source; say where the numbers come from.")
         changed = {k: Entry(_value(k, v, where), source) for k, v in values.items() if _known(k, where)}
         return replace(self, entries={**self.entries, **changed})
 
@@ -92,12 +94,15 @@ def load_model_file(name_or_path: str | Path) -> ModelFile:
     effects = document.get("effects") or []
     if not isinstance(effects, list) or not all(isinstance(e, dict) and "name" in e for e in effects):
         raise CfbError(f"{path}: 'effects' must be a list of mappings, each with a 'name'.")
+    provenance = document.get("provenance") or {}
+    if not isinstance(provenance, dict):
+        raise CfbError(f"{path}: 'provenance' must be a mapping.")
     return ModelFile(
         name=str(document.get("name", path.stem)),
         description=str(document.get("description", "")),
         entries=entries,
         effects=tuple(effects),
-        provenance=document.get("provenance") or {},
+        provenance=provenance,
     )
 
 
@@ -135,7 +140,8 @@ def load_yaml(path: str | Path) -> dict:
         raise CfbError(f"{path}: cannot be read as text ({error}).") from None
     try:
         document = yaml.load(text, Loader=_StrictLoader)
-    except yaml.YAMLError as error:
+    # PyYAML lets through ValueError (a thirteenth month, !!int abc) and the interpreter's recursion limit.
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise CfbError(f"{path}: is not valid YAML ({' '.join(str(error).split())}).") from None
     if not isinstance(document, dict):
         raise CfbError(f"{path}: must hold a YAML mapping, found {type(document).__name__}.")
@@ -197,7 +203,7 @@ def _numbers(key: str, raw: Any, path, what: str) -> np.ndarray:
     shape = SPECIFICATIONS[key].shape
     flat = raw.tolist() if isinstance(raw, np.ndarray | np.generic) else raw
     numbers = flat if isinstance(flat, list | tuple) else [flat]
-    if not all(isinstance(x, int | float) and not isinstance(x, bool) and math.isfinite(x) for x in numbers):
+    if not all(_finite(x) for x in numbers):
         raise CfbError(f"{path}: parameters.{key}.{what} = {flat!r} must be a finite number or a list of them.")
     value = np.asarray(flat, dtype=np.float64)
     if value.shape not in ((), shape):
@@ -205,6 +211,11 @@ def _numbers(key: str, raw: Any, path, what: str) -> np.ndarray:
             f"{path}: parameters.{key}.{what} must have {shape[0] if shape else 1} number(s), found {flat!r}."
         )
     return np.broadcast_to(value, shape).copy()
+
+
+def _finite(x: Any) -> bool:
+    # Compared, not math.isfinite: that overflows on a huge int.
+    return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) <= sys.float_info.max
 
 
 def _known(key: str, where: str) -> bool:
@@ -220,7 +231,7 @@ def _refuse_unknown(found: Mapping, known: set[str], path, prefix: str) -> None:
 
 
 def _same_unit(unit: Any) -> str:
-    text = str(unit).replace("²", "^2").replace("·", " ").replace("*", " ").replace("**", "^")
+    text = str(unit).replace("²", "^2").replace("·", " ").replace("**", "^").replace("*", " ")
     return " ".join(text.split())
 
 

@@ -16,6 +16,7 @@ from cfb_mjx.parameters.model_file import _refuse_unknown, load_yaml
 from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters
 
 FORMAT = "cfb_mjx randomisation 1"
+_FREE_SIGN = ("center_of_gravity", "motor_speed_offset", "attitude_offset")
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,9 @@ def load_randomisation(name_or_path: str | Path = "paper") -> Randomisation:
     """
     path = Path(name_or_path)
     if path.suffix not in (".yaml", ".yml"):
+        names = sorted(file.stem for file in shipped("configs", "randomisation").glob("*.yaml"))
+        if str(name_or_path) not in names:
+            raise CfbError(f"{name_or_path}: no such randomisation; give a YAML file or one of {', '.join(names)}.")
         path = shipped("configs", "randomisation", f"{name_or_path}.yaml")
     document = load_yaml(path)
     _refuse_unknown(document, {"format", "name", "description", "ranges"}, path, "")
@@ -77,9 +81,14 @@ def _range(key: str, raw, path: Path) -> Range:
     if len(widths) not in (1, *size):
         raise CfbError(f"{path}: ranges.{key}.half_width must have 1 or {size[0] if size else 1} numbers.")
     relative = raw["unit"] == "relative"
+    if not relative and key not in _FREE_SIGN:
+        raise CfbError(f"{path}: ranges.{key}.unit must be 'relative': a width in {unit} would allow the wrong sign.")
     if relative and max(widths) >= 1:
         raise CfbError(f"{path}: ranges.{key}.half_width = {width!r} relative would allow values of the wrong sign.")
-    return Range(tuple(float(w) for w in widths), relative, bool(raw.get("shared", False)))
+    shared = raw.get("shared", False)
+    if not isinstance(shared, bool):
+        raise CfbError(f"{path}: ranges.{key}.shared must be true or false, found {shared!r}.")
+    return Range(tuple(float(w) for w in widths), relative, shared)
 
 
 def sample_parameters(

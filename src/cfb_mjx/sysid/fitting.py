@@ -16,7 +16,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.parameters import Entry, ModelFile, Parameters
 from cfb_mjx.sysid.flight_data import FlightData, prepare
-from cfb_mjx.sysid.innovation import Noise, innovations, negative_log_likelihood
+from cfb_mjx.sysid.innovation import Noise, drive, innovations, negative_log_likelihood
 from cfb_mjx.sysid.uncertainty import Uncertainty, assess
 from cfb_mjx.sysid.unknowns import UNITS, Unknowns, choose
 
@@ -113,9 +113,10 @@ def _first_noise(data: FlightData) -> Noise:
 @eqx.filter_jit
 def _fit_noise(unknowns: Unknowns, vector, noise: Noise, segments, use_measured: bool) -> Noise:
     parameters = unknowns.apply(vector)
+    driven = drive(parameters, segments, use_measured)
 
     def loss(x, _):
-        return negative_log_likelihood(parameters, Noise.from_vector(x), segments, use_measured)
+        return negative_log_likelihood(parameters, Noise.from_vector(x), segments, driven)
 
     # BFGS may stop short where a level does not matter; the rounds that follow go on from there.
     solver = optx.BFGS(rtol=1e-5, atol=1e-6)
@@ -124,7 +125,8 @@ def _fit_noise(unknowns: Unknowns, vector, noise: Noise, segments, use_measured:
 
 
 def _residual(vector, unknowns: Unknowns, noise: Noise, segments, use_measured: bool):
-    error, variance = innovations(unknowns.apply(vector), noise, segments, use_measured)
+    parameters = unknowns.apply(vector)
+    error, variance = innovations(parameters, noise, segments, drive(parameters, segments, use_measured))
     # The variance follows the parameters a little (the motors' lag); as a weight it must not be fitted.
     return error / jnp.sqrt(jax.lax.stop_gradient(variance))
 

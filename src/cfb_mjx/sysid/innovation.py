@@ -23,8 +23,6 @@ from cfb_mjx.sysid.flight_data import Segments
 
 CORRELATION_TIME = 0.5
 """Of the disturbance, s: below about 1/(2 pi 0.5 s) = 0.3 Hz it is constant, above it wanders."""
-CHANNELS = 5
-"""Body rate x, y, z; specific force z; collective-free: rotor speed (all motors share one noise)."""
 
 
 class Noise(eqx.Module):
@@ -56,8 +54,31 @@ class Noise(eqx.Module):
         return Noise(x[0:3] + 1e-4, x[3:6] + 1e-3, x[6:9] + 1e-2, x[9] + 1e-3, x[10] + 1e-3, x[11] + 1e-2, x[12] + 1e-2)
 
 
+class Drive(eqx.Module):
+    """What the rotors do to the body, row by row: depends on the parameters, not on the noise."""
+
+    torque: Float[Array, "s n 3"]
+    """Mean over the interval before a row, about the centre of gravity, N m."""
+    thrust: Float[Array, "s n"]
+    """At the row, N."""
+
+
+def drive(parameters: Parameters, segments: Segments, use_measured: bool) -> Drive:
+    """Rotor loads from measured rotor speeds where a segment has them (if ``use_measured``), else from commands."""
+
+    def one(piece: Segments) -> Drive:
+        share = piece.measured * use_measured
+        speed = jnp.where(share > 0, piece.rotor_speed, _modelled_speed(parameters, piece))
+        torque, thrust = jax.vmap(lambda *x: _loads(parameters, *x, share))(
+            piece.interval[1:], speed[:-1], speed[1:], piece.command[:-1]
+        )
+        return Drive(torque, thrust)
+
+    return jax.vmap(one)(segments)
+
+
 def innovations(
-    parameters: Parameters, noise: Noise, segments: Segments, use_measured: bool
+    parameters: Parameters, noise: Noise, segments: Segments, driven: Drive
 ) -> tuple[Float[Array, "s n 8"], Float[Array, "s n 8"]]:
     """Innovations and their variances, zero and one where a row does not count.
 
@@ -68,31 +89,21 @@ def innovations(
         parameters: the drone.
         noise: noise levels.
         segments: flight data.
-        use_measured: take rotor speeds from measurement where a piece has them; otherwise always from the commands.
+        driven: `drive` of the same parameters and segments.
     """
-    return jax.vmap(lambda piece: _one(parameters, noise, piece, use_measured))(segments)
 
+    def one(piece: Segments, loads: Drive):
+        filters = [
+            _rate_filter(parameters, noise, piece, loads.torque),
+            _force_filter(parameters, noise, piece, loads.thrust),
+            _rotor_filter(parameters, noise, piece),
+        ]
+        error, variance = (jnp.concatenate([f[i] for f in filters], axis=1) for i in range(2))
+        counts = piece.valid[1:] * (1 - piece.warm_up[1:])
+        use = counts[:, None] * jnp.concatenate([jnp.ones(4), jnp.full(4, 1.0) * piece.measured])
+        return error * use, jnp.where(use > 0, variance, 1.0)
 
-def _one(parameters: Parameters, noise: Noise, piece: Segments, use_measured: bool):
-    modelled = _modelled_speed(parameters, piece)
-    share = piece.measured * use_measured
-    speed = jnp.where(share > 0, piece.rotor_speed, modelled)
-    loads_mean, force_now = jax.vmap(lambda *x: _loads(parameters, *x))(
-        piece.interval[1:],
-        jnp.where(share > 0, speed[:-1], modelled[:-1]),
-        speed[1:],
-        piece.command[:-1],
-        jnp.broadcast_to(share, piece.interval[1:].shape),
-    )
-    rate_e, rate_s = _rate_filter(parameters, noise, piece, loads_mean)
-    force_e, force_s = _force_filter(parameters, noise, piece, force_now)
-    rotor_e, rotor_s = _rotor_filter(parameters, noise, piece)
-    error = jnp.concatenate([rate_e, force_e[:, None], rotor_e], axis=1)
-    variance = jnp.concatenate([rate_s, force_s[:, None], rotor_s], axis=1)
-    counts = piece.valid[1:] * (1 - piece.warm_up[1:])
-    weight = jnp.concatenate([jnp.ones(4), jnp.full(4, 1.0) * piece.measured])
-    use = counts[:, None] * weight
-    return error * use, jnp.where(use > 0, variance, 1.0)
+    return jax.vmap(one)(segments, driven)
 
 
 def _modelled_speed(parameters: Parameters, piece: Segments) -> Float[Array, "n 4"]:
@@ -161,7 +172,7 @@ def _force_filter(parameters: Parameters, noise: Noise, piece: Segments, thrust:
 
     inputs = (piece.interval[1:], thrust / parameters.mass, piece.specific_force[1:, 2])
     _, (error, variance) = jax.lax.scan(row, (jnp.zeros(()), d), inputs)
-    return error, variance
+    return error[:, None], variance[:, None]
 
 
 def _rotor_filter(parameters: Parameters, noise: Noise, piece: Segments):
@@ -192,8 +203,8 @@ def _rotor_filter(parameters: Parameters, noise: Noise, piece: Segments):
     return error, variance
 
 
-def negative_log_likelihood(parameters, noise, segments, use_measured: bool) -> Float[Array, ""]:
+def negative_log_likelihood(parameters, noise, segments, driven: Drive) -> Float[Array, ""]:
     """Of all innovations, per row, without the constant."""
-    error, variance = innovations(parameters, noise, segments, use_measured)
+    error, variance = innovations(parameters, noise, segments, driven)
     rows = jnp.maximum(jnp.sum(segments.valid), 1.0)
     return 0.5 * jnp.sum(jnp.log(variance) + error**2 / variance) / rows

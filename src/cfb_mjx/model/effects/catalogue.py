@@ -22,11 +22,13 @@ def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
         CfbError: unknown effect, unknown parameter or a value that is not a number, named; ``where`` is the file.
     """
     name = item.get("name")
-    if name not in CATALOGUE:
+    if not isinstance(name, str) or name not in CATALOGUE:
         raise CfbError(f"{where}: unknown effect {name!r}; known are {', '.join(sorted(CATALOGUE))}.")
     kind = CATALOGUE[name]
     fields = {field.name for field in dataclasses.fields(kind)}
     values = item.get("parameters") or {}
+    if not isinstance(values, Mapping):
+        raise CfbError(f"{where}: effects.{name}.parameters must be a mapping, found {values!r}.")
     for key in item:
         if key not in ("name", "parameters", "source", "uncertainty", "p_value"):
             raise CfbError(f"{where}: unknown key 'effects.{name}.{key}'.")
