@@ -1,7 +1,6 @@
 """Bad input: one sentence that names the file, exit status 2, no traceback, earlier results as they were."""
 
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -129,17 +128,21 @@ def test_bad_model_files(cfb, files, tmp_path, text, needle):
     refused(cfb("evaluate", files / "flight.mcap", "--model", tmp_path / "m.yaml"), "m.yaml", needle)
 
 
-def test_a_full_disk_costs_nothing(cfb, files, tmp_path):
+def run_after(preparation, *arguments, **options):
+    """Start cfb after some Python in the same process; a preexec_fn would fork this one, with jax's threads in it."""
+    code = f"import os, resource, signal, sys\n{preparation}\nos.execv(sys.argv[1], sys.argv[1:])"
+    command = [sys.executable, "-c", code, CFB, *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options)
+
+
+def test_a_full_disk_costs_nothing(files, tmp_path):
     """A limit on file size makes the write fail half way, as a full disk would."""
     target = tmp_path / "out.mcap"
     target.write_text("earlier")
-
-    def limit():
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-        resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))
-
-    done = cfb("import", files / "flight.csv", "-o", target, preexec_fn=limit)
-    refused(done, "out.mcap")
+    limit = "signal.signal(signal.SIGXFSZ, signal.SIG_IGN); resource.setrlimit(resource.RLIMIT_FSIZE, (8192, 8192))"
+    process = run_after(limit, "import", files / "flight.csv", "-o", target)
+    out, err = process.communicate(timeout=120)
+    refused(subprocess.CompletedProcess([], process.returncode, out, err), "out.mcap")
     assert target.read_text() == "earlier"
     assert [p.name for p in tmp_path.iterdir()] == ["out.mcap"]
 
@@ -152,13 +155,8 @@ def test_a_folder_without_permission(cfb, files, tmp_path):
 
 def test_ctrl_c_leaves_earlier_results(files, tmp_path):
     (tmp_path / "keep.json").write_text("{}")
-    process = subprocess.Popen(
-        [CFB, "evaluate", str(files / "flight.mcap"), "--json", str(tmp_path / "keep.json")],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-    )
+    arguments = ["evaluate", files / "flight.mcap", "--json", tmp_path / "keep.json"]
+    process = run_after("signal.signal(signal.SIGINT, signal.default_int_handler)", *arguments)
     time.sleep(1.0)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=120)

@@ -71,7 +71,7 @@ def test_the_compiled_mjcf_holds_the_papers_drone():
 def test_inverse_weights_equal_mujocos(guards):
     """Contact softness scales with body_invweight0, which `prepare` overwrites without mj_setConst."""
     body = MjxBody(floor=True)
-    prepared = body.prepare(guards)
+    prepared = body.prepare(guards, 0.004)
     # The compiled model still says what mj_setConst computed from the MJCF.
     np.testing.assert_allclose(prepared.model.body_invweight0[1], body.mujoco_model.body("cfb").invweight0, rtol=1e-9)
 

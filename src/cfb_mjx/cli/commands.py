@@ -16,22 +16,31 @@ Model = Annotated[str, tyro.conf.arg(metavar="MODEL")]
 def import_log(
     source: tyro.conf.Positional[Path],
     output: Output,
-    format: Literal["auto", "tabular", "idsia", "mcap"] = "auto",
+    format: Literal["auto", "tabular", "idsia", "mcap", "usd_card", "crazyswarm", "radio_csv"] = "auto",
     motor_shift: float | None = None,
+    mapping: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    topics_yaml: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    robot: str | None = None,
+    time_unit: str | None = None,
 ) -> None:
     """Convert a flight log to MCAP.
 
     Checks units, frames and time stamps on the way, and says what it changed.
 
     Args:
-        source: log to read (parquet, csv or MCAP).
+        source: log to read: parquet, csv, MCAP, Crazyflie micro SD card binary, Crazyswarm2 bag, radio csv.
         output: MCAP file to write.
         format: layout of the source; auto looks at its content.
         motor_shift: s by which to delay the motor columns of an IDSIA log instead of the estimated shift.
+        mapping: YAML saying which logged variable is what (micro SD card, Crazyswarm2, radio csv).
+        topics_yaml: crazyflies.yaml with the variable names of the custom topics of a Crazyswarm2 bag.
+        robot: whose flight to read from a Crazyswarm2 bag of several.
+        time_unit: unit of the time column of a radio csv.
     """
     from cfb_mjx.cli.importing import run_import
 
-    run_import(source, output, None if format == "auto" else format, motor_shift)
+    options = {"motor_shift": motor_shift, "mapping": mapping, "topics_yaml": topics_yaml, "robot": robot}
+    run_import(source, output, None if format == "auto" else format, options | {"time_unit": time_unit})
 
 
 def evaluate(

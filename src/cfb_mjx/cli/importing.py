@@ -10,7 +10,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import estimate_command_shift, read_log, write_mcap
 
 
-def run_import(source: Path, output: Path, format: str | None, motor_shift: float | None) -> None:
+def run_import(source: Path, output: Path, format: str | None, options: dict[str, object]) -> None:
     """Convert ``source`` to the MCAP ``output`` and report what was read.
 
     Raises:
@@ -20,10 +20,9 @@ def run_import(source: Path, output: Path, format: str | None, motor_shift: floa
         raise CfbError(f"{output}: the output must end in .mcap.")
     if output.exists() and source.exists() and output.samefile(source):
         raise CfbError(f"{output}: is the source itself; choose another name.")
-    options = {} if motor_shift is None else {"motor_shift": motor_shift}
     log = read_log(source, format, **options)
     alignment = log.metadata.get("alignment")
-    if alignment is None and motor_shift is None:
+    if alignment is None:
         alignment = {**estimate_command_shift(log).report(), "applied": False}
         log = log.replace(metadata={"alignment": alignment})
     write_mcap(log, output)
@@ -43,6 +42,8 @@ def run_import(source: Path, output: Path, format: str | None, motor_shift: floa
         if value and (key.startswith("dropped") or key in ("held_rows_kept", "invalid_rotor_speeds")):
             print(f"  {key.replace('_', ' ')}: {value}")
     print(f"  {describe_alignment(alignment)}")
+    for line in [*(log.metadata.get("warnings") or ()), *(log.metadata.get("notes") or ())]:
+        print(f"  {line}")
 
 
 def describe_alignment(alignment: dict | None) -> str:
