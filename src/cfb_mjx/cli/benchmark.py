@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 from pathlib import Path
 
@@ -29,6 +30,8 @@ class Peer:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 text=True,
+                # As its users run it: without the compiler options the cfb command gives itself.
+                env={key: value for key, value in os.environ.items() if key != "XLA_FLAGS"},
             )
         except OSError as error:
             raise CfbError(f"--peer-python {python}: cannot be run ({error.strerror}).") from None
@@ -164,7 +167,9 @@ Steps per second of all drones together, float32; the best of several runs that 
 `rollout_randomised`: the same, every drone with its own parameters. `rollout_gradient`: reverse-mode gradient of a
 100-step rollout with respect to all parameters. Bodies: `rigid` closed form; `mjx` MuJoCo XLA without contact;
 `mjx-floor` with floor contact; `mjx-stock` plain `mjx.step` on the same MJCF without contact. crazyflow runs
-first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`. Memory is the compiled program's
+first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`, in a process with XLA's default
+options; ours runs with the options the `cfb` command sets for itself on CPU ([model.md](model.md#speed)), which make
+loops over few thousand drones one kernel: `XLA_FLAGS={os.environ.get("XLA_FLAGS", "")}`. Memory is the compiled program's
 arguments, results and temporaries.
 
 {comparison}
