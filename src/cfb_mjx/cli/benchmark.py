@@ -78,7 +78,7 @@ def run_bench(drones: list[int], json: Path | None, markdown: Path | None, peer_
             slow = [workloads.rollout(count, "mjx"), workloads.rollout(count, "mjx-floor"), workloads.stock_mjx(count)]
             if count <= 8192:
                 slow.append(workloads.rollout_gradient(count))
-            times += _alternate(slow, 3)
+            times += _alternate(slow, 5)
             group += slow
         for item, seconds in zip(group, times, strict=True):
             if item is peer:
@@ -168,8 +168,8 @@ Steps per second of all drones together, float32; the best of several runs that 
 100-step rollout with respect to all parameters. Bodies: `rigid` closed form; `mjx` MuJoCo XLA without contact;
 `mjx-floor` with floor contact; `mjx-stock` plain `mjx.step` on the same MJCF without contact. crazyflow runs
 first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`, in a process with XLA's default
-options; ours runs with the options the `cfb` command sets for itself on CPU ([model.md](model.md#speed)), which make
-loops over few thousand drones one kernel: `XLA_FLAGS={os.environ.get("XLA_FLAGS", "")}`. Memory is the compiled program's
+options; ours runs with the option the `cfb` command sets for itself on CPU ([model.md](model.md#speed)):
+`XLA_FLAGS={os.environ.get("XLA_FLAGS", "")}`. Memory is the compiled program's
 arguments, results and temporaries.
 
 {comparison}
