@@ -116,12 +116,12 @@ def test_inertia_and_motors_come_back_from_disturbed_flights_under_feedback(camp
         # No model of the disturbance is needed to see it: its level is part of the answer.
 
 
-def test_mass_and_thrust_scale_cannot_be_told_apart(campaign):
+def test_the_common_scale_of_mass_inertia_and_thrust_cannot_be_told(campaign):
+    """Twice the mass, inertia and thrust is the same flight; with the inertia known, the thrust scale can be told."""
     _, logs = campaign
-    found = fit(logs[:1], NOMINAL, "mass,thrust_scale")
-    assert set(found.unidentifiable) == {"mass", "thrust_scale"}
-    assert found.estimates == {}
-    assert "mass / thrust_scale" in found.unidentifiable["mass"]
+    found = fit(logs[:1], NOMINAL, "mass,inertia,rotor_inertia,thrust_scale,torque_scale")
+    assert {"mass", "inertia_xx", "inertia_yy", "thrust_scale"} <= set(found.unidentifiable)
+    assert not {"mass", "inertia_xx", "inertia_yy", "thrust_scale"} & set(found.estimates)
     ratio = float(found.parameters.mass / found.parameters.thrust_scale[0])
     assert ratio == pytest.approx(0.044, rel=0.01)
 
