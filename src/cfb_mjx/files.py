@@ -23,8 +23,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         CfbError: the folder is missing or the file cannot be written (full disk, no permission).
     """
     path = Path(path)
-    if not path.parent.is_dir():
-        raise CfbError(f"{path}: the folder {path.parent} does not exist; create it first.")
+    require_folder(path)
     if path.is_dir():
         raise CfbError(f"{path}: this is a folder; give the name of a file to write.")
     temporary = None
@@ -50,6 +49,34 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 temporary.unlink()
+
+
+def require_folder(*paths: str | os.PathLike | None) -> None:
+    """Refuse, before any work is done, outputs (None: not asked for) whose folder does not exist.
+
+    Raises:
+        CfbError: names the first such output.
+    """
+    for path in paths:
+        if path is not None and not Path(path).parent.is_dir():
+            raise CfbError(f"{path}: the folder {Path(path).parent} does not exist; create it first.")
+
+
+def read_bytes(path: str | os.PathLike, count: int = -1) -> bytes:
+    """The first ``count`` bytes of a file, all of it by default.
+
+    Raises:
+        CfbError: the file is missing or cannot be read.
+    """
+    try:
+        with open(path, "rb") as file:
+            return file.read(count)
+    except FileNotFoundError:
+        raise CfbError(f"{path}: there is no such file; check the path.") from None
+    except OSError as error:
+        raise CfbError(
+            f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions."
+        ) from None
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:

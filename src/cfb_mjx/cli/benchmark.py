@@ -11,7 +11,7 @@ import jax
 from cfb_mjx.cli import workloads
 from cfb_mjx.cli.runtime import environment
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import write_json, write_text
+from cfb_mjx.files import require_folder, write_json, write_text
 
 PEER_STEPS = 500
 
@@ -61,9 +61,7 @@ def run_bench(drones: list[int], json: Path | None, markdown: Path | None, peer_
     """
     if not drones or min(drones) < 1:
         raise CfbError("--drones must be whole numbers from 1.")
-    for output in (json, markdown):
-        if output is not None and not output.parent.is_dir():
-            raise CfbError(f"{output}: the folder {output.parent} does not exist; create it first.")
+    require_folder(json, markdown)
     # A program from the cache would make compile time look like nothing.
     jax.config.update("jax_enable_compilation_cache", False)
     repetitions = 2 if quick else 7

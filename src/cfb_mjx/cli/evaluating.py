@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from cfb_mjx.cli.importing import describe_alignment
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import write_json
+from cfb_mjx.files import require_folder, write_json
 from cfb_mjx.logs import FlightLog, estimate_command_shift, read_log
 
 if TYPE_CHECKING:
@@ -25,9 +25,7 @@ def run_evaluate(paths: list[Path], model: str, changes: list[str], json: Path |
     Raises:
         CfbError: bad logs, bad model, or outputs that cannot be written.
     """
-    for output in (json, figure):
-        if output is not None and not output.parent.is_dir():
-            raise CfbError(f"{output}: the folder {output.parent} does not exist; create it first.")
+    require_folder(json, figure)
     logs = [read_log(path) for path in paths]  # before jax loads: a bad log is refused at once
     configure_jax(x64=True)
     described = changed_model(model, changes)

@@ -13,7 +13,7 @@ from cfb_mjx import __version__
 from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import write_json
+from cfb_mjx.files import require_folder, write_json
 from cfb_mjx.logs import FlightLog, read_log
 
 HELD_OUT_SHARE = 0.25
@@ -36,9 +36,7 @@ def run_fit(
     Raises:
         CfbError: bad logs, parameters or outputs.
     """
-    for path in (output, json):
-        if path is not None and not path.parent.is_dir():
-            raise CfbError(f"{path}: the folder {path.parent} does not exist; create it first.")
+    require_folder(output, json)
     if output.suffix not in (".yaml", ".yml"):
         raise CfbError(f"{output}: the output is a model and must end in .yaml.")
     logs = [read_log(path) for path in paths]

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.files import read_bytes
 from cfb_mjx.logs.assembly import Import, assemble
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.ros_bag import (
@@ -64,14 +65,7 @@ def read_crazyswarm(
     """
     path = Path(path)
     mapping = mapping if isinstance(mapping, VariableMap) else load_mapping(mapping)
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise CfbError(f"{path}: there is no such file; check the path.") from None
-    except OSError as error:
-        raise CfbError(
-            f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions."
-        ) from None
+    data = read_bytes(path)
     if not data.startswith(MAGIC):
         raise CfbError(f"{path}: this is not an MCAP file; give the .mcap inside the bag's folder.")
     notes: list[str] = []

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.files import read_bytes
 from cfb_mjx.logs import mcap_schema
 from cfb_mjx.logs.flight_log import FlightLog, from_nanoseconds
 
@@ -27,14 +28,7 @@ def read_mcap(path: str | os.PathLike) -> FlightLog:
             do not share one set of time stamps.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise CfbError(f"{path}: there is no such file; check the path.") from None
-    except OSError as error:
-        raise CfbError(
-            f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions."
-        ) from None
+    data = read_bytes(path)
     if not data:
         raise CfbError(f"{path}: the file is empty; export the log again.")
     if not data.startswith(_MAGIC):

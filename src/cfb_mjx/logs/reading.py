@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.files import read_bytes
 from cfb_mjx.logs import crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, usd_card
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.validation import validate
@@ -60,15 +61,7 @@ def read_log(path: str | os.PathLike, format: str | None = None, **options) -> F
 
 
 def _detect(path: Path):
-    try:
-        with open(path, "rb") as file:
-            head = file.read(len(_MCAP_MAGIC))
-    except FileNotFoundError:
-        raise CfbError(f"{path}: there is no such file; check the path.") from None
-    except OSError as error:
-        raise CfbError(
-            f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions."
-        ) from None
+    head = read_bytes(path, len(_MCAP_MAGIC))
     if head.startswith(usd_card.MAGIC):
         return "usd_card", None
     if head == _MCAP_MAGIC:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import replacing
+from cfb_mjx.files import read_bytes, replacing
 from cfb_mjx.logs.flight_log import FlightLog, quantise_time
 
 COLUMNS = {
@@ -53,15 +53,7 @@ def read_table(path: str | os.PathLike) -> Table:
     import pyarrow as pa
 
     path = Path(path)
-    try:
-        with open(path, "rb") as file:
-            head = file.read(4)
-    except FileNotFoundError:
-        raise CfbError(f"{path}: there is no such file; check the path.") from None
-    except OSError as error:
-        raise CfbError(
-            f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions."
-        ) from None
+    head = read_bytes(path, 4)
     if not head:
         raise CfbError(f"{path}: the file is empty; export the log again.")
     is_parquet = head == b"PAR1"

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.files import read_bytes
 from cfb_mjx.logs.assembly import Import, assemble
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.streams import Stream, ordered, unwrap
@@ -60,14 +61,7 @@ def read_usd_card(path: str | os.PathLike, mapping: str | os.PathLike | Variable
             variables that were not logged, fewer than two rows.
     """
     path = Path(path)
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise CfbError(f"{path}: there is no such file; check the path.") from None
-    except OSError as error:
-        raise CfbError(
-            f"{path}: cannot be read ({error.strerror or error}); check the path and its permissions."
-        ) from None
+    data = read_bytes(path)
     if not data.startswith(MAGIC):
         raise CfbError(f"{path}: does not begin with 0xBC, so it is no micro SD card log of a Crazyflie.")
     intact = len(data) > 9 and zlib.crc32(data[:-4]) == int.from_bytes(data[-4:], "little")

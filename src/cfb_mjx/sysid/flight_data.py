@@ -122,12 +122,12 @@ def _runs(mask: np.ndarray):
     return [range(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
+def white_noise(values: np.ndarray) -> np.ndarray:
+    """(k,) white noise on a smooth (n, k) signal from its third differences (variance factor 20), robustly."""
+    third = np.diff(values, n=3, axis=0)
+    return 1.4826 * np.nanmedian(np.abs(third), axis=0) / np.sqrt(20.0)
+
+
 def _noise(log: FlightLog) -> tuple[np.ndarray, np.ndarray, float]:
-    """White noise of a smooth signal from its third differences (variance factor 20), robustly."""
-
-    def level(values):
-        third = np.diff(values, n=3, axis=0)
-        return 1.4826 * np.nanmedian(np.abs(third), axis=0) / np.sqrt(20.0)
-
-    speed = np.nan if log.rotor_speed is None else float(np.nanmean(level(log.rotor_speed)))
-    return level(log.body_rate), level(log.specific_force), speed
+    speed = np.nan if log.rotor_speed is None else float(np.nanmean(white_noise(log.rotor_speed)))
+    return white_noise(log.body_rate), white_noise(log.specific_force), speed

@@ -19,6 +19,7 @@ from cfb_mjx.model.rotors import rotor_speed_history
 from cfb_mjx.model.state import State
 from cfb_mjx.model.vector import Vec, multiply
 from cfb_mjx.parameters import Parameters
+from cfb_mjx.sysid.flight_data import white_noise
 from cfb_mjx.sysid.prediction import predict_one
 from cfb_mjx.sysid.uncertainty import Uncertainty, assess
 from cfb_mjx.sysid.unknowns import Unknowns, choose
@@ -160,8 +161,7 @@ def _noise(log: FlightLog) -> np.ndarray:
     """(12,) noise of a row, from third differences; both ends of a window carry it."""
 
     def level(values):
-        third = np.diff(values, n=3, axis=0)
-        return np.maximum(1.4826 * np.median(np.abs(third), axis=0) / np.sqrt(20.0), 1e-6)
+        return np.maximum(white_noise(values), 1e-6)
 
     attitude = 2 * level(log.quaternion[:, 1:])
     return np.sqrt(2) * np.concatenate([level(log.position), level(log.velocity), attitude, level(log.body_rate)])
