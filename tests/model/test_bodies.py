@@ -76,6 +76,20 @@ def test_inverse_weights_equal_mujocos(guards):
     np.testing.assert_allclose(prepared.model.body_invweight0[1], body.mujoco_model.body("cfb").invweight0, rtol=1e-9)
 
 
+def test_the_mass_matrix_is_diagonal_in_every_state_as_the_contact_free_body_takes_it(guards):
+    body = MjxBody(floor=False)
+    ours = body.prepare(guards, 0.004).mass_diagonal
+    data = mujoco.MjData(body.mujoco_model)
+    matrix = np.zeros((6, 6))
+    for seed in range(20):
+        random = np.random.default_rng(seed)
+        data.qpos[:3], data.qpos[3:] = random.normal(size=3), random.normal(size=4)
+        data.qpos[3:] /= np.linalg.norm(data.qpos[3:])
+        mujoco.mj_forward(body.mujoco_model, data)
+        mujoco.mj_fullM(body.mujoco_model, data, matrix)
+        np.testing.assert_allclose(matrix, np.diag(ours), rtol=1e-9, atol=1e-15)
+
+
 def test_mjx_follows_mujoco_c_in_free_flight(guards):
     y, commands = _random_flight(250)
     body = MjxBody(floor=False)
@@ -162,6 +176,11 @@ def test_mjx_follows_mujoco_c_onto_the_floor(landings):
         ("<mujoco><worldbody/></mujoco>", "free joint"),
         ("<mujoco><worldbody><body name='cfb'><freejoint/></body></worldbody></mujoco>", "mass"),
         ("not xml", "compile"),
+        (
+            "<mujoco><worldbody><body name='cfb'><freejoint/><geom size='1'/><body name='leg'><geom size='1'/></body>"
+            "</body></worldbody></mujoco>",
+            "child",
+        ),
         ("<mujoco><worldbody><body name='x'><freejoint/><geom size='1'/></body></worldbody></mujoco>", "cfb"),
     ],
 )

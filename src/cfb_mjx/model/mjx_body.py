@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jaxtyping import Array, Float
 
 with contextlib.redirect_stdout(io.StringIO()):
     # MJX announces on standard output that its optional warp backend is missing.
     from mujoco import mjx
-    from mujoco.mjx._src import smooth
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
@@ -39,6 +39,9 @@ _NOT_NEEDED = (
 class _Prepared(eqx.Module):
     model: mjx.Model
     data: mjx.Data
+    mass_diagonal: Float[Array, "6"]
+    """Diagonal of the joint-space inertia. For one free body in its centre-of-gravity frame that matrix is diagonal
+    and the same in every state, so it is computed and inverted once instead of at every step."""
 
 
 class MjxBody:
@@ -87,7 +90,7 @@ class MjxBody:
             geom_pos=jnp.where(moving[:, None], model.geom_pos - center, model.geom_pos),
             body_invweight0=model.body_invweight0.at[body].set(inverse),
         )
-        return _Prepared(model, data)
+        return _Prepared(model, data, _mass_diagonal(model, data))
 
     def accelerations(self, prepared: _Prepared, state: Components, wrench: Wrench) -> tuple[Vec, Vec]:
         model = prepared.model
@@ -100,7 +103,7 @@ class MjxBody:
         if self.floor:
             acceleration = _with_contact(model, data)
         else:
-            acceleration = _contact_free(model, data)
+            acceleration = _contact_free(model, data, prepared.mass_diagonal)
         return Vec.unstack(acceleration[:3]), Vec.unstack(acceleration[3:])
 
     def __eq__(self, other) -> bool:
@@ -120,15 +123,20 @@ def _with_contact(model: mjx.Model, data: mjx.Data) -> jax.Array:
 
 
 @jax.jit
-def _contact_free(model: mjx.Model, data: mjx.Data) -> jax.Array:
+def _contact_free(model: mjx.Model, data: mjx.Data, mass_diagonal: jax.Array) -> jax.Array:
     """qacc of `mjx.forward` where nothing touches: its stages without geoms, sites, actuators and constraints."""
     data = mjx.kinematics(model, data)
     data = mjx.com_pos(model, data)
-    data = mjx.crb(model, data)
-    data = mjx.factor_m(model, data)
     data = mjx.com_vel(model, data)
     data = mjx.rne(model, data)
-    return smooth.solve_m(model, data, data.qfrc_applied - data.qfrc_bias)
+    return (data.qfrc_applied - data.qfrc_bias) / mass_diagonal
+
+
+@jax.jit
+def _mass_diagonal(model: mjx.Model, data: mjx.Data) -> jax.Array:
+    data = mjx.kinematics(model, data)
+    data = mjx.com_pos(model, data)
+    return jnp.diagonal(mjx.full_m(model, mjx.crb(model, data)))
 
 
 @functools.lru_cache(maxsize=8)
@@ -150,6 +158,9 @@ def _compile(mjcf: str | None, floor: bool) -> mujoco.MjModel:
     joints = model.njnt == 1 and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
     if not joints or model.body(model.jnt_bodyid[0]).name != BODY_NAME:
         raise CfbError(f"{path}: must have exactly one joint, the free joint of a body named '{BODY_NAME}'.")
+    body = _body_index(model)
+    if np.any(model.body_weldid[np.arange(model.nbody) != body] == body):
+        raise CfbError(f"{path}: body '{BODY_NAME}' has child bodies; put their geoms on '{BODY_NAME}' itself.")
     return model
 
 
