@@ -1,0 +1,278 @@
+"""``cfb fit-rotors``: motors and rotor maps on their own, from flights with rotor speed and from bench tables."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from dataclasses import replace
+from datetime import date
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cfb_mjx import __version__
+from cfb_mjx.cli.evaluating import changed_model
+from cfb_mjx.cli.runtime import Progress, configure_jax, environment
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import read_bytes, require_folder, write_json
+from cfb_mjx.logs import read_log
+from cfb_mjx.logs.bench_tables import MapTable, MotorRecord, from_columns, recognises
+from cfb_mjx.logs.tabular import read_table
+
+if TYPE_CHECKING:
+    from cfb_mjx.parameters import ModelFile
+    from cfb_mjx.sysid.motors import MotorFit
+    from cfb_mjx.sysid.rotor_maps import MapFit
+
+_FILE_NAMES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
+_COLUMN = {"thrust": "force", "torque": "torque"}
+_LIMIT = "the model file has one time constant per motor and no dead time"
+
+
+def run_fit_rotors(
+    paths: list[Path],
+    output: Path,
+    model: str,
+    changes: list[str],
+    offset: bool = False,
+    asymmetric: bool = False,
+    dead_time: bool = False,
+    per_motor: bool = False,
+    robust: bool = False,
+    json: Path | None = None,
+    figure: Path | None = None,
+) -> None:
+    """Fit what the files hold, print a table, write the model.
+
+    Raises:
+        CfbError: bad files, nothing that can be fitted, or outputs that cannot be written.
+    """
+    require_folder(output, json, figure)
+    if output.suffix not in (".yaml", ".yml"):
+        raise CfbError(f"{output}: the output is a model and must end in .yaml.")
+    if figure is not None:
+        from cfb_mjx.view.style import check_path
+
+        check_path(figure)
+    records, tables = _read(paths)
+    configure_jax(x64=True)
+    from cfb_mjx.parameters import save_model_file
+    from cfb_mjx.sysid.motors import fit_motors
+
+    base = changed_model(model, changes)
+    motors = None
+    extras = {"offset": offset, "asymmetric": asymmetric, "dead_time": dead_time}
+    if records:
+        motors = fit_motors(
+            records, base.parameters(), **extras, per_motor=per_motor, progress=Progress("fitting motors")
+        )
+    maps = _fit_maps(tables, base, per_motor, robust)
+    corrected, written = _corrected(base, motors, maps, output, paths)
+    if not written:
+        reasons = "; ".join(motors.common.unidentifiable.values()) if motors else ""
+        raise CfbError(f"{', '.join(p.name for p in paths)}: cannot tell any constant of the model ({reasons}).")
+    save_model_file(corrected, output)
+    _print(motors, maps, base, {name for name, on in extras.items() if on})
+    print(f"model: {output} ({', '.join(written)})")
+    if motors and motors.common.extras - {"offset"}:
+        print(f"spin-up and spin-down constants and dead time are reported only: {_LIMIT}.")
+    if json is not None:
+        write_json(json, _json(motors, maps, base, written))
+        print(f"results: {json}")
+    if figure is not None:
+        from cfb_mjx.sysid.motor_replay import replay
+        from cfb_mjx.view.rotors import rotor_figure
+
+        rotor_figure(replay(motors) if motors else [], maps, figure, output.stem)
+        print(f"figure: {figure}")
+
+
+def _read(paths: list[Path]) -> tuple[list[MotorRecord], list[MapTable]]:
+    """Every file by its content: bench tables by their columns, all else as a flight."""
+    records, tables = [], []
+    for path in paths:
+        found = _bench(path)
+        if found is None:
+            from cfb_mjx.sysid.motor_tracks import record_of
+
+            found = record_of(read_log(path))
+            if found is None:
+                raise CfbError(f"{path}: holds no rotor speeds; log them, or leave this flight out.")
+        (tables if isinstance(found, MapTable) else records).append(found)
+    return records, tables
+
+
+def _bench(path: Path) -> MotorRecord | MapTable | None:
+    head = read_bytes(path, 4)
+    if path.suffix.lower() not in (".csv", ".txt", ".parquet") and head != b"PAR1":
+        return None
+    table = read_table(path)
+    return from_columns(table, path) if recognises(table) else None
+
+
+def _fit_maps(tables: list[MapTable], base: ModelFile, per_motor: bool, robust: bool) -> dict[str, MapFit]:
+    from cfb_mjx.sysid.rotor_maps import fit_map
+
+    found = {}
+    for name, column in _COLUMN.items():
+        used = [t for t in tables if getattr(t, column) is not None]
+        if not used:
+            continue
+        motor = np.concatenate([t.motor for t in used])
+        label = ", ".join(t.name for t in used)
+        if per_motor and (motor == 0).any():
+            raise CfbError(f"{label}: does not say which motor each point is of; add a column motor (1 to 4).")
+        found[name] = fit_map(
+            np.concatenate([t.rotor_speed for t in used]),
+            np.concatenate([getattr(t, column) for t in used]),
+            motor,
+            robust=robust,
+            per_motor=per_motor,
+            sigma=float(base.entries["reference_rotor_speed"].value),
+            name=f"{label} ({name})",
+        )
+    return found
+
+
+def _corrected(base: ModelFile, motors, maps, output: Path, paths: list[Path]) -> tuple[ModelFile, list[str]]:
+    """The model with what was identified, and the names of what changed."""
+    from cfb_mjx.parameters import Entry
+
+    source = f"cfb fit-rotors on {len(paths)} file(s), {date.today().isoformat()}"
+    entries, written = dict(base.entries), []
+
+    def put(key: str, value: np.ndarray, std: np.ndarray | None) -> None:
+        entries[key] = Entry(np.asarray(value, dtype=float), source, std)
+        written.append(key)
+
+    for name in _FILE_NAMES if motors else ():
+        found = motors.values(name)
+        if found is not None:
+            put(name, *found)
+    for name, fitted in maps.items():
+        put(f"{name}_polynomial", fitted.coefficients, fitted.std)
+        # The factors belong to the curve: old ones would count twice.
+        scale, std = np.ones(4), np.zeros(4)
+        for motor, value, deviation in zip(fitted.motors, fitted.scale, fitted.scale_std, strict=True):
+            scale[motor - 1], std[motor - 1] = value, deviation
+        if len(fitted.motors) or np.any(base.entries[f"{name}_scale"].value != 1):
+            put(f"{name}_scale", scale, std if len(fitted.motors) else None)
+    provenance = {
+        "command": shlex.join(["cfb", "fit-rotors", *(Path(a).name if "/" in a else a for a in sys.argv[2:])]),
+        "base_model": base.name,
+        "files_sha256": {path.name: sha256(path.read_bytes()).hexdigest() for path in paths},
+        "cfb_mjx": __version__,
+        "environment": environment(),
+    }
+    description = f"{base.name} with rotors fitted to {', '.join(path.name for path in paths)}"
+    return replace(base, entries=entries, name=output.stem, description=description, provenance=provenance), written
+
+
+def _coefficients(maps: dict[str, MapFit], base: ModelFile) -> dict[str, dict]:
+    """Coefficients and factors as rows of the table; presets on the base model's own reference speed."""
+    rows = {}
+    for name, fitted in maps.items():
+        unit = "N" if name == "thrust" else "N m"
+        old = base.entries[f"{name}_polynomial"].value * np.mean(base.entries[f"{name}_scale"].value)
+        for power, value, std, preset in zip("321", fitted.coefficients, fitted.std, old, strict=True):
+            rows[f"{name}_s{power}"] = {"value": value, "std": std, "unit": unit, "preset": preset}
+        scales = base.entries[f"{name}_scale"].value
+        for motor, value, std in zip(fitted.motors, fitted.scale, fitted.scale_std, strict=True):
+            rows[f"{name}_scale_M{motor}"] = {"value": value, "std": std, "unit": "1", "preset": scales[motor - 1]}
+    return rows
+
+
+def _rows(group) -> dict[str, dict]:
+    return {
+        name: {"value": e.value, "std": e.std, "unit": e.unit, "preset": e.preset}
+        for name, e in group.estimates.items()
+    }
+
+
+def _group_json(group) -> dict:
+    noise = group.motor
+    return {
+        "parameters": _rows(group),
+        "fitted_with": sorted(group.extras),
+        "unidentifiable": list(group.unidentifiable),
+        "unidentifiable_because": group.unidentifiable,
+        "extras": {
+            t.name: {"p_value": t.p_value, "bic_gain": t.bic_gain, "supported": t.supported} for t in group.tests
+        },
+        "noise": {"reading_radps": noise.reading, "walk_radps_per_sqrt_s": noise.walk, "wander_radps": noise.wander},
+        "innovation_lag_one_correlation": group.optimum.whiteness,
+        "share_of_rows_beyond_5_std": group.optimum.outliers,
+        "rows": group.optimum.rows,
+    }
+
+
+def _json(motors: MotorFit | None, maps: dict[str, MapFit], base: ModelFile, written: list[str]) -> dict:
+    result = {"parameters": (_rows(motors.common) if motors else {}) | _coefficients(maps, base)}
+    result["unidentifiable"] = list(motors.common.unidentifiable) if motors else []
+    if motors:
+        result["motors"] = {"all": _group_json(motors.common)}
+        result["motors"] |= {f"M{n}": _group_json(group) for n, group in motors.motors.items()}
+        result["motors_differ_p_value"] = motors.differences
+    result["maps"] = {
+        name: {
+            "coefficients": m.coefficients,
+            "covariance": m.covariance,
+            "reference_rotor_speed_radps": m.sigma,
+            "noise": m.noise[0],
+            "increasing_where_measured": m.shape.increasing_where_measured,
+            "notes": m.shape.notes(),
+            "scales_equal_p_value": m.scale_p_value,
+            "points": {
+                "motor": m.motor,
+                "rotor_speed_radps": m.rotor_speed,
+                "measured": m.value,
+                "residual": m.residual,
+                "weight": m.weight,
+            },
+        }
+        for name, m in maps.items()
+    }
+    return result | {"written_to_model": written, "environment": environment()}
+
+
+def _print(motors: MotorFit | None, maps: dict[str, MapFit], base: ModelFile, asked: set[str]) -> None:
+    print(f"{'constant':<26}{'value':>12}{'std':>11}  {'unit':<8}{'preset':>11}{'change':>9}")
+    groups = {"": motors.common, **{f" M{n}": g for n, g in motors.motors.items()}} if motors else {}
+    for suffix, group in groups.items():
+        _print_rows({name + suffix: row for name, row in _rows(group).items()})
+    _print_rows(_coefficients(maps, base))
+    for suffix, group in groups.items():
+        for reason in dict.fromkeys(group.unidentifiable.values()):
+            print(f"not identifiable{suffix}: {reason}")
+    for test in motors.common.tests if motors else ():
+        verdict = "supported by the data" if test.supported else "not supported by the data"
+        hint = ""
+        if test.supported and test.name not in asked:
+            hint = "; --offset fits it" if test.name == "offset" else "; the fit allows for it"
+        print(f"{test.name.replace('_', ' ')}: {verdict} (p = {test.p_value:.2g}, BIC {-test.bic_gain:+.1f}){hint}")
+    for name, p in (motors.differences if motors else {}).items():
+        if p < 0.01:
+            print(f"the motors differ in {name} (p = {p:.2g})")
+    if motors:
+        best = motors.common.optimum
+        print(
+            f"rows {best.rows}; innovations: lag-one correlation {best.whiteness:+.3f}, "
+            f"{best.outliers:.2%} beyond 5 standard deviations"
+        )
+    for name, m in maps.items():
+        unit = "N" if name == "thrust" else "N m"
+        print(f"{name}: {len(m.value)} points, noise {m.noise[0]:.2g} {unit}, {len(m.outliers)} outliers")
+        for note in m.shape.notes():
+            print(f"{name}: {note}")
+        if np.isfinite(m.scale_p_value):
+            word = "differ" if m.scale_p_value < 0.01 else "do not differ significantly"
+            print(f"{name}: the motors {word} (p = {m.scale_p_value:.2g})")
+
+
+def _print_rows(rows: dict[str, dict]) -> None:
+    for name, row in rows.items():
+        change = f"{row['value'] / row['preset'] - 1:+.1%}" if row["preset"] else ""
+        numbers = f"{row['value']:>12.4g}{row['std']:>11.2g}  {row['unit']:<8}{row['preset']:>11.4g}{change:>9}"
+        print(f"{name:<26}{numbers}".rstrip())

@@ -1,0 +1,191 @@
+"""Bench measurements as tables (csv or parquet): command steps, and force and torque against rotor speed."""
+
+from __future__ import annotations
+
+import itertools
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs.tabular import Table, read_table, require_numbers
+
+STEP_LAYOUT = "t (s), u or u1..u4 (0 to 1), omega or omega1..omega4 (rad/s)"
+MAP_LAYOUT = "omega (rad/s), force (N) and/or torque (N m), optionally motor (1 to 4)"
+# No Crazyflie rotor reaches 4000 rad/s, pulls 2 N or needs 0.02 N m: beyond, the column is in another unit.
+SPEED_LIMIT, FORCE_LIMIT, TORQUE_LIMIT = 4000.0, 2.0, 0.02
+_FLIGHT = ("px", "qw", "wx", "ax", "ros_timestamp_x")
+
+
+@dataclass(frozen=True)
+class MotorRecord:
+    """One recording of k motors, from a flight or from a bench.
+
+    Attributes:
+        name: of the recording, for messages.
+        time: (n,) s, increasing.
+        command: (n, k) in [0, 1]; a row holds until the next.
+        rotor_speed: (n, k) rad/s, NaN where a reading is missing.
+        motors: (k,) motor numbers 1..4; 0 where the recording does not say which.
+    """
+
+    name: str
+    time: np.ndarray
+    command: np.ndarray
+    rotor_speed: np.ndarray
+    motors: tuple[int, ...]
+
+    def segments(self) -> list[slice]:
+        """Stretches of rows without a gap (a gap is longer than three nominal intervals + 0.5 ms)."""
+        steps = np.diff(self.time)
+        gaps = np.flatnonzero(steps > 3 * np.median(steps) + 0.5e-3) + 1
+        return [slice(a, b) for a, b in itertools.pairwise([0, *gaps.tolist(), len(self.time)])]
+
+
+@dataclass(frozen=True)
+class MapTable:
+    """Steady force and torque at rotor speeds.
+
+    Attributes:
+        name: file name without its ending.
+        rotor_speed: (n,) rad/s.
+        force: (n,) N, or None.
+        torque: (n,) N m, magnitude, or None.
+        motor: (n,) numbers 1..4; 0 where the table does not say.
+    """
+
+    name: str
+    rotor_speed: np.ndarray
+    force: np.ndarray | None
+    torque: np.ndarray | None
+    motor: np.ndarray
+
+
+def recognises(table: Table) -> bool:
+    """Whether the columns are a bench table's rather than a flight's."""
+    if any(c in table for c in _FLIGHT):
+        return False
+    return "force" in table or "torque" in table or any(c == "u" or c.startswith("omega") for c in table)
+
+
+def read_bench(path: str | os.PathLike) -> MotorRecord | MapTable:
+    """Read and check a bench table; which kind it is follows from its columns.
+
+    Raises:
+        CfbError: unreadable or empty file, missing columns, missing or infinite values, time that does not increase, or
+            another unit (rpm, percent, PWM, grams, millinewtons); one sentence with what to do.
+    """
+    path = Path(path)
+    return from_columns(read_table(path), path)
+
+
+def from_columns(table: Table, path: Path) -> MotorRecord | MapTable:
+    """`read_bench` on columns already in memory."""
+    if "force" in table or "torque" in table:
+        return _map(table, path)
+    if "t" in table:
+        return _steps(table, path)
+    raise CfbError(
+        f"{path}: is neither a step table with {STEP_LAYOUT} nor a map table with {MAP_LAYOUT}; "
+        f"its columns are {', '.join(table)}; rename them."
+    )
+
+
+def _steps(table: Table, path: Path) -> MotorRecord:
+    speeds = [c for c in ("omega", *(f"omega{i}" for i in range(1, 5))) if c in table]
+    if not speeds or ("omega" in speeds and len(speeds) > 1):
+        raise CfbError(f"{path}: needs one column omega or columns omega1..omega4; a step table holds {STEP_LAYOUT}.")
+    motors = tuple(int(c[5:] or 0) for c in speeds)
+    commands = [f"u{m}" if m and f"u{m}" in table else "u" for m in motors]
+    if motors == (0,) and "u" not in table:
+        raise CfbError(f"{path}: missing column u, the command that goes with omega; a step table holds {STEP_LAYOUT}.")
+    if missing := sorted({f"u{m}" for m, c in zip(motors, commands, strict=True) if c not in table}):
+        raise CfbError(f"{path}: missing column {', '.join(missing)} (or u); a step table holds {STEP_LAYOUT}.")
+    require_numbers(table, ["t", *dict.fromkeys(commands), *speeds], path)
+    time = table["t"]
+    if len(time) < 2:
+        raise CfbError(f"{path}: the table has {len(time)} rows; record at least a second of steps.")
+    _finite(table, ["t", *dict.fromkeys(commands)], path)
+    step = np.diff(time)
+    if (step <= 0).any():
+        row = int(np.argmax(step <= 0)) + 1
+        raise CfbError(f"{path}: t does not increase in row {row} (counted from 0); sort by t and drop duplicates.")
+    if np.median(step) >= 0.5:
+        raise CfbError(f"{path}: rows are {np.median(step):g} s apart, so t is probably in ms or us; convert it to s.")
+    command = np.stack([table[c] for c in commands], axis=1)
+    _command(command, commands, path)
+    speed = np.stack([table[c] for c in speeds], axis=1)
+    _speed(speed, path)
+    return MotorRecord(path.stem, time, np.clip(command, 0, 1), speed, motors)
+
+
+def _map(table: Table, path: Path) -> MapTable:
+    if "omega" not in table:
+        raise CfbError(f"{path}: missing column omega; a map table holds {MAP_LAYOUT}.")
+    used = [c for c in ("omega", "force", "torque", "motor") if c in table]
+    require_numbers(table, used, path)
+    if not len(table["omega"]):
+        raise CfbError(f"{path}: the table has no rows; export the measurement again.")
+    _finite(table, used, path)
+    speed = table["omega"]
+    _speed(speed[:, None], path)
+    force, torque, motor = (table.get(c) for c in ("force", "torque", "motor"))
+    if force is not None:
+        top = float(np.abs(force).max())
+        if top > FORCE_LIMIT:
+            unit, factor = ("millinewtons", "0.001") if top > 100 else ("grams", "0.00981")
+            raise CfbError(f"{path}: force reaches {top:.3g} N, which looks like {unit}; multiply it by {factor}.")
+        if np.median(force) < 0:
+            raise CfbError(f"{path}: force is mostly negative; give thrust along the rotor axis as positive, in N.")
+    if torque is not None:
+        top = float(np.abs(torque).max())
+        if top > TORQUE_LIMIT:
+            raise CfbError(
+                f"{path}: torque reaches {top:.3g} N m, which looks like millinewton metres; multiply it by 0.001."
+            )
+        if np.median(torque) < 0:
+            raise CfbError(f"{path}: torque is mostly negative; give the magnitude of the drag torque, in N m.")
+    if motor is None:
+        motor = np.zeros(len(speed))
+    elif not np.isin(motor, (1, 2, 3, 4)).all():
+        raise CfbError(f"{path}: motor must be 1, 2, 3 or 4 (M1 front-right ... M4 front-left) in every row.")
+    return MapTable(path.stem, speed, force, torque, motor.astype(int))
+
+
+def _finite(table: Table, columns: list[str], path: Path) -> None:
+    for column in columns:
+        bad = ~np.isfinite(table[column])
+        if bad.any():
+            raise CfbError(
+                f"{path}: column {column} has no finite value in row {int(np.argmax(bad))} (counted from 0; "
+                f"{int(bad.sum())} rows in all); drop those rows."
+            )
+
+
+def _command(command: np.ndarray, names: list[str], path: Path) -> None:
+    low, high = float(command.min()), float(command.max())
+    if low < -1e-3:
+        raise CfbError(f"{path}: {names[0]} is negative ({low:.3g}); commands lie in [0, 1].")
+    if high > 1.001:
+        unit, factor = ("percent", 100) if high <= 100.5 else ("raw PWM in 0..65535", 65535)
+        raise CfbError(f"{path}: {names[0]} reaches {high:.4g}, which looks like {unit}; divide it by {factor}.")
+
+
+def _speed(speed: np.ndarray, path: Path) -> None:
+    known = speed[np.isfinite(speed)]
+    if np.isinf(speed).any() or not len(known):
+        raise CfbError(f"{path}: omega holds infinite values or none at all; leave missing readings empty.")
+    if known.min() < 0:
+        raise CfbError(f"{path}: omega is negative in places; rotor speeds are magnitudes in rad/s, drop the sign.")
+    beyond = known > SPEED_LIMIT
+    if beyond.mean() > 0.01:
+        raise CfbError(
+            f"{path}: omega reaches {known.max():.0f}, which looks like rpm; multiply it by 2 pi / 60 (0.10472)."
+        )
+    if beyond.any():
+        raise CfbError(
+            f"{path}: omega holds single readings up to {known.max():.0f} rad/s, faster than any rotor turns; "
+            "drop those readings (in a step table: leave them empty)."
+        )

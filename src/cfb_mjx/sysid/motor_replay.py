@@ -1,0 +1,57 @@
+"""What fitted motors would have done under the recorded commands, beside what they did."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cfb_mjx.sysid.motor_likelihood import undisturbed
+from cfb_mjx.sysid.motor_tracks import gather
+from cfb_mjx.sysid.motors import MotorFit
+
+
+@dataclass(frozen=True)
+class Replay:
+    """One motor, the piece of its recordings in which the command moves most.
+
+    Attributes:
+        motor: number, 0 where not known.
+        time: (n,) s from the piece's start.
+        command: (n,) in [0, 1].
+        measured: (n,) rad/s, NaN where missing.
+        simulated: (n,) rad/s, from the commands alone.
+        rms: of measured minus simulated over all recordings of the motor, rad/s.
+    """
+
+    motor: int
+    time: np.ndarray
+    command: np.ndarray
+    measured: np.ndarray
+    simulated: np.ndarray
+    rms: float
+
+
+def replay(fit: MotorFit) -> list[Replay]:
+    """Simulate every motor from its commands, with its own constants where it was fitted on its own."""
+    found = []
+    for number in sorted({n for record in fit.records for n in record.motors}):
+        data = gather(fit.records, number)
+        if data is None:
+            continue
+        tracks = data.tracks
+        vector = fit.motors.get(number, fit.common).optimum.vector
+        simulated = np.asarray(undisturbed(jnp.asarray(vector), jax.tree.map(jnp.asarray, tracks)).rotor_speed)
+        judged = tracks.judged > 0
+        error = (tracks.rotor_speed - simulated)[judged]
+        # A scrap of a flight shows little, however much the command moves in it.
+        enough = judged.sum(axis=1) >= 0.5 * judged.sum(axis=1).max()
+        moves = [np.std(c[j]) if ok else -1.0 for c, j, ok in zip(tracks.command, judged, enough, strict=True)]
+        shown = int(np.argmax(moves))
+        rows = slice(0, int(np.flatnonzero(judged[shown])[-1]) + 1)
+        measured = np.where(tracks.measured[shown] > 0, tracks.rotor_speed[shown], np.nan)
+        columns = (tracks.time[shown], tracks.command[shown], measured, simulated[shown])
+        found.append(Replay(number, *(c[rows] for c in columns), float(np.sqrt(np.mean(error**2)))))
+    return found

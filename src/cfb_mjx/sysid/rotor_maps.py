@@ -1,0 +1,215 @@
+"""Thrust and torque of a rotor from bench points: a cubic through the origin by linear least squares (paper eqs. 8-9).
+
+``y(Omega) = c3 s^3 + c2 s^2 + c1 s`` with ``s = Omega / sigma``. Optionally every motor has a factor of its own on the
+common curve (mean one), and outliers are weighed down (Huber, Robust Statistics, 1981, chapter 7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.sysid.map_shape import SIGMA, Shape, shape_of
+
+HUBER = 1.345
+"""Residuals beyond this many standard deviations count linearly: 95 % efficient on normal noise."""
+FEWEST_POINTS = 6
+_ITERATIONS = 50
+
+
+@dataclass(frozen=True)
+class MapFit:
+    """A fitted curve.
+
+    Attributes:
+        coefficients: (3,) of s^3, s^2, s, like `Parameters.thrust_polynomial`.
+        covariance: (3, 3).
+        scale: (m,) factor of each motor, mean one; empty when all share one curve.
+        scale_std: (m,) its standard deviations.
+        motors: (m,) numbers the factors belong to.
+        scale_p_value: that all factors are one (F test); NaN without factors.
+        rotor_speed: (n,) points, rad/s.
+        value: (n,) measured, N or N m.
+        residual: (n,) measured minus fitted.
+        weight: (n,) 1, or less for what the robust fit takes for outliers.
+        motor: (n,) motor numbers.
+        noise: standard deviation of a point, from the residuals (robustly if asked) or as given, N or N m; (n,).
+        shape: monotonicity and sign.
+        sigma: reference rotor speed, rad/s.
+    """
+
+    coefficients: np.ndarray
+    covariance: np.ndarray
+    scale: np.ndarray
+    scale_std: np.ndarray
+    motors: tuple[int, ...]
+    scale_p_value: float
+    rotor_speed: np.ndarray
+    value: np.ndarray
+    residual: np.ndarray
+    weight: np.ndarray
+    motor: np.ndarray
+    noise: np.ndarray
+    shape: Shape
+    sigma: float
+
+    @property
+    def std(self) -> np.ndarray:
+        """(3,) standard deviations of the coefficients."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def outliers(self) -> np.ndarray:
+        """Indices of points more than four standard deviations off the curve."""
+        return np.flatnonzero(np.abs(self.residual) > 4 * self.noise)
+
+    def curve(self, rotor_speed: np.ndarray) -> np.ndarray:
+        """The common curve, N or N m."""
+        return powers(rotor_speed, self.sigma) @ self.coefficients
+
+    def curve_std(self, rotor_speed: np.ndarray) -> np.ndarray:
+        """Standard deviation of the common curve, N or N m."""
+        design = powers(rotor_speed, self.sigma)
+        return np.sqrt(np.einsum("ni,ij,nj->n", design, self.covariance, design))
+
+
+def powers(rotor_speed: np.ndarray, sigma: float = SIGMA) -> np.ndarray:
+    """(n, 3) columns s^3, s^2, s."""
+    s = np.asarray(rotor_speed, dtype=float) / sigma
+    return np.stack([s**3, s**2, s], axis=-1)
+
+
+def fit_map(
+    rotor_speed: np.ndarray,
+    value: np.ndarray,
+    motor: np.ndarray | None = None,
+    std: float | np.ndarray | None = None,
+    robust: bool = False,
+    per_motor: bool = False,
+    sigma: float = SIGMA,
+    name: str = "map",
+) -> MapFit:
+    """Fit thrust [N] or torque [N m] against rotor speed [rad/s].
+
+    Args:
+        rotor_speed: (n,) rad/s.
+        value: (n,) measured.
+        motor: (n,) numbers of the motors; all one by default.
+        std: noise of the points, N or N m, for their weights; estimated from the residuals by default.
+        robust: weigh outliers down.
+        per_motor: a factor for each motor on the common curve.
+        sigma: reference rotor speed, rad/s.
+        name: for messages.
+
+    Raises:
+        CfbError: too few points or too few different speeds for a cubic.
+    """
+    speed, value = np.asarray(rotor_speed, float), np.asarray(value, float)
+    motor = np.zeros(len(speed), int) if motor is None else np.asarray(motor, int)
+    motors = tuple(sorted(set(motor.tolist()))) if per_motor else ()
+    motors = motors if len(motors) > 1 else ()
+    _enough(speed, motor, motors, name)
+    given = None if std is None else np.broadcast_to(np.asarray(std, float), speed.shape)
+    unit = np.ones(len(speed)) if given is None else given
+    weight, noise = np.ones(len(speed)), unit
+    member = np.array([motor == m for m in motors], float).T if motors else np.zeros((len(speed), 0))
+    design = powers(speed, sigma)
+    theta, scale = np.zeros(3), np.ones(len(motors))
+    for _ in range(_ITERATIONS):
+        before = np.concatenate([theta, scale])
+        theta, scale = _least_squares(design, member, value, np.sqrt(weight) / unit, scale)
+        residual = value - _factor(member, scale) * (design @ theta)
+        free = len(speed) - 3 - max(len(motors) - 1, 0)
+        noise = given if given is not None else np.full(len(speed), _spread(residual, free, robust))
+        if robust:
+            ratio = np.abs(residual) / noise
+            weight = np.where(ratio > HUBER, HUBER / np.maximum(ratio, HUBER), 1.0)
+        if np.abs(np.concatenate([theta, scale]) - before).max() <= 1e-12 * (1 + np.abs(before).max()):
+            break
+    covariance = _covariance(design, member, theta, scale, residual, noise, robust)
+    spread = covariance[3:, 3:]
+    return MapFit(
+        coefficients=theta,
+        covariance=covariance[:3, :3],
+        scale=scale,
+        scale_std=np.sqrt(np.diag(spread)),
+        motors=motors,
+        scale_p_value=_agreement(scale, spread, free),
+        rotor_speed=speed,
+        value=value,
+        residual=residual,
+        weight=weight,
+        motor=motor,
+        noise=noise,
+        shape=shape_of(theta, (float(speed.min()), float(speed.max())), sigma),
+        sigma=sigma,
+    )
+
+
+def _enough(speed: np.ndarray, motor: np.ndarray, motors: tuple[int, ...], name: str) -> None:
+    if len(speed) < FEWEST_POINTS:
+        raise CfbError(f"{name}: has {len(speed)} points, a cubic needs at least {FEWEST_POINTS}; measure more.")
+    ordered = np.sort(speed[speed > 0])
+    # Points closer than 2 % of full speed are repetitions of one setting.
+    levels = 1 + int(np.sum(np.diff(ordered) > 0.02 * SIGMA)) if len(ordered) else 0
+    if levels < 3:
+        raise CfbError(
+            f"{name}: holds {levels} different rotor speeds, the three coefficients of a cubic need at least 3; "
+            "measure between idle and full speed."
+        )
+    for m in motors:
+        if np.sum(motor == m) < 2:
+            raise CfbError(f"{name}: motor {m} has a single point; measure more, or fit without --per-motor.")
+
+
+def _factor(member: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    return member @ scale if member.shape[1] else np.ones(len(member))
+
+
+def _least_squares(design, member, value, root, scale):
+    """One round: the curve given the factors, then the factors given the curve, with their mean moved to the curve."""
+    rows = (root * _factor(member, scale))[:, None] * design
+    theta = np.linalg.lstsq(rows, root * value, rcond=None)[0]
+    if member.shape[1]:
+        curve = root * (design @ theta)
+        scale = (member.T @ (curve * root * value)) / (member.T @ curve**2)
+        theta, scale = theta * scale.mean(), scale / scale.mean()
+    return theta, scale
+
+
+def _spread(residual: np.ndarray, free: int, robust: bool) -> float:
+    if robust:
+        # Fewer residuals than points are free; without the factor a small table looks too good.
+        return max(1.4826 * np.median(np.abs(residual)) * np.sqrt(len(residual) / free), 1e-12)
+    return max(float(np.sqrt(residual @ residual / free)), 1e-12)
+
+
+def _covariance(design, member, theta, scale, residual, noise, robust: bool) -> np.ndarray:
+    """(3 + m, 3 + m) of the coefficients and the factors; the factors' mean is fixed."""
+    count = member.shape[1]
+    slopes = np.concatenate([_factor(member, scale)[:, None] * design, member * (design @ theta)[:, None]], axis=1)
+    # The factors live in the space orthogonal to a common change.
+    basis = np.eye(3 + count)
+    if count:
+        within = np.linalg.svd(np.ones((1, count)))[2][1:].T
+        basis = np.block([[np.eye(3), np.zeros((3, count - 1))], [np.zeros((count, 3)), within]])
+    triangle = np.linalg.qr((slopes / noise[:, None]) @ basis, mode="r")
+    inverse = np.linalg.inv(triangle)
+    covariance = basis @ (inverse @ inverse.T) @ basis.T
+    if not robust:
+        return covariance
+    ratio = residual / noise
+    psi, slope = np.clip(ratio, -HUBER, HUBER), np.mean(np.abs(ratio) <= HUBER)
+    return covariance * (psi @ psi / (len(psi) - triangle.shape[0])) / max(slope, 0.1) ** 2
+
+
+def _agreement(scale: np.ndarray, covariance: np.ndarray, free: int) -> float:
+    if not len(scale):
+        return np.nan
+    from jax.scipy.special import betainc
+
+    freedom = len(scale) - 1
+    f = float((scale - 1) @ np.linalg.pinv(covariance) @ (scale - 1)) / freedom
+    return float(betainc(free / 2, freedom / 2, free / (free + freedom * f)))
