@@ -1,0 +1,64 @@
+"""Three parallel PID loops, as the Crazyflie firmware writes them (``pid.c``)."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+
+class Gains(eqx.Module):
+    """Of three loops side by side."""
+
+    kp: tuple[float, float, float]
+    ki: tuple[float, float, float]
+    kd: tuple[float, float, float]
+    integral_limit: tuple[float, float, float]
+    """Of the integral of the error, before ``ki``; error unit times s."""
+    output_limit: tuple[float, float, float]
+
+
+def gains(kp, ki=(0, 0, 0), kd=(0, 0, 0), integral_limit=(5000,) * 3, output_limit=(float("inf"),) * 3) -> Gains:
+    """`Gains` from numbers; the defaults are the firmware's."""
+    return Gains(*(tuple(map(float, x)) for x in (kp, ki, kd, integral_limit, output_limit)))
+
+
+class Memory(eqx.Module):
+    """Integral of the error, and the measurement of the step before."""
+
+    integral: Float[Array, "3"]
+    previous: Float[Array, "3"]
+
+
+def update(
+    gains: Gains,
+    memory: Memory,
+    error: Float[Array, "3"],
+    measured: Float[Array, "3"],
+    dt: float,
+    wraps: Bool[Array, "3"] | bool = False,
+) -> tuple[Memory, Float[Array, "3"]]:
+    """One step: proportional and integral of the error, derivative of the measurement.
+
+    The integral goes into the output of the same step. Nothing stops it while the output saturates, only its limit.
+
+    Args:
+        gains: of the three loops.
+        memory: of the step before.
+        error: wanted minus measured.
+        measured: what the derivative is taken of.
+        dt: time since the step before, s.
+        wraps: which channels are angles in deg whose differences are taken the short way.
+    """
+    kp, ki, kd, integral_limit, output_limit = (jnp.asarray(x, error.dtype) for x in vars(gains).values())
+    error = jnp.where(wraps, _short_way(error), error)
+    change = measured - memory.previous
+    change = jnp.where(wraps, _short_way(change), change)
+    integral = jnp.clip(memory.integral + dt * error, -integral_limit, integral_limit)
+    output = kp * error + ki * integral - kd * change / dt
+    return Memory(integral, measured), jnp.clip(output, -output_limit, output_limit)
+
+
+def _short_way(angle_deg):
+    # Equal angles modulo a turn; the derivative stays one.
+    return angle_deg - 360.0 * jnp.round(angle_deg / 360.0)

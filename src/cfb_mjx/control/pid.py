@@ -1,0 +1,209 @@
+"""The Crazyflie firmware's cascaded PID: position and velocity at 100 Hz, attitude and rate at 500 Hz.
+
+Gains, limits, signs and mixing are those of the platform CF21BL (bitcraze/crazyflie-firmware, August 2026:
+``platform_defaults_cf21bl.h``, ``position_controller_pid.c``, ``attitude_pid_controller.c``, ``pid.c``,
+``power_distribution_quadrotor.c``). As there, angles are degrees, pitch is nose up positive (the legacy sign: opposite
+to a rotation about +y), thrust counts go from 0 to 65535, and the derivative acts on the measurement, unfiltered.
+
+Two things differ. The count of a motor is taken as its command, u = count / 65535: the firmware before its battery
+compensation, which otherwise treats it as a thrust. And the base thrust is by default the count that hovers
+(`FirmwarePid.hovering`): the firmware's own 30000 stands for a thrust, and without the compensation hovers only once
+the integrator has found the rest.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from cfb_mjx.control.loop import Gains, Memory, gains, update
+from cfb_mjx.model.rotors import hover_command
+from cfb_mjx.model.state import State
+from cfb_mjx.parameters import Parameters
+
+COUNTS = 65535.0
+DT = 0.002
+"""Time between two steps: the attitude and rate loops run at 500 Hz, s."""
+DIVIDER = 5
+"""The position and velocity loops run in every fifth step, at 100 Hz."""
+_OVERHEAD = 1.1
+"""Output limits of the position and velocity loops exceed the velocity and tilt limits by this factor."""
+_LEGACY = np.array([1.0, -1.0, 1.0])
+"""Roll, pitch, yaw to the firmware's signs, and back."""
+_MIXING = np.array([[-0.5, 0.5, 1.0], [-0.5, -0.5, -1.0], [0.5, -0.5, 1.0], [0.5, 0.5, -1.0]])
+"""Roll, pitch, yaw counts of M1..M4."""
+
+
+class FirmwarePid(eqx.Module):
+    """Gains and limits. Outputs: position m/s, velocity deg (x, y) and kilocounts (z), attitude deg/s, rate counts."""
+
+    position: Gains = gains(kp=(2, 2, 2), ki=(0, 0, 0.5), output_limit=(_OVERHEAD,) * 3)
+    velocity: Gains = gains(kp=(25, 25, 25), ki=(1, 1, 15), output_limit=(20 * _OVERHEAD, 20 * _OVERHEAD, 32.767))
+    attitude: Gains = gains(kp=(6, 6, 6), ki=(3, 3, 1), kd=(0, 0, 0.35), integral_limit=(20, 20, 360))
+    rate: Gains = gains(
+        kp=(200, 200, 120),
+        ki=(400, 400, 16.7),
+        kd=(2.5, 2.5, 0),
+        integral_limit=(33.3, 33.3, 166.7),
+        output_limit=(32767.0,) * 3,
+    )
+    tilt_limit_deg: float = 20.0
+    thrust_base: Float[Array, ""] | float = 30000.0
+    """Counts of every motor at zero vertical velocity error."""
+    thrust_min: float = 20000.0
+    """Lowest collective of the velocity loop, counts."""
+    idle: float = 7000.0
+    """No motor receives less, counts."""
+
+    @classmethod
+    def hovering(cls, parameters: Parameters) -> FirmwarePid:
+        """The firmware's gains with the base thrust at which ``parameters`` hover."""
+        return cls(thrust_base=COUNTS * jnp.mean(hover_command(parameters)))
+
+
+class PidState(eqx.Module):
+    """What the loops remember between steps."""
+
+    tick: Int[Array, ""]
+    position: Memory
+    velocity: Memory
+    attitude: Memory
+    rate: Memory
+    attitude_wanted_deg: Float[Array, "2"]
+    """Roll and pitch (firmware's signs) from the last run of the velocity loop."""
+    thrust: Float[Array, ""]
+    """Collective from the last run of the velocity loop, counts."""
+
+
+class Setpoint(eqx.Module):
+    """What to do: hold a position, or an attitude with a given collective. Build it with `hover` or `tilted`."""
+
+    position: Float[Array, "3"]
+    yaw: Float[Array, ""]
+    roll_pitch: Float[Array, "2"]
+    thrust: Float[Array, ""]
+    hold_position: Float[Array, ""]
+    """1: position and yaw count; 0: roll, pitch, yaw and thrust do."""
+
+    @classmethod
+    def hover(cls, position: Float[Array, "3"], yaw: Float[Array, ""] | float = 0.0) -> Setpoint:
+        """Hold ``position`` [m, world] and ``yaw`` [rad]."""
+        position = jnp.asarray(position, jnp.result_type(float))
+        return cls(position, jnp.asarray(yaw, position.dtype), jnp.zeros(2), jnp.asarray(0.0), jnp.asarray(1.0))
+
+    @classmethod
+    def tilted(cls, roll=0.0, pitch=0.0, yaw=0.0, thrust=0.5) -> Setpoint:
+        """Hold an attitude [rad, about body x, y, z] with a mean command ``thrust`` in [0, 1]."""
+        angles = jnp.stack([jnp.asarray(x, jnp.result_type(float)) for x in (roll, pitch, yaw)])
+        return cls(jnp.zeros(3), angles[2], angles[:2], jnp.asarray(thrust, angles.dtype), jnp.asarray(0.0))
+
+
+def init(controller: FirmwarePid, measurement: State) -> PidState:
+    """State with empty integrators that has seen ``measurement`` before."""
+    position, velocity, angles_deg, rates_deg = _signals(measurement)
+    zero = jnp.zeros(3)
+    return PidState(
+        tick=jnp.asarray(0),
+        position=Memory(zero, position),
+        velocity=Memory(zero, velocity),
+        attitude=Memory(zero, angles_deg),
+        rate=Memory(zero, rates_deg),
+        attitude_wanted_deg=jnp.zeros(2),
+        thrust=jnp.asarray(controller.thrust_base, zero.dtype),
+    )
+
+
+def resume(controller: FirmwarePid, state: PidState, measurement: State) -> PidState:
+    """Take over from something else: integrators as they were, derivatives without a kick, every loop due."""
+    fresh = init(controller, measurement)
+    return eqx.tree_at(
+        lambda s: [getattr(s, loop).integral for loop in ("position", "velocity", "attitude", "rate")],
+        fresh,
+        [getattr(state, loop).integral for loop in ("position", "velocity", "attitude", "rate")],
+    )
+
+
+def step(
+    controller: FirmwarePid, state: PidState, measurement: State, setpoint: Setpoint
+) -> tuple[PidState, Float[Array, "4"]]:
+    """One step of `DT` seconds.
+
+    Args:
+        controller: gains and limits.
+        state: memory.
+        measurement: position, velocity and attitude as the estimator gives them, body rate of the gyro, SI; rotor
+            speeds are not read.
+        setpoint: what to do.
+
+    Returns:
+        The new memory and the command (4,) in [0, 1] of M1..M4.
+    """
+    position, velocity, angles_deg, rates_deg = _signals(measurement)
+    yaw = jnp.radians(angles_deg[2])
+    due = (state.tick % DIVIDER == 0) & (setpoint.hold_position > 0)
+
+    slow = DT * DIVIDER
+    wanted_position = _heading_frame(setpoint.position, yaw)
+    position_memory, wanted_velocity = update(
+        controller.position, state.position, wanted_position - position, position, slow
+    )
+    velocity_memory, output = update(controller.velocity, state.velocity, wanted_velocity - velocity, velocity, slow)
+    limit = controller.tilt_limit_deg
+    # Forward is nose down, left is left side down: both negative in the firmware's signs.
+    roll_pitch_deg = jnp.clip(-output[np.array([1, 0])], -limit, limit)
+    thrust = jnp.clip(1000.0 * output[2] + controller.thrust_base, controller.thrust_min, COUNTS)
+    position_memory, velocity_memory, roll_pitch_deg, thrust = jax.tree.map(
+        lambda new, old: jnp.where(due, new, old),
+        (position_memory, velocity_memory, roll_pitch_deg, thrust),
+        (state.position, state.velocity, state.attitude_wanted_deg, state.thrust),
+    )
+
+    held = setpoint.hold_position > 0
+    collective = jnp.where(held, thrust, COUNTS * setpoint.thrust)
+    tilt_deg = jnp.where(held, roll_pitch_deg, jnp.degrees(setpoint.roll_pitch) * _LEGACY[:2])
+    wanted_deg = jnp.append(tilt_deg, jnp.degrees(setpoint.yaw))
+    yaw_wraps = np.array([False, False, True])
+    attitude_memory, wanted_rate_deg = update(
+        controller.attitude, state.attitude, wanted_deg - angles_deg, angles_deg, DT, yaw_wraps
+    )
+    rate_memory, torque = update(controller.rate, state.rate, wanted_rate_deg - rates_deg, rates_deg, DT)
+
+    new = PidState(
+        state.tick + 1, position_memory, velocity_memory, attitude_memory, rate_memory, roll_pitch_deg, thrust
+    )
+    return new, mix(collective, torque, controller.idle)
+
+
+def mix(thrust: Float[Array, ""], torque: Float[Array, "3"], idle: float = 0.0) -> Float[Array, "4"]:
+    """Legacy mixing of collective and roll, pitch, yaw (counts) to commands in [0, 1].
+
+    Positive counts ask for roll about +x, nose up (legacy), yaw about +z. Where a motor would exceed full power all are
+    lowered alike, as in the firmware: attitude before height.
+    """
+    # The firmware turns the yaw output's sign before mixing.
+    counts = thrust + _MIXING @ (torque * np.array([1.0, 1.0, -1.0]))
+    counts = counts - jnp.maximum(jnp.max(counts) - COUNTS, 0.0)
+    return jnp.clip(counts, idle, COUNTS) / COUNTS
+
+
+def _signals(measurement: State):
+    """Position and velocity along the heading (m, m/s); roll, pitch, yaw (deg) and rates (deg/s) in legacy signs."""
+    w, x, y, z = measurement.quaternion
+    # Just inside the range: at the pole the derivative of arcsin is infinite.
+    sine = jnp.clip(2 * (w * y - z * x), -1 + 1e-9, 1 - 1e-9)
+    yaw = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    angles = jnp.stack([jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), jnp.arcsin(sine), yaw])
+    return (
+        _heading_frame(measurement.position, yaw),
+        _heading_frame(measurement.velocity, yaw),
+        jnp.degrees(angles) * _LEGACY,
+        jnp.degrees(measurement.body_rate) * _LEGACY,
+    )
+
+
+def _heading_frame(vector: Float[Array, "3"], yaw: Float[Array, ""]) -> Float[Array, "3"]:
+    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    return jnp.stack([c * vector[0] + s * vector[1], c * vector[1] - s * vector[0], vector[2]])

@@ -1,0 +1,211 @@
+"""Manoeuvres that identify a drone: open-loop command sequences around hover, and the limits they must keep."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.rollout import rollout
+from cfb_mjx.model.rotors import YAW_SIGNS
+from cfb_mjx.model.state import State
+from cfb_mjx.model.vector import Vec, up_axis
+
+STEP = 0.004
+"""Time each row of a sequence is held, s."""
+_ROLL, _PITCH = np.array([-1.0, -1.0, 1.0, 1.0]), np.array([-1.0, 1.0, 1.0, -1.0])
+_YAW = np.array(YAW_SIGNS)
+"""Commands that turn about +x, +y and +z (paper eqs. 6-7), M1..M4."""
+_THERE_AND_BACK = np.array([1.0, -1.0, -1.0, 1.0])
+"""Quarters of a doublet pair: rate and angle are both near zero after it."""
+MARGIN = 0.75
+"""Share of every limit the undisturbed manoeuvre may use; disturbances, which nobody counters, take the rest."""
+_BRAKING = 3.0
+"""Vertical deceleration the stabiliser is counted on for, m/s^2; the firmware's cap on thrust allows 8 when level."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a manoeuvre must keep, from its start until the stabiliser has it again.
+
+    Attributes:
+        rate: norm of the body rate, rad/s.
+        tilt_deg: angle between the body's z axis and the vertical, deg.
+        altitude_loss: below the height at the start, m, the way needed to stop sinking included.
+        end_rate: body rate at the handover, rad/s.
+        end_tilt_deg: tilt at the handover, deg.
+        command: lowest and highest command.
+    """
+
+    rate: float = 12.0
+    tilt_deg: float = 50.0
+    altitude_loss: float = 0.5
+    end_rate: float = 5.0
+    end_tilt_deg: float = 35.0
+    command: tuple[float, float] = (0.05, 0.95)
+
+    def __post_init__(self):
+        for name in ("rate", "tilt_deg", "altitude_loss", "end_rate", "end_tilt_deg"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise CfbError(f"the limit on {name.replace('_', ' ')} must be positive, found {value:g}.")
+
+    def shares(self, asked: Demand) -> Demand:
+        """``asked`` with every quantity as a share of its limit."""
+
+        def lean(angle_deg):
+            return 1 - np.cos(np.radians(angle_deg))
+
+        return Demand(
+            asked.rate / self.rate,
+            asked.lean / lean(self.tilt_deg),
+            asked.altitude_loss / self.altitude_loss,
+            asked.end_rate / self.end_rate,
+            asked.end_lean / lean(self.end_tilt_deg),
+        )
+
+
+class Demand(eqx.Module):
+    """What a sequence asks of the undisturbed drone, or the share of every limit that is (`Limits.shares`)."""
+
+    rate: Float[Array, "*n"]
+    """Norm of the body rate, rad/s."""
+    lean: Float[Array, "*n"]
+    """1 - cos of the tilt: the angle itself has no derivative at zero."""
+    altitude_loss: Float[Array, "*n"]
+    """Below the start, with the way needed to stop sinking, m."""
+    end_rate: Float[Array, "*k"]
+    end_lean: Float[Array, "*k"]
+
+
+def flown(model: Quadrotor, commands: Float[Array, "n 4"]) -> State:
+    """States (n,) after each row of ``commands``, undisturbed, from hover at height zero."""
+    return rollout(model, model.hover_state((0.0, 0.0, 0.0)), commands)
+
+
+def demand(path: State) -> Demand:
+    """What `flown` asks, row by row and at the end; differentiable."""
+    rate = jnp.linalg.norm(path.body_rate + 1e-9, axis=1)  # the norm has no derivative at zero
+    lean = 1 - up_axis(Vec.unstack(path.quaternion))[2]
+    sinking = jnp.maximum(-path.velocity[:, 2], 0.0)
+    lost = -path.position[:, 2] + sinking**2 / (2 * _BRAKING)
+    return Demand(rate, lean, lost, rate[-1], lean[-1])
+
+
+def stepped(model: Quadrotor, **choices) -> Quadrotor:
+    """The model with one step per row of a sequence; RK4, which follows commands that jump, unless told otherwise."""
+    return Quadrotor(model.parameters, model.effects, model.body, dt=STEP, **({"integrator": "rk4"} | choices))
+
+
+def rows(duration: float) -> int:
+    """Rows of a sequence of ``duration`` seconds.
+
+    Raises:
+        CfbError: shorter than 0.1 s or longer than 2 s.
+    """
+    if not 0.1 <= duration <= 2.0:
+        raise CfbError(f"an open-loop manoeuvre lasts 0.1 to 2 s, found {duration:g} s; nobody steers meanwhile.")
+    return round(duration / STEP)
+
+
+def roll_pitch(duration: float = 0.5) -> np.ndarray:
+    """(n, 4) doublet pair about x, then about y, as changes of the command of unit height: for J_x and J_y."""
+    n = rows(duration)
+    half = n // 2
+    return np.concatenate([_doublets(half, _ROLL), _doublets(n - half, _PITCH)])
+
+
+def all_axes(duration: float = 0.5) -> np.ndarray:
+    """(n, 4) doublet pairs about x and y, a quarter of the time each, then about z, as changes of unit height."""
+    n = rows(duration)
+    quarter = n // 4
+    return np.concatenate([_doublets(quarter, _ROLL), _doublets(quarter, _PITCH), _doublets(n - 2 * quarter, _YAW)])
+
+
+def single_motor(duration: float = 0.5, motor: int = 0) -> np.ndarray:
+    """(n, 4) doublet pair of one motor, as changes of the command of unit height: for J_z and J_m.
+
+    The motor's acceleration turns the body about z against its rotor (paper eq. 7); unlike a yaw command of all four,
+    the drone also rolls and pitches, by known amounts.
+    """
+    return _doublets(rows(duration), np.eye(4)[motor])
+
+
+def multisine(duration: float, seed: int = 0, lines: int = 5) -> np.ndarray:
+    """(n, 4) sums of sines with random phases, no frequency in two motors, of height one at most."""
+    n = rows(duration)
+    rng = np.random.default_rng(seed)
+    time = np.arange(n)[:, None, None] * STEP
+    # Whole periods fit into the sequence: every sine ends where it began.
+    frequency = (1 + np.arange(4)[None, :, None] + 4 * np.arange(lines)[None, None, :]) / (4 * n * STEP) * 4
+    waves = np.sin(2 * np.pi * frequency * time + rng.uniform(0, 2 * np.pi, (1, 4, lines))).sum(-1)
+    return waves / np.abs(waves).max()
+
+
+def scaled(model: Quadrotor, shape: np.ndarray, limits: Limits, margin: float = MARGIN) -> np.ndarray:
+    """Hover plus the largest multiple of ``shape`` that stays within ``margin`` of every limit.
+
+    Args:
+        model: the drone.
+        shape: (n, 4) changes of the command.
+        limits: to keep.
+        margin: share of every limit that may be used.
+
+    Returns:
+        (n, 4) commands.
+
+    Raises:
+        CfbError: the drone cannot hover within the command range, or the limits leave no room for a movement that can
+            be told from noise.
+    """
+    hover = hovering(model, limits)
+    low, high = limits.command
+    change = np.abs(shape).max(axis=0) > 0
+    room = min(np.min(high - hover[change]), np.min(hover[change] - low)) / np.abs(shape).max()
+    heights = np.linspace(0.0, room, 201)
+    asked = worst(model, hover + heights[:, None, None] * shape, limits)
+    # Contiguous from zero: beyond the first violation lies nothing one would want.
+    first_bad = int(np.argmax(asked > margin)) if np.any(asked > margin) else len(heights)
+    height = heights[max(first_bad - 1, 0)]
+    if height * np.abs(shape).max() < 0.01:
+        raise CfbError(
+            f"the limits (body rate {limits.rate:g} rad/s, altitude loss {limits.altitude_loss:g} m) leave no room for "
+            "a manoeuvre; allow more."
+        )
+    return hover + height * shape
+
+
+def hovering(model: Quadrotor, limits: Limits) -> np.ndarray:
+    """(4,) commands of hover.
+
+    Raises:
+        CfbError: they lie outside the limits.
+    """
+    hover = np.asarray(model.hover_command(), dtype=float)
+    if not np.all((hover > limits.command[0] + 0.02) & (hover < limits.command[1] - 0.02)):
+        raise CfbError(
+            f"this model hovers at commands {np.array2string(hover, precision=2)}, outside the range "
+            f"{limits.command[0]:g} to {limits.command[1]:g} a manoeuvre may use; check its mass and thrust."
+        )
+    return hover
+
+
+def worst(model: Quadrotor, commands: np.ndarray, limits: Limits) -> np.ndarray:
+    """(k,) largest share of a limit that each of (k, n, 4) sequences asks for; at most 1 is allowed."""
+    return np.max(jax.tree.leaves(limits.shares(_peaks(stepped(model), jnp.asarray(commands)))), axis=0)
+
+
+@eqx.filter_jit
+def _peaks(model: Quadrotor, commands: Float[Array, "k n 4"]) -> Demand:
+    return jax.vmap(lambda u: jax.tree.map(jnp.max, demand(flown(model, u))))(commands)
+
+
+def _doublets(n: int, direction: np.ndarray) -> np.ndarray:
+    quarter = np.minimum(np.arange(n) * 4 // n, 3)
+    return _THERE_AND_BACK[quarter][:, None] * direction

@@ -1,0 +1,236 @@
+"""A flight that repeats a manoeuvre, simulated: hover, open loop, catch, return; as a log and as what truly happened.
+
+The loop runs every 2 ms, as the firmware's attitude loop; the open-loop commands change every 4 ms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model.delay import DelayLine
+from cfb_mjx.model.effects import Condition, Effect, Wrench
+from cfb_mjx.model.quadrotor import Quadrotor, step, wrench_of
+from cfb_mjx.model.rotors import loads_at
+from cfb_mjx.model.rotors import prepare as prepare_rotors
+from cfb_mjx.model.state import State
+from cfb_mjx.model.vector import Vec, rotate_inverse
+from cfb_mjx.sysid.conditions import Conditions
+from cfb_mjx.sysid.excitation import STEP
+
+TICK = 0.002
+SETTLE, BRAKING, CATCH, RETURN = 1.0, 1.2, 2.0, 2.5
+"""Hover before the first manoeuvre; from the handover on only stopping; until when it should have settled, holding
+where it stopped; then flying back to the start, s."""
+_RETURN_SPEED = 0.5
+
+
+class Stabiliser(Protocol):
+    """What flies the drone outside the manoeuvre: pure functions of a memory (any pytree), called every `TICK`."""
+
+    def start(self, measurement: State) -> Any:
+        """The memory at the first measurement."""
+
+    def resume(self, memory: Any, measurement: State) -> Any:
+        """The memory when taking over after the manoeuvre, during which it was not called."""
+
+    def command(self, memory: Any, measurement: State, position: Array) -> tuple[Any, Array]:
+        """New memory and command (4,) to hold ``position`` [m, world]."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A simulated flight.
+
+    Attributes:
+        log: what would be recorded (pose and velocity late by the model's observation delay).
+        time: (n,) s, every `TICK`.
+        state: true states at ``time``.
+        command: (n, 4) in force from ``time`` on.
+        starts: (repetitions,) index of the first tick of each manoeuvre.
+        length: ticks of a manoeuvre.
+    """
+
+    log: FlightLog
+    time: np.ndarray
+    state: State
+    command: np.ndarray
+    starts: np.ndarray
+    length: int
+
+
+def fly(
+    model: Quadrotor,
+    stabiliser: Stabiliser,
+    sequence: np.ndarray,
+    repetitions: int = 5,
+    conditions: Conditions = Conditions(),
+    height: float = 1.5,
+    seed: int = 0,
+    name: str = "excitation",
+) -> Experiment:
+    """Simulate hover, then ``repetitions`` times: the sequence open loop, catch, return to the start.
+
+    Args:
+        model: the drone; stepped at `TICK` with RK4 whatever its own choices.
+        stabiliser: flies outside the manoeuvre; not called during it.
+        sequence: (m, 4) commands, each held `STEP` seconds.
+        repetitions: of the manoeuvre, in one flight.
+        conditions: noise and disturbances.
+        height: at which it hovers, m.
+        seed: of noise and disturbances.
+        name: of the log.
+    """
+    model = replace_choices(model)
+    hold = round(STEP / TICK)
+    open_loop = np.repeat(np.asarray(sequence, dtype=float), hold, axis=0)
+    settle, brake, catch, back = (round(t / TICK) for t in (SETTLE, BRAKING, CATCH, RETURN))
+    m = len(open_loop)
+    cycle = m + catch + back
+    starts = settle + cycle * np.arange(repetitions)
+    n = settle + cycle * repetitions
+    phase = np.zeros(n, dtype=int)
+    fixed = np.zeros((n, 4))
+    for start in starts:
+        phase[start : start + m] = OPEN
+        phase[start + m] = HANDOVER
+        phase[start + m + 1 : start + m + brake] = BRAKE
+        phase[start + m + catch : start + cycle] = BACK
+        fixed[start : start + m] = open_loop
+    rng = np.random.default_rng(seed)
+    widths = {"gyro": 3, "pose": 9, "torque": 3, "force": 1, "rotor": 4}
+    draws = {name: rng.normal(size=(n, width)) for name, width in widths.items()}
+    levels = {k: jnp.asarray(v) for k, v in vars(conditions).items() if not isinstance(v, bool)}
+    start = model.hover_state((0.0, 0.0, height))
+    state, measured, command, force = jax.tree.map(
+        np.asarray, _simulate(model, stabiliser, start, levels, (phase, fixed, draws))
+    )
+    time = np.arange(n) * TICK
+    log = _log(time, state, measured, command, force, conditions, rng, float(model.parameters.observation_delay), name)
+    return Experiment(log, time, state, command, starts, m)
+
+
+OPEN, HANDOVER, BRAKE, BACK = 1, 2, 3, 4
+"""Phases of a flight besides 0, holding a position."""
+
+
+def replace_choices(model: Quadrotor) -> Quadrotor:
+    """The model stepped every `TICK` with RK4, which follows commands that jump."""
+    return Quadrotor(model.parameters, model.effects, model.body, dt=TICK, integrator="rk4")
+
+
+class _Push(Effect):
+    """A force and a torque on the body, held over a step."""
+
+    name: ClassVar[str] = "push"
+    force: Float[Array, "3"]
+    torque: Float[Array, "3"]
+
+    def body(self, wrench: Wrench, condition: Condition) -> Wrench:
+        return Wrench(wrench.force + Vec.unstack(self.force), wrench.torque + Vec.unstack(self.torque))
+
+
+@eqx.filter_jit
+def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs):
+    p = model.parameters
+    keep = jnp.exp(-TICK / levels["correlation_time"])
+    # One process per axis of torque, force and rotor; the first draw starts it in its steady state.
+    wander = jnp.concatenate([jnp.full(3, levels["disturbance"]), levels["force_disturbance"][None]])
+    wander = jnp.concatenate([wander, jnp.full(4, levels["rotor_disturbance"])])
+
+    def observe(late: State, body_rate, draws) -> State:
+        a, b, c = (draws["pose"][3 * i : 3 * i + 3] for i in range(3))
+        turned = late.quaternion + 0.5 * levels["attitude"] * _times(late.quaternion, c)
+        return State(
+            late.position + levels["position"] * a,
+            late.velocity + levels["velocity"] * b,
+            turned / jnp.linalg.norm(turned),
+            body_rate + levels["gyro"] * draws["gyro"],
+            late.rotor_speed,
+        )
+
+    def tick(carry, row):
+        state, line, memory, target, wandering = carry
+        phase, fixed, draws = row
+        line = line.push(state)
+        measured = observe(line.read(p.observation_delay), state.body_rate, draws)
+        memory = jax.tree.map(
+            lambda new, old: jnp.where(phase == HANDOVER, new, old),
+            stabiliser.resume(memory, measured),
+            memory,
+        )
+        # While it brakes, the position to hold is where it is: only the velocity counts.
+        target = jnp.where((phase == HANDOVER) | (phase == BRAKE), measured.position, target)
+        home = start.position - target
+        way = jnp.minimum(1.0, _RETURN_SPEED * TICK / jnp.maximum(jnp.linalg.norm(home), 1e-9))
+        target = target + jnp.where(phase == BACK, way, 0.0) * home
+        moved, wanted = stabiliser.command(memory, measured, target)
+        is_open = phase == OPEN
+        memory = jax.tree.map(lambda new, old: jnp.where(is_open, old, new), moved, memory)
+        command = jnp.clip(jnp.where(is_open, fixed, wanted), 0.0, 1.0)
+        fresh = jnp.concatenate([draws["torque"], draws["force"], draws["rotor"]])
+        wandering = keep * wandering + jnp.sqrt(1 - keep**2) * wander * fresh
+        push = _Push(p.mass * wandering[3] * jnp.array([0.0, 0.0, 1.0]), p.inertia * wandering[:3])
+        disturbed = eqx.tree_at(
+            lambda q: (q.parameters.motor_speed_offset, q.effects),
+            model,
+            (p.motor_speed_offset + wandering[4:], (*model.effects, push)),
+        )
+        force = specific_force(disturbed, state)
+        return (step(disturbed, state, command), line, memory, target, wandering), (state, measured, command, force)
+
+    first = jax.tree.map(lambda x: x[0], inputs[2])
+    memory = stabiliser.start(start)
+    line = DelayLine.filled(start, TICK, 0.1)
+    wandering = wander * jnp.concatenate([first["torque"], first["force"], first["rotor"]])
+    carry = (start, line, memory, start.position, wandering)
+    return jax.lax.scan(tick, carry, jax.tree.map(jnp.asarray, inputs))[1]
+
+
+def specific_force(model: Quadrotor, state: State) -> Float[Array, "3"]:
+    """What an ideal accelerometer at the centre of gravity reads, body axes, m/s^2."""
+    p, speed = model.parameters, Vec.unstack(state.rotor_speed)
+    loads = loads_at(prepare_rotors(p, TICK), speed, 0.0 * speed)
+    velocity, quaternion, rate = (Vec.unstack(x) for x in (state.velocity, state.quaternion, state.body_rate))
+    condition = Condition(
+        Vec.unstack(state.position), velocity, rotate_inverse(quaternion, velocity), quaternion, rate, speed, p
+    )
+    for effect in model.effects:
+        loads = effect.rotors(loads, condition)
+    wrench = wrench_of(p, loads)
+    for effect in model.effects:
+        wrench = effect.body(wrench, condition)
+    return jnp.stack([jnp.asarray(f) + 0.0 for f in wrench.force]) / p.mass
+
+
+def _times(quaternion, small):
+    """Product of a quaternion with [0, small]."""
+    w, v = quaternion[0], quaternion[1:]
+    return jnp.concatenate([-(v @ small)[None], w * small + jnp.cross(v, small)])
+
+
+def _log(time, state, measured, command, force, conditions: Conditions, rng, delay, name) -> FlightLog:
+    rows = slice(None, None, max(round(conditions.row / TICK), 1))
+    speed = None
+    if conditions.measured_rotors:
+        true = state.rotor_speed[rows]
+        speed = true + conditions.rotor * rng.normal(size=true.shape)
+    force = force[rows] + conditions.accelerometer * rng.normal(size=force[rows].shape)
+    return FlightLog(
+        time=time[rows],
+        position=measured.position[rows],
+        velocity=measured.velocity[rows],
+        quaternion=measured.quaternion[rows],
+        body_rate=measured.body_rate[rows],
+        specific_force=force,
+        command=command[rows],
+        rotor_speed=speed,
+        metadata={"name": name, "source": "cfb excite", "format": "simulated", "observation_delay": delay},
+    )
