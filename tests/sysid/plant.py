@@ -59,7 +59,15 @@ def derivative(plant: Plant, x, u, push):
 
 
 def fly(
-    plant: Plant, seconds: float, seed: int, disturbance: float = 0.0, noise: float = 1.0, measure_rotors: bool = True
+    plant: Plant,
+    seconds: float,
+    seed: int,
+    disturbance: float = 0.0,
+    noise: float = 1.0,
+    measure_rotors: bool = True,
+    goals: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    dither: float = 0.01,
+    gyro_feedback: float = 1.0,
 ) -> list[FlightLog]:
     """Fly F drones and return their logs (250 Hz rows, pose and velocity 8 ms late).
 
@@ -70,6 +78,9 @@ def fly(
         disturbance: rms of the wandering angular acceleration about x and y, rad/s^2 (a quarter of it about z).
         noise: factor on the sensors' noise.
         measure_rotors: whether the logs hold rotor speeds.
+        goals: factors on the roll, pitch and yaw set-points.
+        dither: rms of the noise added to the commands.
+        gyro_feedback: factor on the controller's gains; 0 leaves the drone to itself.
     """
     rng = np.random.default_rng(seed)
     count = len(plant.mass)
@@ -80,7 +91,7 @@ def fly(
     hover_u = hover_s * SIGMA / plant.gain
     # Attitude doublets and yaw steps, a new one every 0.3 s, as set-points of the controller; and small dither.
     steps = ticks // 150 + 1
-    goal = rng.uniform(-0.35, 0.35, (steps, count, 3)) * [1, 1, 2]
+    goal = rng.uniform(-0.35, 0.35, (steps, count, 3)) * [1, 1, 2] * np.asarray(goals)
     push = np.zeros((count, 3))
     keep = np.exp(-TICK * 2 * np.pi * 2.0)  # corner at 2 Hz
     history, rows = [], []
@@ -90,9 +101,10 @@ def fly(
         q = q * np.sign(q[:, :1])
         wanted = goal[tick // 150]
         command = 60 * (wanted - 2 * q[:, 1:]) - 14 * w * [1, 1, 0.7]
+        command = gyro_feedback * command
         collective = 0.15 * (1.0 - height) - 0.12 * climb
         mix = 6e-4 * (command[:, :1] * ROLL + command[:, 1:2] * PITCH) + 1.2e-3 * command[:, 2:] * YAW
-        u = np.clip(hover_u[:, None] + collective[:, None] + mix + 0.01 * rng.normal(size=(count, 4)), 0.05, 0.95)
+        u = np.clip(hover_u[:, None] + collective[:, None] + mix + dither * rng.normal(size=(count, 4)), 0.05, 0.95)
         u = u if tick % ROW == 0 else rows[-1][1]  # commands change with the rows: every one is logged
         if tick % ROW == 0:
             rows.append((x.copy(), u.copy(), delayed.copy()))

@@ -8,22 +8,20 @@ import signal
 import sys
 
 from cfb_mjx import __version__
+from cfb_mjx.cli.runtime import share_cpu_kernels
 from cfb_mjx.errors import CfbError
 
 SUMMARY = {
     "import": "convert a flight log to MCAP",
     "evaluate": "measure how well a model predicts flights, open loop",
     "fit": "refit the model to flights, with uncertainty",
+    "fit-rotors": "fit motors and rotor maps, from flights or a bench",
+    "excite": "design a manoeuvre that identifies the drone, and predict what a fit will know",
     "bench": "measure throughput, compile time and memory",
     "demo": "evaluate a flight, fly 4096 randomised drones, write a page",
     "version": "print versions",
 }
 """Kept apart from the commands themselves: help and typing errors answer without loading anything."""
-
-XLA_CPU_FLAGS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
-"""On CPU a time step then becomes a few kernels that share what they compute, instead of some thirty that repeat it:
-up to 4 times faster; nothing changes elsewhere. XLA reads it when jaxlib loads, so the commands set it for themselves;
-scripts put it into XLA_FLAGS (docs/model.md)."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -34,8 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
     # Programs from the compile cache make XLA log an error about tuning hints it takes for processor features; real
     # errors reach Python as exceptions. Set here, for this process only, because jaxlib reads it when it loads.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    if "xla_backend_extra_options" not in os.environ.get("XLA_FLAGS", ""):
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {XLA_CPU_FLAGS}".strip()
+    share_cpu_kernels()
     try:
         status = _dispatch(sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()

@@ -77,6 +77,9 @@ def fit(
     model: Model = "cfb-guards",
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
     json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    figure: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    estimator: Literal["auto", "innovation", "shooting"] = "auto",
+    robust: bool = False,
     commands_only: bool = False,
     compare: bool = False,
 ) -> None:
@@ -89,19 +92,129 @@ def fit(
         logs: flight logs to fit.
         output: model YAML to write.
         parameters: names or groups, comma separated: inertia (or inertia_xx, ...), rotor_inertia (J_m), motor
-            (motor_time_constant, motor_gain), thrust_scale, torque_scale, mass, cog (cog_x, cog_y).
+            (motor_time_constant, motor_gain), motor_speed_offset, thrust_scale, torque_scale, mass, cog (cog_x, cog_y),
+            observation_delay.
         held_out: logs to judge on; without them the last quarter of every log is kept from the fit.
         model: preset or model YAML to start from.
         set: parameters to set before, for instance mass=0.045 (weigh the drone: flights cannot tell it).
         json: write the results here.
+        figure: draw the estimates and the held-out errors before and after here (.png, .svg, .pdf).
+        estimator: innovation (safe under feedback) or shooting (predictions over 200 ms; for flights without feedback);
+            auto takes innovation unless the observation delay is asked for.
+        robust: let outliers count linearly instead of squared.
         commands_only: do not use measured rotor speeds to drive the body.
-        compare: show what multiple shooting, blind to feedback, would say.
+        compare: show what the other estimator would say; multiple shooting is blind to feedback.
     """
     if not logs:
         raise CfbError("fit needs at least one log; see 'cfb fit --help'.")
     from cfb_mjx.cli.fitting import run_fit
 
-    run_fit(list(logs), list(held_out), output, parameters, model, list(set), json, commands_only, compare)
+    run_fit(
+        list(logs),
+        list(held_out),
+        output,
+        parameters,
+        model,
+        list(set),
+        json,
+        commands_only,
+        compare,
+        estimator,
+        robust,
+        figure,
+    )
+
+
+def fit_rotors(
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")],
+    output: Output,
+    model: Model = "cfb-guards",
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    offset: bool = False,
+    asymmetric: bool = False,
+    dead_time: bool = False,
+    per_motor: bool = False,
+    robust: bool = False,
+    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    figure: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+) -> None:
+    """Fit motors and rotor maps on their own, from flights with rotor speed and from bench tables.
+
+    What a file holds is seen from its content: a flight log, command steps (t, u or u1..u4, omega or omega1..omega4),
+    or steady force and torque (omega, force, torque, optionally motor). What the data cannot tell is named.
+
+    Args:
+        files: flight logs and bench tables (csv, parquet).
+        output: model YAML to write.
+        model: preset or model YAML to start from.
+        set: parameters to set before, for instance mass=0.045.
+        offset: fit the steady rotor speed at zero command as well (needs commands over a wide range).
+        asymmetric: separate time constants for spin-up and spin-down (reported, not written to the model).
+        dead_time: time from a command to its first effect (reported, not written to the model).
+        per_motor: every motor on its own as well, and a thrust and torque factor for each.
+        robust: weigh outliers among the bench points of force and torque down.
+        json: write the results here.
+        figure: draw fits and residuals here (.png, .svg, .pdf).
+    """
+    if not files:
+        raise CfbError("fit-rotors needs at least one file; see 'cfb fit-rotors --help'.")
+    from cfb_mjx.cli.rotor_fitting import run_fit_rotors
+
+    run_fit_rotors(
+        list(files), output, model, list(set), offset, asymmetric, dead_time, per_motor, robust, json, figure
+    )
+
+
+def excite(
+    manoeuvre: tyro.conf.Positional[Literal["roll-pitch", "single-motor", "optimised"]],
+    output: Output,
+    parameters: str | None = None,
+    model: Model = "cfb-guards",
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    repetitions: int = 5,
+    duration: float = 0.5,
+    rate_limit: float = 12.0,
+    altitude_loss: float = 0.5,
+    measured_rotors: bool = False,
+    disturbance: float = 4.0,
+    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+) -> None:
+    """Design a manoeuvre that identifies the drone, fly it in simulation, and predict what a fit will know.
+
+    A stabiliser like the firmware's hovers, hands over to open-loop commands and catches the drone. Writes the commands
+    (commands.csv), the simulated flight (flight.mcap), a figure and the expected uncertainty (excitation.json).
+
+    Args:
+        manoeuvre: roll-pitch (doublets, for the inertia about x and y), single-motor (for J_z and J_m), or optimised
+            for the chosen parameters, compared with the other two.
+        output: folder to write to.
+        parameters: what will be fitted, as for cfb fit; by default what cfb fit would choose.
+        model: preset or model YAML: the best guess of the drone before the flight.
+        set: parameters to change, for instance mass=0.045.
+        repetitions: of the manoeuvre in one flight.
+        duration: of the open-loop part, s.
+        rate_limit: body rate not to exceed, rad/s.
+        altitude_loss: height that may be lost until the drone is caught, m.
+        measured_rotors: rotor speed will be logged.
+        disturbance: rms of the unmodelled torque over inertia to expect, rad/s^2.
+        json: write the results here too.
+    """
+    from cfb_mjx.cli.exciting import run_excite
+
+    run_excite(
+        manoeuvre,
+        output,
+        parameters,
+        model,
+        list(set),
+        repetitions,
+        duration,
+        rate_limit,
+        altitude_loss,
+        measured_rotors,
+        disturbance,
+        json,
+    )
 
 
 def bench(
@@ -147,7 +260,16 @@ def version() -> None:
         print(f"{name}: {value}")
 
 
-COMMANDS = {"import": import_log, "evaluate": evaluate, "fit": fit, "bench": bench, "demo": demo, "version": version}
+COMMANDS = {
+    "import": import_log,
+    "evaluate": evaluate,
+    "fit": fit,
+    "fit-rotors": fit_rotors,
+    "excite": excite,
+    "bench": bench,
+    "demo": demo,
+    "version": version,
+}
 
 
 def run(name: str, arguments: list[str]) -> None:

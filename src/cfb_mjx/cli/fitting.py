@@ -30,13 +30,16 @@ def run_fit(
     json: Path | None,
     commands_only: bool,
     compare: bool,
+    estimator: str = "auto",
+    robust: bool = False,
+    figure: Path | None = None,
 ) -> None:
-    """Fit, print a table, write the model.
+    """Fit, print a table, write the model and what else was asked for.
 
     Raises:
         CfbError: bad logs, parameters or outputs.
     """
-    require_folder(output, json)
+    require_folder(output, json, figure)
     if output.suffix not in (".yaml", ".yml"):
         raise CfbError(f"{output}: the output is a model and must end in .yaml.")
     logs = [read_log(path) for path in paths]
@@ -46,26 +49,30 @@ def run_fit(
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import save_model_file
     from cfb_mjx.sysid import evaluate
-    from cfb_mjx.sysid.fitting import default_parameters, fit
+    from cfb_mjx.sysid.fitting import fit
 
     base = changed_model(model, changes)
-    request = parameters or default_parameters(fitted)
-    result = fit(fitted, base.parameters(), request, not commands_only, Progress("fitting"))
+    result = fit(fitted, base.parameters(), parameters, not commands_only, robust, estimator, Progress("fitting"))
     corrected = replace(
         result.model_file(base, f"cfb fit on {len(paths)} log(s), {date.today().isoformat()}"),
         name=output.stem,
         description=f"{base.name} refitted to {', '.join(log.name for log in logs)}",
         provenance=_provenance(paths, held_out, base.name),
     )
-    naive = _naive(fitted, base, request, not commands_only) if compare else None
+    other = _other(result, fitted, base, not commands_only, robust) if compare else None
     before = evaluate(Quadrotor.from_file(base), judged)
     after = evaluate(Quadrotor.from_file(corrected), judged)
     save_model_file(corrected, output)
-    _print(result, naive, before, after)
+    _print(result, other, before, after)
     print(f"model: {output}")
     if json is not None:
-        write_json(json, _json(result, naive, before, after))
+        write_json(json, _json(result, other, before, after))
         print(f"results: {json}")
+    if figure is not None:
+        from cfb_mjx.view.fit import fit_figure
+
+        fit_figure(result, other, before, after, figure)
+        print(f"figure: {figure}")
 
 
 def _first(log: FlightLog) -> FlightLog:
@@ -76,16 +83,15 @@ def _last(log: FlightLog) -> FlightLog:
     return log.slice(log.time[0] + (1 - HELD_OUT_SHARE) * log.duration, log.time[-1])
 
 
-def _naive(logs, base, request, use_measured) -> dict[str, float] | None:
-    import jax.numpy as jnp
+def _other(result, logs, base, use_measured, robust):
+    """The estimator that was not chosen, for comparison; None where it cannot run."""
+    from cfb_mjx.sysid.fitting import fit
 
-    from cfb_mjx.sysid.shooting import shoot
-
+    other = "shooting" if result.estimator == "innovation" else "innovation"
     try:
-        unknowns, vector, _ = shoot(logs, base.parameters(), request, use_measured=use_measured)
+        return fit(logs, base.parameters(), result.names, use_measured, robust, other, Progress(f"fitting ({other})"))
     except CfbError:
         return None
-    return dict(zip(unknowns.names, map(float, unknowns.values(jnp.asarray(vector))), strict=True))
 
 
 def _provenance(paths: list[Path], held_out: list[Path], base: str) -> dict:
@@ -100,41 +106,55 @@ def _provenance(paths: list[Path], held_out: list[Path], base: str) -> dict:
     }
 
 
-def _json(result, naive, before, after) -> dict:
+_NAMES = {"innovation": "innovations", "shooting": "multiple shooting"}
+
+
+def _estimates(result) -> dict:
     return {
-        "parameters": {
-            name: {"value": e.value, "std": e.std, "unit": e.unit, "preset": e.preset}
-            for name, e in result.estimates.items()
-        },
+        name: {"value": e.value, "std": e.std, "unit": e.unit, "preset": e.preset}
+        for name, e in result.estimates.items()
+    }
+
+
+def _json(result, other, before, after) -> dict:
+    held_out = {"hold": before.metrics("hold")}
+    for stage, evaluation in (("before", before), ("after", after)):
+        held_out[stage] = evaluation.metrics("commands_in")
+        held_out[f"{stage}_rotor_speed_in"] = evaluation.metrics("rotor_speed_in")
+    return {
+        "parameters": _estimates(result),
         "unidentifiable": list(result.unidentifiable),
         "unidentifiable_because": result.unidentifiable,
         "correlation": {"names": result.names, "matrix": result.uncertainty.correlation},
-        "multiple_shooting": naive,
+        "estimator": result.estimator,
+        "other_estimator": None
+        if other is None
+        else {"estimator": other.estimator, "parameters": _estimates(other)}
+        | {"values": other.values, "unidentifiable": other.unidentifiable},
+        "feedback": result.feedback
+        and {"correlation": result.feedback.correlation, "p_value": result.feedback.p_value},
         "innovation_lag_one_correlation": result.whiteness,
+        "noise": None if result.noise is None else vars(result.noise),
         "rows": result.rows,
-        "held_out": {
-            stage: evaluation.metrics("commands_in") for stage, evaluation in (("before", before), ("after", after))
-        }
-        | {
-            f"{stage}_rotor_speed_in": evaluation.metrics("rotor_speed_in")
-            for stage, evaluation in (("before", before), ("after", after))
-        }
-        | {"hold": before.metrics("hold")},
+        "held_out": held_out,
         "environment": environment(),
     }
 
 
-def _print(result, naive, before, after) -> None:
+def _print(result, other, before, after) -> None:
     print(f"{'parameter':<22}{'value':>12}{'std':>11}  {'unit':<8}{'preset':>11}{'change':>9}", end="")
-    print(f"{'multiple shooting':>20}" if naive else "")
+    print(f"{_NAMES[other.estimator]:>20}" if other else "")
     for name, e in result.estimates.items():
         change = f"{e.value / e.preset - 1:+.1%}" if e.preset else ""
         print(f"{name:<22}{e.value:>12.4g}{e.std:>11.2g}  {e.unit:<8}{e.preset:>11.4g}{change:>9}", end="")
-        print(f"{naive[name]:>20.4g}" if naive else "")
+        doubt = "" if other and name in other.estimates else "?"
+        print(f"{f'{other.values[name]:.4g}{doubt}':>20}" if other else "")
     for reason in dict.fromkeys(result.unidentifiable.values()):
         print(f"not identifiable: {reason}")
-    if naive:
-        print("multiple shooting ignores feedback and disturbances: on flights under feedback it is biased.")
+    feedback = result.feedback or (other and other.feedback)
+    if feedback and feedback.present:
+        print(f"flown under feedback: the commands answer the gyro (correlation {feedback.correlation:.2f});", end=" ")
+        print("multiple shooting is biased on such flights.")
     windows = sum(len(log.windows) for log in before.logs)
     print(f"\nheld-out RMS error, {windows} windows    before       after        hold")
     hold = before.metrics("hold")

@@ -9,13 +9,20 @@ from datetime import date
 from importlib import metadata
 from pathlib import Path
 
+XLA_CPU_FLAGS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
+"""On CPU a time step then becomes a few kernels that share what they compute, instead of some thirty that repeat it:
+up to 4 times faster; nothing changes elsewhere. XLA reads it when jaxlib loads, so the commands set it for themselves;
+scripts put it into XLA_FLAGS (docs/model.md)."""
+
 
 def configure_jax(x64: bool) -> None:
     """Set precision and the persistent compile cache. Commands call this; importing the library never does.
 
     The cache lies in the user's cache folder (``XDG_CACHE_HOME`` is honoured); ``JAX_COMPILATION_CACHE_DIR`` overrides
-    it.
+    it. Where jax has not been loaded yet, XLA's CPU kernels are told to share results (`XLA_CPU_FLAGS`).
     """
+    if "jaxlib" not in sys.modules:
+        share_cpu_kernels()
     import jax
 
     jax.config.update("jax_enable_x64", x64)
@@ -29,6 +36,12 @@ def configure_jax(x64: bool) -> None:
             return  # Without a writable home the cache is simply off.
         jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def share_cpu_kernels() -> None:
+    """Put `XLA_CPU_FLAGS` into ``XLA_FLAGS`` unless it speaks of extra options already; read when jaxlib loads."""
+    if "xla_backend_extra_options" not in os.environ.get("XLA_FLAGS", ""):
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {XLA_CPU_FLAGS}".strip()
 
 
 def environment() -> dict[str, str]:

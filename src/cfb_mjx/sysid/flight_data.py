@@ -11,8 +11,10 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.logs import FlightLog
 
-ROWS_PER_SEGMENT = 512
-"""Long flights are cut into segments of this many rows: they run side by side, and are the blocks of the bootstrap."""
+ROWS_PER_SEGMENT = 641
+"""Long flights are cut into overlapping segments of this many rows, which run side by side. One shape for all flights:
+programs are compiled once and then come from the cache."""
+_COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 
 
 class Segments(eqx.Module):
@@ -39,6 +41,7 @@ class FlightData:
 
     segments: Segments
     log_of_segment: np.ndarray
+    """(pieces,) index of the log each segment comes from; segments beyond are empty."""
     rate_noise: np.ndarray
     """(3,) gyro noise, rad/s."""
     specific_force_noise: np.ndarray
@@ -62,20 +65,19 @@ def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
     """
     pieces, owners = [], []
     for index, log in enumerate(logs):
-        lead = max(2, round(warm_up / log.nominal_interval))
+        lead = min(max(2, round(warm_up / log.nominal_interval)), ROWS_PER_SEGMENT // 2)
         edges = np.concatenate([[0], log.gaps() + 1, [len(log.time)]]).astype(int)
         for begin, end in itertools.pairwise(edges):
             first = begin
             while end - first > lead + 16:
-                last = min(first + lead + ROWS_PER_SEGMENT, end)
+                last = min(first + ROWS_PER_SEGMENT, end)
                 pieces.append((log, first, last, lead))
                 owners.append(index)
                 first = last - lead
                 if last == end:
                     break
-    width = max((last - first for _, first, last, _ in pieces), default=1)
-    built = [_segment(*piece, width) for piece in pieces]
-    stacked = {key: np.stack([b[key] for b in built]) for key in built[0]} if built else None
+    built = [_segment(*piece, ROWS_PER_SEGMENT) for piece in pieces]
+    stacked = _padded({key: np.stack([b[key] for b in built]) for key in built[0]}) if built else None
     noise = [_noise(log) for log in logs]
     return FlightData(
         segments=Segments(**stacked) if stacked else None,
@@ -84,6 +86,16 @@ def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
         specific_force_noise=np.median([n[1] for n in noise], axis=0),
         rotor_speed_noise=float(np.median([n[2] for n in noise])),
     )
+
+
+def _padded(stacked: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Append segments that count for nothing up to the next count of `_COUNTS` (beyond, a multiple of the last)."""
+    count = len(stacked["valid"])
+    wanted = next((n for n in _COUNTS if n >= count), -(-count // _COUNTS[-1]) * _COUNTS[-1])
+    # Copies of a real segment: zeros would divide by zero.
+    more = {key: np.concatenate([v, np.repeat(v[:1], wanted - count, axis=0)]) for key, v in stacked.items()}
+    more["valid"][count:] = 0.0
+    return more
 
 
 def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> dict[str, np.ndarray]:

@@ -1,167 +1,206 @@
 """Multiple shooting: parameters that predict best over a horizon, from the measured state of every window.
 
 The classical estimator, right for flights without feedback or without unmodelled disturbances. Under feedback it is
-biased (`cfb_mjx.sysid.innovation` says why and is the default); ``cfb fit`` shows its answer beside the default one.
+biased (`cfb_mjx.sysid.innovation` says why and is the default); ``cfb fit --compare`` shows its answer beside the
+default one.
+
+A window starts at a measured state, which carries noise, and at rotor speeds nobody may have measured. With free
+initial states these errors are unknowns too, as likely as the sensors' noise says; being many and each seen by its own
+window only, they are eliminated: with r the prediction errors at the measured start, whitened by the sensors' noise,
+and G their derivative by the start's errors in standard deviations, the covariance of r is I + G G^T, and r is whitened
+by its Cholesky factor (generalised least squares; the same estimate as fitting every start).
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
+from jaxtyping import Array, Float
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.model.bodies import Body, RigidBody
 from cfb_mjx.model.quadrotor import Quadrotor
-from cfb_mjx.model.rotors import rotor_speed_history
 from cfb_mjx.model.state import State
 from cfb_mjx.model.vector import Vec, multiply
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.flight_data import white_noise
 from cfb_mjx.sysid.prediction import predict_one
-from cfb_mjx.sysid.uncertainty import Uncertainty, assess
+from cfb_mjx.sysid.result import Fit, summarise
+from cfb_mjx.sysid.robust import tempered
+from cfb_mjx.sysid.shooting_data import Batch, batches
+from cfb_mjx.sysid.solver import least_squares
+from cfb_mjx.sysid.uncertainty import assess
 from cfb_mjx.sysid.unknowns import Unknowns, choose
-from cfb_mjx.sysid.windows import find_windows
 
-HORIZONS = (0.05, 0.1, 0.2)
-
-
-class _LogWindows(eqx.Module):
-    """One log's windows as arrays."""
-
-    time: jax.Array
-    command: jax.Array
-    row: jax.Array
-    since_row: jax.Array
-    state: State
-    step: jax.Array
-    inputs: jax.Array
-    at: jax.Array
-    truth: State
-    weight: jax.Array
-    """(12,) one over the noise of position, velocity, attitude, body rate."""
-    measured: bool = eqx.field(static=True)
+ROUNDS = 6
+SETTLED = 5e-4
 
 
 def shoot(
     logs: list[FlightLog],
     nominal: Parameters,
     parameters: str | tuple[str, ...],
-    horizons: tuple[float, ...] = HORIZONS,
     use_measured: bool = True,
-) -> tuple[Unknowns, np.ndarray, Uncertainty]:
-    """Least squares on the prediction errors at the horizons, weighted by the sensors' noise.
+    free_start: bool = True,
+    robust: bool = False,
+    body: Body | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Fit:
+    """Least squares on the prediction errors every 20 ms up to 200 ms, weighted by the sensors' noise.
 
-    Initial states are the measured ones; rotor speeds at the start are measured, or come from the commands since the
-    log began. Returns the unknowns, the fitted vector and its uncertainty.
+    Args:
+        logs: flights; run with x64 enabled.
+        nominal: where to start, and the values of all that is not fitted.
+        parameters: names or groups (`cfb_mjx.sysid.unknowns.choose`). The observation delay, if asked for, is one for
+            all logs and replaces what they say of it.
+        use_measured: feed measured rotor speeds where a log has them, else commands.
+        free_start: allow for errors of every window's initial state and rotor speeds; otherwise they are taken as
+            measured.
+        robust: let outliers count linearly instead of squared.
+        body: the body to predict with, `RigidBody()` or `MjxBody(floor=False)`.
+        progress: called with (done, total).
 
     Raises:
         CfbError: unknown parameters, or no window in any log.
     """
     unknowns = choose(parameters, nominal)
-    prepared = [_prepare(log, nominal, horizons, use_measured) for log in logs]
-    prepared = [item for item in prepared if item is not None]
-    if not prepared:
+    delayed = "observation_delay" in unknowns.names
+    data = batches(logs, None, float(nominal.observation_delay), use_measured)
+    if not data:
         raise CfbError(f"{', '.join(log.name for log in logs)}: no prediction window fits; fly at least 1.2 s.")
-
-    found = _solve(unknowns, prepared)
-    residual, jacobian = (np.asarray(x) for x in _linearise(unknowns, found, prepared))
-    return (
-        unknowns,
-        np.asarray(found),
-        assess(residual, jacobian @ np.linalg.inv(unknowns.slope(found)), unknowns.names),
-    )
-
-
-def _residual(vector, unknowns: Unknowns, prepared: list[_LogWindows]):
-    model = Quadrotor(unknowns.apply(vector), integrator="rk4", rotor_loads="instant")
-    return jnp.concatenate([_log_residual(model, item) for item in prepared])
-
-
-@eqx.filter_jit
-def _solve(unknowns: Unknowns, prepared: list[_LogWindows]):
-    solver = optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)
-    return optx.least_squares(
-        lambda x, _: _residual(x, unknowns, prepared),
-        solver,
-        unknowns.start,
-        options={"jac": "fwd"},
-        max_steps=60,
-        throw=False,
-    ).value
+    body = RigidBody() if body is None else body
+    vector = unknowns.start
+    for done in range(ROUNDS):
+        before = vector
+        if delayed and done:
+            data = batches(logs, float(unknowns.apply(vector).observation_delay), 0.0, use_measured)
+        whiten = _whitening(unknowns, vector, data, body, free_start)
+        vector = _solve(unknowns, vector, data, body, whiten, robust)
+        if progress is not None:
+            progress(done + 1, ROUNDS)
+        if done and float(jnp.max(jnp.abs(vector - before))) < SETTLED:
+            break
+    if progress is not None:
+        progress(ROUNDS, ROUNDS)
+    residual, jacobian = _linearise(unknowns, vector, data, body, whiten, robust)
+    residual, jacobian = (np.concatenate([np.asarray(x) for x in parts]) for parts in (residual, jacobian))
+    live = np.concatenate([np.asarray(batch.live) for batch in data]) > 0
+    slope = np.linalg.inv(unknowns.slope(vector))
+    uncertainty = assess(residual[live], jacobian[live] @ slope, unknowns.names)
+    return summarise(unknowns, vector, uncertainty, "shooting", int(live.sum()))
 
 
-@eqx.filter_jit
-def _linearise(unknowns: Unknowns, vector, prepared: list[_LogWindows]):
-    def residual(x):
-        return _residual(x, unknowns, prepared)
+def _errors(parameters: Parameters, start: Float[Array, "w 16"], batch: Batch, body: Body) -> Float[Array, "w m"]:
+    """Prediction errors in standard deviations, with the starts moved by ``start`` standard deviations."""
+    model = Quadrotor(parameters, body=body, integrator="rk4", rotor_loads="instant")
+    # What a row calls the pose at t is the pose at t + late.
+    late = batch.delay - parameters.observation_delay
 
-    return residual(vector), jax.jacfwd(residual)(vector)
-
-
-def _log_residual(model: Quadrotor, item: _LogWindows):
-    start = item.state
-    if not item.measured:
-        parameters = model.parameters
-        history = rotor_speed_history(parameters, item.time, item.command)[item.row]
-        target = parameters.motor_gain * jnp.clip(item.command[item.row], 0, 1) + parameters.motor_speed_offset
-        speed = target + (history - target) * jnp.exp(-item.since_row[:, None] / parameters.motor_time_constant)
-        start = eqx.tree_at(lambda s: s.rotor_speed, start, speed)
-
-    def one(state, step, inputs, at, truth):
-        path = predict_one(model, state, step, inputs, item.measured)
-        found = jax.tree.map(lambda x: x[at], path)
-        turn = jax.vmap(lambda a, b: multiply(_conjugate(a), Vec.unstack(b)).stack())(
-            truth.quaternion, found.quaternion
+    def one(lead_step, lead_command, state, step, inputs, at, truth, noise, rotor_noise, move):
+        speed = state.rotor_speed if batch.measured else _speed_after(parameters, lead_step, lead_command)
+        turn = move[6:9] * noise[6:9] - late * state.body_rate
+        start = State(
+            state.position + move[0:3] * noise[0:3] - late * state.velocity,
+            state.velocity + move[3:6] * noise[3:6],
+            multiply(Vec.unstack(state.quaternion), _small(turn)).stack(),
+            state.body_rate + move[9:12] * noise[9:12],
+            speed + move[12:16] * rotor_noise,
         )
-        # Twice the vector part: the rotation vector of a small error, whichever sign the quaternion has.
-        angle = 2 * turn[:, 1:] * jnp.sign(turn[:, :1])
-        error = [found.position - truth.position, found.velocity - truth.velocity, angle]
-        return jnp.concatenate([*error, found.body_rate - truth.body_rate], axis=1) * item.weight
+        path = predict_one(model, start, step, inputs, batch.measured)
+        found = jax.tree.map(lambda x: x[at], path)
+        earlier = path.velocity[at - 1]
+        acceleration = (found.velocity - earlier) / jnp.maximum(step[at - 1], 1e-6)[:, None]
+        angle = _rotation(truth.quaternion, found.quaternion) + late * found.body_rate
+        error = [
+            found.position + late * found.velocity - truth.position,
+            found.velocity + late * acceleration - truth.velocity,
+            angle,
+            found.body_rate - truth.body_rate,
+        ]
+        return (jnp.concatenate(error, axis=1) / noise).ravel()
 
-    return jax.vmap(one)(start, item.step, item.inputs, item.at, item.truth)
-
-
-def _conjugate(q) -> Vec:
-    return Vec(q[0], -q[1], -q[2], -q[3])
-
-
-def _prepare(log: FlightLog, nominal: Parameters, horizons, use_measured: bool) -> _LogWindows | None:
-    delay = log.metadata.get("observation_delay")
-    delay = float(nominal.observation_delay) if delay is None else delay
-    windows = find_windows(log, horizons, delay)
-    if not len(windows):
-        return None
-    measured = bool(use_measured and np.isfinite(windows.rotor_speed).all())
-
-    def state(prefix: str) -> State:
-        fields = [getattr(windows, prefix + name) for name in ("position", "velocity", "quaternion", "body_rate")]
-        speed = windows.rotor_speed[:, 0] if measured and not prefix else np.zeros((*fields[0].shape[:-1], 4))
-        return State(*fields, rotor_speed=speed)
-
-    item = _LogWindows(
-        time=log.time,
-        command=log.command,
-        row=windows.row,
-        since_row=windows.start - log.time[windows.row],
-        state=state(""),
-        step=windows.step,
-        inputs=windows.rotor_speed[:, 1:] if measured else windows.command,
-        at=windows.at,
-        truth=state("true_"),
-        weight=1 / _noise(log),
-        measured=measured,
+    return batch.live[:, None] * jax.vmap(one)(
+        batch.lead_step,
+        batch.lead_command,
+        batch.state,
+        batch.step,
+        batch.inputs,
+        batch.at,
+        batch.truth,
+        batch.noise,
+        batch.rotor_noise,
+        start,
     )
-    return jax.tree.map(jnp.asarray, item)
 
 
-def _noise(log: FlightLog) -> np.ndarray:
-    """(12,) noise of a row, from third differences; both ends of a window carry it."""
+def _speed_after(parameters: Parameters, step: Float[Array, "p"], command: Float[Array, "p 4"]) -> Float[Array, "4"]:
+    target = parameters.motor_gain * command + parameters.motor_speed_offset
 
-    def level(values):
-        return np.maximum(white_noise(values), 1e-6)
+    def advance(speed, row):
+        dt, goal = row
+        return goal + (speed - goal) * jnp.exp(-dt / parameters.motor_time_constant), None
 
-    attitude = 2 * level(log.quaternion[:, 1:])
-    return np.sqrt(2) * np.concatenate([level(log.position), level(log.velocity), attitude, level(log.body_rate)])
+    return jax.lax.scan(advance, target[0], (step, target))[0]
+
+
+def _small(turn: Float[Array, "3"]) -> Vec:
+    """Quaternion of a small rotation vector."""
+    half = 0.5 * turn
+    return Vec(jnp.sqrt(1 - jnp.minimum(half @ half, 0.5)), half[0], half[1], half[2])
+
+
+def _rotation(truth: Float[Array, "h 4"], found: Float[Array, "h 4"]) -> Float[Array, "h 3"]:
+    """Rotation vector from ``truth`` to ``found``, to first order: twice the vector part, whichever sign."""
+    sign = jnp.array([1.0, -1.0, -1.0, -1.0])
+    turn = jax.vmap(lambda a, b: multiply(Vec.unstack(a * sign), Vec.unstack(b)).stack())(truth, found)
+    return 2 * turn[:, 1:] * jnp.sign(turn[:, :1])
+
+
+@eqx.filter_jit
+def _whitening(unknowns: Unknowns, vector, data: list[Batch], body: Body, free_start: bool) -> list[Array]:
+    """Lower Cholesky factor of the covariance of every window's errors."""
+    parameters = unknowns.apply(vector)
+
+    def factor(batch):
+        count = batch.step.shape[0]
+        if not free_start:
+            # Both ends of a window carry a row's noise.
+            return jnp.sqrt(2.0) * jnp.ones((count, 1, 1))
+        # Every window's errors depend on its own start only: 16 directions serve all windows at once.
+        directions = jnp.broadcast_to(jnp.eye(16)[:, None, :], (16, count, 16))
+        zero = jnp.zeros((count, 16))
+        along = jax.vmap(lambda d: jax.jvp(lambda x: _errors(parameters, x, batch, body), (zero,), (d,))[1])
+        slope = jnp.moveaxis(along(directions), 0, -1)
+        return jnp.linalg.cholesky(jnp.eye(slope.shape[1]) + slope @ jnp.swapaxes(slope, 1, 2))
+
+    return [factor(batch) for batch in data]
+
+
+def _residual(vector, unknowns: Unknowns, data: list[Batch], body: Body, whiten: list[Array], robust: bool):
+    parameters = unknowns.apply(vector)
+
+    def one(batch, factor):
+        errors = _errors(parameters, jnp.zeros((batch.step.shape[0], 16)), batch, body)
+        if factor.shape[-1] == 1:
+            return tempered(errors / factor[:, :, 0], robust)
+        solved = jax.scipy.linalg.solve_triangular(factor, errors[..., None], lower=True)[..., 0]
+        return tempered(solved, robust)
+
+    return [one(batch, factor) for batch, factor in zip(data, whiten, strict=True)]
+
+
+@eqx.filter_jit
+def _solve(unknowns: Unknowns, vector, data: list[Batch], body: Body, whiten: list[Array], robust: bool):
+    residual = partial(_residual, unknowns=unknowns, data=data, body=body, whiten=whiten, robust=robust)
+    return least_squares(residual, vector)
+
+
+@eqx.filter_jit
+def _linearise(unknowns: Unknowns, vector, data: list[Batch], body: Body, whiten: list[Array], robust: bool):
+    residual = partial(_residual, unknowns=unknowns, data=data, body=body, whiten=whiten, robust=robust)
+    return residual(vector), jax.jacfwd(residual)(vector)

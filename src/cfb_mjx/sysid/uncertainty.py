@@ -6,22 +6,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from cfb_mjx.sysid.unknowns import OFFSETS
+
 LOOSEST = 0.5
-"""A direction in which the estimate is free by more than this (50 % of a value, 5 mm of offset) is not identified."""
+"""A direction in which the estimate is free by more than this is not identified: 50 % of a value, half the unit of
+`cfb_mjx.sysid.unknowns.OFFSETS` (5 mm, 100 rad/s, 2 ms)."""
 SHARE = 0.3
 """A parameter belongs to an unidentified direction when its component there is at least this."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of the named quantities: relative, or in cm for offsets.
+    """Of the named quantities: relative, or in the units of `cfb_mjx.sysid.unknowns.OFFSETS`.
 
     Attributes:
         covariance: (k, k), of the identified part.
         correlation: (k, k).
         unidentified: directions (unit vectors) the data leave free.
         names: of the parameters those directions move.
-        combinations: what *is* identified among them, as text.
+        combinations: what *is* identified among them, as text; empty where nothing is.
     """
 
     covariance: np.ndarray
@@ -41,7 +44,7 @@ def assess(residual: np.ndarray, jacobian: np.ndarray, names: tuple[str, ...], b
 
     Args:
         residual: (blocks, ...) whitened; the first axis is what the bootstrap resamples.
-        jacobian: (blocks, ..., k) its derivatives by relative changes of the named quantities (offsets: by cm).
+        jacobian: (blocks, ..., k) its derivatives by relative changes of the named quantities.
         names: of the k parameters.
         bootstraps: resamples of the blocks.
 
@@ -88,17 +91,16 @@ def _combinations(free: list[np.ndarray], names: tuple[str, ...]) -> list[str]:
     found = []
     for direction in free:
         members = [i for i in range(len(names)) if abs(direction[i]) > SHARE]
-        offsets = [names[i] for i in members if names[i].startswith("cog")]
         if len(members) == 1:
-            found.append(f"{names[members[0]]}: the data do not depend on it")
-        elif offsets:
-            found.append(f"{', '.join(names[i] for i in members)}: only together")
-        else:
-            # Any power product orthogonal to the direction is identified; pairs with the first member are enough.
-            first, *others = members
-            for other in others:
-                power = -direction[first] / direction[other]
-                found.append(f"{names[first]} {_times(names[other], power)}")
+            continue  # nothing: the data do not depend on it
+        if any(names[i] in OFFSETS for i in members):
+            found.append(f"{', '.join(names[i] for i in members)} only together")
+            continue
+        # Any power product orthogonal to the direction is identified; pairs with the first member are enough.
+        first, *others = members
+        for other in others:
+            power = -direction[first] / direction[other]
+            found.append(f"{names[first]} {_times(names[other], power)}")
     return found
 
 

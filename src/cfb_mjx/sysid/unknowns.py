@@ -1,7 +1,8 @@
 """Which parameters a fit may change, and the unconstrained numbers it works with.
 
-Every vector the optimiser sees is physical: positive quantities are logarithms, and the inertia is built from the three
-second moments of its mass distribution, so that every possible rigid body can be reached and no impossible one.
+Every vector the optimiser sees is physical: positive quantities are logarithms, and the inertia is built from the
+second moments of its mass distribution, whichever of its axes are free: every possible rigid body can be reached and
+no impossible one.
 """
 
 from __future__ import annotations
@@ -23,21 +24,32 @@ UNITS = {
     "rotor_inertia": "kg m^2",
     "motor_time_constant": "s",
     "motor_gain": "rad/s",
+    "motor_speed_offset": "rad/s",
     "thrust_scale": "1",
+    "thrust_linear": "N",
     "torque_scale": "1",
     "cog_x": "m",
     "cog_y": "m",
+    "observation_delay": "s",
 }
-"""Names a fit knows, with their units. Motor quantities are common factors of the four motors."""
+"""Names a fit knows, with their units. Motor quantities are common to the four motors; ``thrust_linear`` is the
+coefficient of s in the thrust cubic: with ``thrust_scale`` it sets level and slope of the thrust near hover."""
 GROUPS = {
     "inertia": ("inertia_xx", "inertia_yy", "inertia_zz"),
     "motor": ("motor_time_constant", "motor_gain"),
     "cog": ("cog_x", "cog_y"),
     "J_m": ("rotor_inertia",),
 }
+OFFSETS = {
+    "motor_speed_offset": 200.0,
+    "thrust_linear": 0.05,
+    "cog_x": 0.01,
+    "cog_y": 0.01,
+    "observation_delay": 0.004,
+}
+"""Quantities that may be zero: changed by so much, not by a factor, for one unit of the optimiser's number."""
 _AXES = ("inertia_xx", "inertia_yy", "inertia_zz")
-_LENGTH = 0.01
-"""Centre-of-gravity offsets are counted in cm, so that all unknowns are of order one."""
+_FACTORS = ("mass", "rotor_inertia", "motor_time_constant", "motor_gain", "thrust_scale", "torque_scale")
 
 
 class Unknowns(eqx.Module):
@@ -54,42 +66,27 @@ class Unknowns(eqx.Module):
     def apply(self, vector: Float[Array, "k"]) -> Parameters:
         """Parameters at ``vector``; differentiable."""
         p, change = self.nominal, dict(zip(self.names, vector, strict=True))
-
-        def factor(name):
-            return jnp.exp(change.get(name, 0.0))
-
-        free = [axis in change for axis in _AXES]
-        if all(free):
-            # Second moments a, b, c: J_xx = b + c and so on. One logarithm each.
-            moments = 0.5 * jnp.sum(p.inertia) - p.inertia
-            moments = moments * jnp.stack([factor(axis) for axis in _AXES])
-            inertia = jnp.sum(moments) - moments
-        else:
-            inertia = p.inertia * jnp.stack([factor(axis) for axis in _AXES])
-        cog = p.center_of_gravity + _LENGTH * jnp.stack(
-            [jnp.asarray(change.get("cog_x", 0.0)), jnp.asarray(change.get("cog_y", 0.0)), jnp.asarray(0.0)]
-        )
+        factors = tuple(getattr(p, name) * jnp.exp(change.get(name, 0.0)) for name in _FACTORS)
+        inertia = _inertia(p.inertia, tuple(change.get(axis) for axis in _AXES))
+        moved = {name: size * change[name] for name, size in OFFSETS.items() if name in change}
+        cog = [jnp.asarray(moved.get(name, 0.0)) for name in ("cog_x", "cog_y")]
         return eqx.tree_at(
             lambda q: (
-                q.mass,
+                *(getattr(q, name) for name in _FACTORS),
                 q.inertia,
-                q.rotor_inertia,
-                q.motor_time_constant,
-                q.motor_gain,
-                q.thrust_scale,
-                q.torque_scale,
                 q.center_of_gravity,
+                q.motor_speed_offset,
+                q.thrust_polynomial,
+                q.observation_delay,
             ),
             p,
             (
-                p.mass * factor("mass"),
+                *factors,
                 inertia,
-                p.rotor_inertia * factor("rotor_inertia"),
-                p.motor_time_constant * factor("motor_time_constant"),
-                p.motor_gain * factor("motor_gain"),
-                p.thrust_scale * factor("thrust_scale"),
-                p.torque_scale * factor("torque_scale"),
-                cog,
+                p.center_of_gravity + jnp.stack([*cog, jnp.zeros(())]),
+                p.motor_speed_offset + moved.get("motor_speed_offset", 0.0),
+                p.thrust_polynomial + jnp.stack([0.0, 0.0, moved.get("thrust_linear", 0.0)]),
+                p.observation_delay + moved.get("observation_delay", 0.0),
             ),
         )
 
@@ -97,28 +94,54 @@ class Unknowns(eqx.Module):
         """The chosen quantities at ``vector``, SI (means over the motors); differentiable."""
         p = self.apply(vector)
         known = {
-            "mass": p.mass,
-            "inertia_xx": p.inertia[0],
-            "inertia_yy": p.inertia[1],
-            "inertia_zz": p.inertia[2],
-            "rotor_inertia": p.rotor_inertia,
-            "motor_time_constant": jnp.mean(p.motor_time_constant),
-            "motor_gain": jnp.mean(p.motor_gain),
-            "thrust_scale": jnp.mean(p.thrust_scale),
-            "torque_scale": jnp.mean(p.torque_scale),
+            **{name: jnp.mean(getattr(p, name)) for name in (*_FACTORS, "motor_speed_offset", "observation_delay")},
+            **{axis: p.inertia[i] for i, axis in enumerate(_AXES)},
+            "thrust_linear": p.thrust_polynomial[2],
             "cog_x": p.center_of_gravity[0],
             "cog_y": p.center_of_gravity[1],
         }
         return jnp.stack([known[name] for name in self.names])
 
     def scale(self, vector: Float[Array, "k"]) -> np.ndarray:
-        """(k,) what one unit of a relative change is in SI: the value itself, or a cm for offsets."""
+        """(k,) what one unit of a relative change is in SI: the value itself, or the unit of `OFFSETS`."""
         values = np.asarray(self.values(vector))
-        return np.array([_LENGTH if n.startswith("cog") else v for n, v in zip(self.names, values, strict=True)])
+        return np.array([OFFSETS.get(name, value) for name, value in zip(self.names, values, strict=True)])
 
     def slope(self, vector: Float[Array, "k"]) -> np.ndarray:
         """(k, k) derivative of the relative changes of the quantities by the vector."""
         return np.asarray(jax.jacfwd(self.values)(vector)) / self.scale(vector)[:, None]
+
+
+def _inertia(nominal: Float[Array, "3"], change: tuple[Array | None, ...]) -> Float[Array, "3"]:
+    """Principal inertia whose free axes (those with a change) moved, and whose other axes stayed, always possible.
+
+    With m the second moments of the mass about the three coordinate planes, J_xx = m_y + m_z and so on; a body is
+    possible when no m is negative.
+    """
+    # A flat plate has a moment of zero, which no factor could change.
+    moments = jnp.maximum(0.5 * jnp.sum(nominal) - nominal, 1e-6 * jnp.sum(nominal))
+    free = [i for i in range(3) if change[i] is not None]
+    if not free:
+        return nominal
+    if len(free) == 3:
+        moments = moments * jnp.exp(jnp.stack(change))
+    elif len(free) == 2:
+        # The fixed axis k holds m_i + m_j: the ratio of these two is one unknown, m_k the other. The unknowns are
+        # turned so that each moves its own axis first.
+        i, j = free
+        k = 3 - i - j
+        split, rest = change[j] - change[i], change[i] + change[j]
+        share = jax.nn.sigmoid(jnp.log(moments[i] / moments[j]) + split)
+        moments = moments.at[i].set(nominal[k] * share).at[j].set(nominal[k] * (1 - share))
+        moments = moments.at[k].multiply(jnp.exp(rest))
+    else:
+        # J_j and J_k stay: m_k = J_j - m_i and m_j = J_k - m_i, so J_i = J_j + J_k - 2 m_i with m_i in (0, min).
+        i = free[0]
+        j, k = (n for n in range(3) if n != i)
+        most = jnp.minimum(nominal[j], nominal[k])
+        own = most * jax.nn.sigmoid(jnp.log(moments[i] / (most - moments[i])) - change[i])
+        moments = moments.at[i].set(own).at[j].set(nominal[k] - own).at[k].set(nominal[j] - own)
+    return jnp.sum(moments) - moments
 
 
 def choose(request: str | tuple[str, ...], nominal: Parameters) -> Unknowns:

@@ -1,0 +1,53 @@
+"""Whether a flight was flown under feedback: do the commands answer what the gyro could not be expected to say?"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfb_mjx.model.rotors import POSITION_SIGNS_X, POSITION_SIGNS_Y, YAW_SIGNS
+from cfb_mjx.sysid.flight_data import Segments
+
+LAGS = 5
+"""Rows within which a controller answers."""
+SIGNIFICANT = 1e-6
+
+
+@dataclass(frozen=True)
+class Feedback:
+    """Largest correlation between an innovation of a body rate and a later change of command, and its p-value."""
+
+    correlation: float
+    p_value: float
+
+    @property
+    def present(self) -> bool:
+        """Whether the flight was under feedback."""
+        return self.p_value < SIGNIFICANT
+
+
+def detect(segments: Segments, residual: np.ndarray) -> Feedback:
+    """Correlate innovations with the command changes that follow.
+
+    An innovation is what past rows, past commands included, do not explain: a command sequence decided beforehand
+    cannot follow it, a controller's must.
+
+    Args:
+        segments: flight data.
+        residual: (s, n - 1, 8) whitened innovations, zero where a row does not count.
+    """
+    mix = np.stack([POSITION_SIGNS_Y, -np.asarray(POSITION_SIGNS_X), YAW_SIGNS])
+    counts = np.asarray(segments.valid * (1 - segments.warm_up))[:, 1:]
+    change = np.diff(np.asarray(segments.command) @ mix.T, axis=1)  # into each row, from the one before
+    length, best = change.shape[1], 0.0
+    for lag in range(LAGS):
+        use = (counts[:, : length - lag] * counts[:, lag:])[..., None]
+        error, answer = residual[:, : length - lag, :3] * use, change[:, lag:] * use
+        size = np.sqrt(np.sum(error**2, axis=(0, 1)) * np.sum(answer**2, axis=(0, 1)))
+        found = np.abs(np.sum(error * answer, axis=(0, 1))) / np.maximum(size, 1e-300)
+        best = max(best, float(found.max()))
+    # Fisher's z is normal with variance 1 / (n - 3); Bonferroni over axes and lags.
+    z = np.arctanh(min(best, 1 - 1e-12)) * np.sqrt(max(counts.sum() - 3, 1))
+    return Feedback(float(best), min(1.0, 3 * LAGS * math.erfc(z / math.sqrt(2))))

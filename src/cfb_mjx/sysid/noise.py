@@ -1,0 +1,100 @@
+"""Noise of a flight: what the sensors do to what they measure, and what pushes the drone that no model knows."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cfb_mjx.sysid.flight_data import FlightData
+
+_SHORTEST, _LONGEST = 0.03, 3.0  # correlation time of the disturbance, s
+
+
+class Noise(eqx.Module):
+    """Standard deviations, one per axis where there are axes, and the two time constants that go with them."""
+
+    gyro: Float[Array, "3"]
+    """White noise of a gyro row, rad/s."""
+    rate_walk: Float[Array, "3"]
+    """White angular acceleration, rad/s per square root of a second."""
+    disturbance: Float[Array, "3"]
+    """Wandering angular acceleration, rad/s^2."""
+    correlation_time: Float[Array, ""]
+    """Of the wandering angular acceleration, s."""
+    accelerometer: Float[Array, ""]
+    """White noise of the z accelerometer, m/s^2."""
+    accelerometer_lag: Float[Array, ""]
+    """Time constant of the accelerometer's low-pass filter, s."""
+    force_disturbance: Float[Array, ""]
+    """Wandering specific force along z, m/s^2."""
+    rotor: Float[Array, ""]
+    """White noise of a rotor speed row, rad/s."""
+    rotor_walk: Float[Array, ""]
+    """White rotor acceleration, rad/s per square root of a second: what the motor model misses."""
+    rotor_disturbance: Float[Array, ""]
+    """Wandering error of the steady rotor speed, rad/s."""
+
+    def to_vector(self) -> Float[Array, "16"]:
+        """Unconstrained numbers, for optimisation."""
+        middle = jnp.sqrt(_SHORTEST * _LONGEST)
+        time = jnp.log(self.correlation_time / middle) / jnp.log(_LONGEST / middle)
+        return jnp.concatenate(
+            [
+                jnp.log(self.gyro),
+                jnp.log(self.rate_walk),
+                jnp.log(self.disturbance),
+                jnp.arctanh(jnp.clip(time, -0.999, 0.999))[None],
+                jnp.log(
+                    jnp.stack(
+                        [
+                            self.accelerometer,
+                            self.accelerometer_lag,
+                            self.force_disturbance,
+                            self.rotor,
+                            self.rotor_walk,
+                            self.rotor_disturbance,
+                        ]
+                    )
+                ),
+            ]
+        )
+
+    @staticmethod
+    def from_vector(vector: Float[Array, "16"]) -> Noise:
+        """Inverse of `to_vector`; a floor keeps a vanishing level from flattening the likelihood."""
+        x = jnp.exp(vector)
+        middle = jnp.sqrt(_SHORTEST * _LONGEST)
+        return Noise(
+            gyro=x[0:3] + 1e-4,
+            rate_walk=x[3:6] + 1e-3,
+            disturbance=x[6:9] + 1e-2,
+            correlation_time=middle * jnp.exp(jnp.tanh(vector[9]) * jnp.log(_LONGEST / middle)),
+            accelerometer=x[10] + 1e-3,
+            accelerometer_lag=x[11] + 1e-5,
+            force_disturbance=x[12] + 1e-3,
+            rotor=x[13] + 1e-2,
+            rotor_walk=x[14] + 1e-2,
+            rotor_disturbance=x[15] + 1e-2,
+        )
+
+    @staticmethod
+    def first(data: FlightData) -> Noise:
+        """Where a fit starts: sensors as their third differences show, the rest as seen on real flights."""
+        rotor = data.rotor_speed_noise if np.isfinite(data.rotor_speed_noise) else 10.0
+        levels = Noise(
+            gyro=np.maximum(data.rate_noise, 1e-3),
+            rate_walk=np.full(3, 0.3),
+            disturbance=np.full(3, 4.0),
+            correlation_time=0.3,
+            accelerometer=max(data.specific_force_noise[2], 1e-2),
+            accelerometer_lag=1e-3,
+            force_disturbance=0.5,
+            rotor=max(rotor, 1.0),
+            rotor_walk=30.0,
+            rotor_disturbance=20.0,
+        )
+        # An explicit type: weakly typed numbers would compile every program twice.
+        return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), levels)

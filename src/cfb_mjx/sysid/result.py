@@ -1,0 +1,128 @@
+"""What a fit returns, and how it becomes a model file."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cfb_mjx.parameters import Entry, ModelFile, Parameters
+from cfb_mjx.sysid.feedback import Feedback
+from cfb_mjx.sysid.noise import Noise
+from cfb_mjx.sysid.uncertainty import Uncertainty
+from cfb_mjx.sysid.unknowns import UNITS, Unknowns
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One fitted quantity, SI."""
+
+    value: float
+    std: float
+    unit: str
+    preset: float
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Result of a fit."""
+
+    estimator: str
+    """``innovation`` or ``shooting``."""
+    estimates: dict[str, Estimate]
+    """Identified parameters."""
+    unidentifiable: dict[str, str]
+    """What the data cannot tell: name to explanation."""
+    parameters: Parameters
+    """With every fitted value, also of what cannot be told alone: together they describe the flights."""
+    uncertainty: Uncertainty
+    names: tuple[str, ...]
+    values: dict[str, float]
+    """Every fitted value, SI, whether it can be told or not."""
+    vector: np.ndarray
+    """(k,) the optimiser's numbers, see `cfb_mjx.sysid.unknowns`."""
+    rows: int
+    """Measured rows (innovation) or windows (shooting) that were fitted."""
+    noise: Noise | None = None
+    """Noise levels (innovation)."""
+    whiteness: dict[str, float] | None = None
+    """Lag-one correlation of the innovations per channel: near 0 when the noise model fits (innovation)."""
+    feedback: Feedback | None = None
+    """Whether the commands answered the gyro (innovation)."""
+
+    def model_file(self, base: ModelFile, source: str) -> ModelFile:
+        """``base`` with the fitted constants, their uncertainty and ``source``."""
+        return _describe(base, self, source)
+
+
+def summarise(unknowns: Unknowns, vector, uncertainty: Uncertainty, estimator: str, rows: int, **more) -> Fit:
+    """A `Fit` that gives numbers only to what the data can tell."""
+    values = np.asarray(unknowns.values(vector))
+    std = uncertainty.std * unknowns.scale(vector)
+    preset = np.asarray(unknowns.values(unknowns.start))
+    known = [i for i, name in enumerate(unknowns.names) if name not in uncertainty.names]
+    return Fit(
+        estimator=estimator,
+        estimates={
+            unknowns.names[i]: Estimate(float(values[i]), float(std[i]), UNITS[unknowns.names[i]], float(preset[i]))
+            for i in known
+        },
+        unidentifiable=_reasons(uncertainty),
+        parameters=unknowns.apply(vector),
+        uncertainty=uncertainty,
+        names=unknowns.names,
+        values=dict(zip(unknowns.names, map(float, values), strict=True)),
+        vector=np.asarray(vector),
+        rows=rows,
+        **more,
+    )
+
+
+def _reasons(uncertainty: Uncertainty) -> dict[str, str]:
+    """Why each parameter without a number has none."""
+    reasons = {}
+    for name in uncertainty.names:
+        known = [text for text in uncertainty.combinations if name in text.split() or f"{name}," in text.split()]
+        reasons[name] = f"{name} alone; they tell {', '.join(known)}" if known else f"{name}: they do not depend on it"
+    return {name: f"these flights cannot tell {reason}" for name, reason in reasons.items()}
+
+
+_FILE_KEYS = (
+    "mass",
+    "rotor_inertia",
+    "motor_time_constant",
+    "motor_gain",
+    "motor_speed_offset",
+    "thrust_scale",
+    "torque_scale",
+    "observation_delay",
+)
+_AXES = ("inertia_xx", "inertia_yy", "inertia_zz")
+
+
+def _describe(base: ModelFile, result: Fit, source: str) -> ModelFile:
+    entries = dict(base.entries)
+
+    def put(key, value, std, note=""):
+        entries[key] = Entry(np.asarray(value, dtype=float), source + note, std)
+
+    def deviation(name):
+        return result.estimates[name].std if name in result.estimates else None
+
+    for name in _FILE_KEYS:
+        if name in result.names:
+            std = deviation(name)
+            value = np.asarray(getattr(result.parameters, name))
+            put(
+                name, value, None if std is None else np.full(value.shape, std), "" if std else "; not identified alone"
+            )
+    axes = [name for name in _AXES if name in result.names]
+    if axes:
+        std = np.array([deviation(name) or np.nan for name in _AXES])
+        put("inertia", result.parameters.inertia, std if np.isfinite(std).all() else None, f" ({', '.join(axes)})")
+    if "thrust_linear" in result.names:
+        put("thrust_polynomial", result.parameters.thrust_polynomial, None, " (linear coefficient)")
+    if "cog_x" in result.names or "cog_y" in result.names:
+        std = np.array([deviation(name) or np.nan for name in ("cog_x", "cog_y")] + [0.0])
+        put("center_of_gravity", result.parameters.center_of_gravity, std if np.isfinite(std).all() else None)
+    return replace(base, entries=entries)

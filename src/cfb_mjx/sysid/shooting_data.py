@@ -1,0 +1,151 @@
+"""Shooting windows of several logs in one batch of a few fixed shapes, with the noise of their sensors."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model.state import State
+from cfb_mjx.sysid.flight_data import white_noise
+from cfb_mjx.sysid.windows import Windows, find_windows
+
+HORIZONS = tuple(float(h) for h in np.round(np.arange(0.02, 0.2001, 0.02), 3))
+"""Where a window is compared with the measurement, s."""
+LEAD = 0.6
+"""Commands before a window from which its rotor speeds are estimated, s: twelve motor time constants."""
+COMMAND_DOUBT = 50.0
+"""How far off rotor speeds from commands are believed to be, rad/s: battery and load are not known."""
+
+
+class Batch(eqx.Module):
+    """W windows, S integration steps, H instants of comparison, P rows before the window."""
+
+    lead_step: Float[Array, "w p"]
+    lead_command: Float[Array, "w p 4"]
+    state: State
+    """Measured at the start; rotor speeds as measured, or zero."""
+    step: Float[Array, "w s"]
+    inputs: Float[Array, "w s 4"]
+    at: jax.Array
+    truth: State
+    noise: Float[Array, "w 12"]
+    """Of a row: position, velocity, attitude (rotation vector), body rate."""
+    rotor_noise: Float[Array, "w"]
+    live: Float[Array, "w"]
+    """0 for windows that only fill the batch."""
+    delay: Float[Array, ""]
+    """Age of the pose in a row that was assumed when the windows were cut, s."""
+    measured: bool = eqx.field(static=True)
+
+
+def batches(logs: list[FlightLog], delay: float | None, fallback: float, use_measured: bool) -> list[Batch]:
+    """Windows of the logs, those with and those without measured rotor speeds.
+
+    Args:
+        logs: flights.
+        delay: age of the pose in every log, s; None takes each log's own.
+        fallback: for logs that do not know theirs, s.
+        use_measured: feed measured rotor speeds where there are some.
+    """
+    pieces: dict[tuple[bool, float], list[dict]] = {}
+    for log in logs:
+        own = log.metadata.get("observation_delay")
+        age = delay if delay is not None else (fallback if own is None else float(own))
+        windows = find_windows(log, HORIZONS, age)
+        if len(windows):
+            good = np.isfinite(windows.rotor_speed).all(axis=(1, 2)) & use_measured
+            for measured in (True, False):
+                chosen = np.flatnonzero(good == measured)
+                if len(chosen):
+                    pieces.setdefault((measured, age), []).append(_arrays(log, windows, chosen, measured))
+    return [_stack(parts, measured, age) for (measured, age), parts in pieces.items()]
+
+
+def _arrays(log: FlightLog, windows: Windows, chosen: np.ndarray, measured: bool) -> dict:
+    lead = [_lead(log, windows.start[i], windows.row[i]) for i in chosen]
+    width = max(len(step) for step, _ in lead)
+    speed = windows.rotor_speed[chosen]
+    names = ("position", "velocity", "quaternion", "body_rate")
+    return {
+        # Shorter leads start with steps of no length.
+        "lead_step": np.stack([np.pad(step, (width - len(step), 0)) for step, _ in lead]),
+        "lead_command": np.stack([np.pad(u, ((width - len(u), 0), (0, 0)), mode="edge") for _, u in lead]),
+        "state": [getattr(windows, name)[chosen] for name in names]
+        + [speed[:, 0] if measured else np.zeros((len(chosen), 4))],
+        "step": windows.step[chosen],
+        "inputs": speed[:, 1:] if measured else windows.command[chosen],
+        "at": windows.at[chosen],
+        "truth": [getattr(windows, "true_" + name)[chosen] for name in names],
+        "noise": np.tile(_noise(log), (len(chosen), 1)),
+        "rotor_noise": np.full(len(chosen), _rotor_noise(log) if measured else COMMAND_DOUBT),
+    }
+
+
+def _lead(log: FlightLog, start: float, row: int) -> tuple[np.ndarray, np.ndarray]:
+    """Durations and commands from `LEAD` before a window to its start."""
+    first = max(int(np.searchsorted(log.time, start - LEAD)), 0)
+    edges = np.concatenate([log.time[first : row + 1], [start]])
+    return np.maximum(np.diff(edges), 0.0), np.clip(log.command[first : row + 1], 0, 1)
+
+
+def _stack(parts: list[dict], measured: bool, delay: float) -> Batch:
+    count = sum(len(part["step"]) for part in parts)
+    rows = _ladder(count)
+
+    def join(key, axis_pad=None, front=False):
+        arrays = [part[key] for part in parts]
+        if axis_pad is not None:
+            width = axis_pad * -(-max(a.shape[1] for a in arrays) // axis_pad)
+            arrays = [_pad_steps(a, width, front, edge=a.ndim == 3) for a in arrays]
+        joined = np.concatenate(arrays)
+        return jnp.asarray(np.concatenate([joined, np.repeat(joined[:1], rows - count, axis=0)]))
+
+    def state(key, speed):
+        fields = [np.concatenate([part[key][i] for part in parts]) for i in range(len(parts[0][key]))]
+        fields = [jnp.asarray(np.concatenate([f, np.repeat(f[:1], rows - count, axis=0)])) for f in fields]
+        return State(*fields, *([] if speed else [jnp.zeros((*fields[0].shape[:-1], 4))]))
+
+    return Batch(
+        lead_step=join("lead_step", 32, front=True),
+        lead_command=join("lead_command", 32, front=True),
+        state=state("state", True),
+        step=join("step", 32),
+        inputs=join("inputs", 32),
+        at=join("at"),
+        truth=state("truth", False),
+        noise=join("noise"),
+        rotor_noise=join("rotor_noise"),
+        live=jnp.asarray((np.arange(rows) < count).astype(float)),
+        delay=jnp.asarray(delay, float),
+        measured=measured,
+    )
+
+
+def _ladder(count: int) -> int:
+    """Batch sizes 32, 64, 96, 128, then multiples of 64: few programs, little waste."""
+    return 32 * -(-count // 32) if count <= 128 else 64 * -(-count // 64)
+
+
+def _pad_steps(values: np.ndarray, width: int, front: bool, edge: bool) -> np.ndarray:
+    more = width - values.shape[1]
+    pads = [(0, 0), (more, 0) if front else (0, more), *[(0, 0)] * (values.ndim - 2)]
+    return np.pad(values, pads, mode="edge") if edge else np.pad(values, pads)
+
+
+def _noise(log: FlightLog) -> np.ndarray:
+    """(12,) noise of a row, from third differences."""
+
+    def level(values):
+        return np.maximum(white_noise(values), 1e-6)
+
+    return np.concatenate(
+        [level(log.position), level(log.velocity), 2 * level(log.quaternion[:, 1:]), level(log.body_rate)]
+    )
+
+
+def _rotor_noise(log: FlightLog) -> float:
+    return max(float(np.nanmean(white_noise(log.rotor_speed))), 1e-3)
