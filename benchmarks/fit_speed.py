@@ -30,8 +30,8 @@ from same_residual import by_scipy, of_innovations, of_shooting, timed  # noqa: 
 from cfb_mjx.cli.runtime import environment  # noqa: E402
 from cfb_mjx.files import write_text  # noqa: E402
 from cfb_mjx.parameters import load_model_file  # noqa: E402
-from cfb_mjx.sysid.fitting import fit  # noqa: E402
-from cfb_mjx.sysid.shooting import shoot  # noqa: E402
+from cfb_mjx.sysid.identification.fitting import fit  # noqa: E402
+from cfb_mjx.sysid.identification.shooting import shoot  # noqa: E402
 
 NOMINAL = load_model_file("cfb-guards").parameters()
 NAMES = ("inertia_xx", "inertia_yy", "inertia_zz", "rotor_inertia", "cog_x", "cog_y")

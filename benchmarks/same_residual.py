@@ -19,8 +19,8 @@ from scipy.optimize import least_squares
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.bodies import RigidBody
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid import fitting, flight_data, shooting, shooting_data
-from cfb_mjx.sysid.unknowns import Unknowns, choose
+from cfb_mjx.sysid.identification import fitting, flight_data, shooting, shooting_data
+from cfb_mjx.sysid.identification.unknowns import Unknowns, choose
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ from same_residual import by_scipy, of_shooting, timed  # noqa: E402
 from cfb_mjx.cli.runtime import environment  # noqa: E402
 from cfb_mjx.files import write_text  # noqa: E402
 from cfb_mjx.parameters import load_model_file  # noqa: E402
-from cfb_mjx.sysid.fitting import fit  # noqa: E402
-from cfb_mjx.sysid.shooting import shoot  # noqa: E402
+from cfb_mjx.sysid.identification.fitting import fit  # noqa: E402
+from cfb_mjx.sysid.identification.shooting import shoot  # noqa: E402
 
 NOMINAL = load_model_file("cfb-guards").parameters()
 SHOWN = {

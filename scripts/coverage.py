@@ -56,7 +56,7 @@ def study(flights: int, seconds: float, case: dict, progress) -> dict:
     from plant import fly
 
     from cfb_mjx.parameters import load_model_file
-    from cfb_mjx.sysid.fitting import fit
+    from cfb_mjx.sysid.identification.fitting import fit
 
     rng = np.random.default_rng(SEED)
     plant = draw(flights, rng)

@@ -19,13 +19,13 @@ from cfb_mjx.control import FirmwarePid, PositionHold
 from cfb_mjx.files import write_json
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.sysid.conditions import Conditions
-from cfb_mjx.sysid.design import Problem, optimise
-from cfb_mjx.sysid.excitation import Limits, roll_pitch, scaled, single_motor
-from cfb_mjx.sysid.experiment import fly
-from cfb_mjx.sysid.fitting import default_parameters, fit
-from cfb_mjx.sysid.information import predict
-from cfb_mjx.sysid.unknowns import choose
+from cfb_mjx.sysid.excitation.conditions import Conditions
+from cfb_mjx.sysid.excitation.design import Problem, optimise
+from cfb_mjx.sysid.excitation.experiment import fly
+from cfb_mjx.sysid.excitation.information import predict
+from cfb_mjx.sysid.excitation.manoeuvres import Limits, roll_pitch, scaled, single_motor
+from cfb_mjx.sysid.identification.fitting import default_parameters, fit
+from cfb_mjx.sysid.identification.unknowns import choose
 
 REPETITIONS = 5
 

@@ -17,7 +17,7 @@ from cfb_mjx.logs import read_log
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid import evaluate
-from cfb_mjx.sysid.fitting import fit
+from cfb_mjx.sysid.identification.fitting import fit
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "real-flights.md"
 GROUPS = {"gentle (random1, random2, multisine)": ("random", "multisine"), "square": ("square",)}

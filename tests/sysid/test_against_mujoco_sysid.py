@@ -24,8 +24,8 @@ import open_loop
 
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file
+from cfb_mjx.sysid.identification.unknowns import choose
 from cfb_mjx.sysid.prediction import predict, rotor_speed_at_start
-from cfb_mjx.sysid.unknowns import choose
 from cfb_mjx.sysid.windows import Windows, find_windows
 
 NOMINAL = load_model_file("cfb-guards").parameters()

@@ -12,9 +12,11 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import read_log
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.sysid.conditions import Conditions
-from cfb_mjx.sysid.design import Problem, optimise, slopes
-from cfb_mjx.sysid.excitation import (
+from cfb_mjx.sysid.excitation.conditions import Conditions
+from cfb_mjx.sysid.excitation.design import Problem, optimise, slopes
+from cfb_mjx.sysid.excitation.experiment import fly
+from cfb_mjx.sysid.excitation.information import linearise, log_determinant, marginal_std, predict
+from cfb_mjx.sysid.excitation.manoeuvres import (
     Limits,
     flown,
     multisine,
@@ -24,11 +26,9 @@ from cfb_mjx.sysid.excitation import (
     stepped,
     worst,
 )
-from cfb_mjx.sysid.experiment import fly
-from cfb_mjx.sysid.information import linearise, log_determinant, marginal_std, predict
-from cfb_mjx.sysid.noise import Noise
-from cfb_mjx.sysid.safety import attained
-from cfb_mjx.sysid.unknowns import choose
+from cfb_mjx.sysid.excitation.safety import attained
+from cfb_mjx.sysid.identification.noise import Noise
+from cfb_mjx.sysid.identification.unknowns import choose
 
 MODEL = Quadrotor.from_file("cfb-guards")
 NAMES = "inertia,rotor_inertia,motor_time_constant,motor_gain"

@@ -11,10 +11,10 @@ from scipy.integrate import solve_ivp
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.sysid.fitting import fit
-from cfb_mjx.sysid.robust import OUTLIER, tempered
-from cfb_mjx.sysid.uncertainty import assess
-from cfb_mjx.sysid.unknowns import choose
+from cfb_mjx.sysid.identification.fitting import fit
+from cfb_mjx.sysid.identification.robust import OUTLIER, tempered
+from cfb_mjx.sysid.identification.uncertainty import assess
+from cfb_mjx.sysid.identification.unknowns import choose
 
 NOMINAL = load_model_file("cfb-guards").parameters()
 

@@ -14,9 +14,9 @@ from cfb_mjx.files import require_folder, write_json, write_text
 if TYPE_CHECKING:
     import numpy as np
 
-    from cfb_mjx.sysid.experiment import Experiment
-    from cfb_mjx.sysid.information import Prediction
-    from cfb_mjx.sysid.safety import Attained
+    from cfb_mjx.sysid.excitation.experiment import Experiment
+    from cfb_mjx.sysid.excitation.information import Prediction
+    from cfb_mjx.sysid.excitation.safety import Attained
 
 Manoeuvre = Literal["roll-pitch", "single-motor", "optimised"]
 PAPER = ("roll-pitch", "single-motor")
@@ -66,8 +66,8 @@ def run_excite(
     if not 0 <= disturbance < float("inf"):
         raise CfbError(f"--disturbance {disturbance:g}: the disturbance is an rms in rad/s^2, zero or more.")
     configure_jax(x64=True)
-    from cfb_mjx.sysid.conditions import Conditions
-    from cfb_mjx.sysid.excitation import Limits
+    from cfb_mjx.sysid.excitation.conditions import Conditions
+    from cfb_mjx.sysid.excitation.manoeuvres import Limits
 
     described = changed_model(model, changes)
     limits = Limits(rate=rate_limit, altitude_loss=altitude_loss)
@@ -86,13 +86,13 @@ def _trials(manoeuvre, described, parameters, repetitions, duration, limits, con
     """The manoeuvre; before an optimised one the paper's, which it is compared with and whose noise it assumes."""
     from cfb_mjx.control import FirmwarePid, PositionHold
     from cfb_mjx.model import Quadrotor
-    from cfb_mjx.sysid.design import Problem, optimise
-    from cfb_mjx.sysid.excitation import roll_pitch, scaled, single_motor
-    from cfb_mjx.sysid.experiment import fly
-    from cfb_mjx.sysid.fitting import default_parameters
-    from cfb_mjx.sysid.information import log_determinant, predict, typical
-    from cfb_mjx.sysid.safety import attained, worst_of
-    from cfb_mjx.sysid.unknowns import choose
+    from cfb_mjx.sysid.excitation.design import Problem, optimise
+    from cfb_mjx.sysid.excitation.experiment import fly
+    from cfb_mjx.sysid.excitation.information import log_determinant, predict, typical
+    from cfb_mjx.sysid.excitation.manoeuvres import roll_pitch, scaled, single_motor
+    from cfb_mjx.sysid.excitation.safety import attained, worst_of
+    from cfb_mjx.sysid.identification.fitting import default_parameters
+    from cfb_mjx.sysid.identification.unknowns import choose
 
     nominal = described.parameters()
     model = Quadrotor.from_file(described)
@@ -204,7 +204,7 @@ def _write(folder: Path, chosen: Trial, result: dict, limits, title: str) -> Non
     import numpy as np
 
     from cfb_mjx.logs import write_mcap
-    from cfb_mjx.sysid.excitation import STEP
+    from cfb_mjx.sysid.excitation.manoeuvres import STEP
     from cfb_mjx.view.excitation import excitation_figure
 
     folder.mkdir(exist_ok=True)

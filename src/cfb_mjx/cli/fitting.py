@@ -49,7 +49,7 @@ def run_fit(
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import save_model_file
     from cfb_mjx.sysid import evaluate
-    from cfb_mjx.sysid.fitting import fit
+    from cfb_mjx.sysid.identification.fitting import fit
 
     base = changed_model(model, changes)
     result = fit(fitted, base.parameters(), parameters, not commands_only, robust, estimator, Progress("fitting"))
@@ -85,7 +85,7 @@ def _last(log: FlightLog) -> FlightLog:
 
 def _other(result, logs, base, use_measured, robust):
     """The estimator that was not chosen, for comparison; None where it cannot run."""
-    from cfb_mjx.sysid.fitting import fit
+    from cfb_mjx.sysid.identification.fitting import fit
 
     other = "shooting" if result.estimator == "innovation" else "innovation"
     try:

@@ -23,8 +23,8 @@ from cfb_mjx.logs.tabular import read_table
 
 if TYPE_CHECKING:
     from cfb_mjx.parameters import ModelFile
-    from cfb_mjx.sysid.motors import MotorFit
-    from cfb_mjx.sysid.rotor_maps import MapFit
+    from cfb_mjx.sysid.rotors.motors import MotorFit
+    from cfb_mjx.sysid.rotors.rotor_maps import MapFit
 
 _FILE_NAMES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
 _COLUMN = {"thrust": "force", "torque": "torque"}
@@ -59,7 +59,7 @@ def run_fit_rotors(
     records, tables = _read(paths)
     configure_jax(x64=True)
     from cfb_mjx.parameters import save_model_file
-    from cfb_mjx.sysid.motors import fit_motors
+    from cfb_mjx.sysid.rotors.motors import fit_motors
 
     base = changed_model(model, changes)
     motors = None
@@ -82,7 +82,7 @@ def run_fit_rotors(
         write_json(json, _json(motors, maps, base, written))
         print(f"results: {json}")
     if figure is not None:
-        from cfb_mjx.sysid.motor_replay import replay
+        from cfb_mjx.sysid.rotors.motor_replay import replay
         from cfb_mjx.view.rotors import rotor_figure
 
         rotor_figure(replay(motors) if motors else [], maps, figure, output.stem)
@@ -95,7 +95,7 @@ def _read(paths: list[Path]) -> tuple[list[MotorRecord], list[MapTable]]:
     for path in paths:
         found = _bench(path)
         if found is None:
-            from cfb_mjx.sysid.motor_tracks import record_of
+            from cfb_mjx.sysid.rotors.motor_tracks import record_of
 
             found = record_of(read_log(path))
             if found is None:
@@ -113,7 +113,7 @@ def _bench(path: Path) -> MotorRecord | MapTable | None:
 
 
 def _fit_maps(tables: list[MapTable], base: ModelFile, per_motor: bool, robust: bool) -> dict[str, MapFit]:
-    from cfb_mjx.sysid.rotor_maps import fit_map
+    from cfb_mjx.sysid.rotors.rotor_maps import fit_map
 
     found = {}
     for name, column in _COLUMN.items():

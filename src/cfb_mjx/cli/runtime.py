@@ -23,6 +23,8 @@ def configure_jax(x64: bool) -> None:
     """
     if "jaxlib" not in sys.modules:
         share_cpu_kernels()
+        # Programs from the compile cache make XLA log an error about tuning hints it takes for processor features.
+        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     import jax
 
     jax.config.update("jax_enable_x64", x64)

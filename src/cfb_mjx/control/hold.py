@@ -1,4 +1,4 @@
-"""The PID as a holder of positions, for what flies a drone without asking how (`cfb_mjx.sysid.experiment`)."""
+"""The PID as a holder of positions, for what flies a drone without asking how (`sysid.excitation`)."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 
-from cfb_mjx.sysid.experiment import TICK, Experiment
+from cfb_mjx.sysid.excitation.experiment import TICK, Experiment
 from cfb_mjx.view import style
 from cfb_mjx.view.spread import tilt_deg
 

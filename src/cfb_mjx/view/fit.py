@@ -6,7 +6,7 @@ import os
 
 import numpy as np
 
-from cfb_mjx.sysid.result import Fit
+from cfb_mjx.sysid.identification.result import Fit
 from cfb_mjx.view import style
 
 _STAGES = (

@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.sysid.motor_replay import Replay
-from cfb_mjx.sysid.rotor_maps import MapFit
+from cfb_mjx.sysid.rotors.motor_replay import Replay
+from cfb_mjx.sysid.rotors.rotor_maps import MapFit
 from cfb_mjx.view import style
 
 _MARKS = "os^Dv"

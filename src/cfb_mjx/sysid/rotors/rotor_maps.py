@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.sysid.map_shape import SIGMA, Shape, shape_of
+from cfb_mjx.sysid.rotors.map_shape import SIGMA, Shape, shape_of
 
 HUBER = 1.345
 """Residuals beyond this many standard deviations count linearly: 95 % efficient on normal noise."""

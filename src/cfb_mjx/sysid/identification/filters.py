@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.flight_data import Segments
-from cfb_mjx.sysid.noise import Noise
-from cfb_mjx.sysid.robust import limited
+from cfb_mjx.sysid.identification.flight_data import Segments
+from cfb_mjx.sysid.identification.noise import Noise
+from cfb_mjx.sysid.identification.robust import limited
 
 CORRELATION_TIME = 0.5
 """Of the wandering offsets of specific force and steady rotor speed, s: battery and inflow, below about 0.3 Hz."""

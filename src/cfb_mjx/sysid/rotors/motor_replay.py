@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.sysid.motor_likelihood import undisturbed
-from cfb_mjx.sysid.motor_tracks import gather
-from cfb_mjx.sysid.motors import MotorFit
+from cfb_mjx.sysid.rotors.motor_likelihood import undisturbed
+from cfb_mjx.sysid.rotors.motor_tracks import gather
+from cfb_mjx.sysid.rotors.motors import MotorFit
 
 
 @dataclass(frozen=True)

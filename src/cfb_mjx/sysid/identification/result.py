@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cfb_mjx.parameters import Entry, ModelFile, Parameters
-from cfb_mjx.sysid.feedback import Feedback
-from cfb_mjx.sysid.noise import Noise
-from cfb_mjx.sysid.uncertainty import Uncertainty
-from cfb_mjx.sysid.unknowns import UNITS, Unknowns
+from cfb_mjx.sysid.identification.feedback import Feedback
+from cfb_mjx.sysid.identification.noise import Noise
+from cfb_mjx.sysid.identification.uncertainty import Uncertainty
+from cfb_mjx.sysid.identification.unknowns import UNITS, Unknowns
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Fit:
     values: dict[str, float]
     """Every fitted value, SI, whether it can be told or not."""
     vector: np.ndarray
-    """(k,) the optimiser's numbers, see `cfb_mjx.sysid.unknowns`."""
+    """(k,) the optimiser's numbers, see `cfb_mjx.sysid.identification.unknowns`."""
     rows: int
     """Measured rows (innovation) or windows (shooting) that were fitted."""
     noise: Noise | None = None

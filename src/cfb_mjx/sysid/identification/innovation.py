@@ -22,15 +22,15 @@ from cfb_mjx.model import rotors
 from cfb_mjx.model.quadrotor import wrench_of
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.filters import (
+from cfb_mjx.sysid.identification.filters import (
     force_innovations,
     rate_innovations,
     rotor_innovations,
     smoothed_rotor_speed,
 )
-from cfb_mjx.sysid.flight_data import Segments
-from cfb_mjx.sysid.noise import Noise
-from cfb_mjx.sysid.robust import tempered
+from cfb_mjx.sysid.identification.flight_data import Segments
+from cfb_mjx.sysid.identification.noise import Noise
+from cfb_mjx.sysid.identification.robust import tempered
 
 CHANNELS = ("rate_x", "rate_y", "rate_z", "specific_force_z", "rotor_1", "rotor_2", "rotor_3", "rotor_4")
 

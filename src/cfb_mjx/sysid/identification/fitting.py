@@ -15,16 +15,16 @@ import optimistix as optx
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.feedback import detect
-from cfb_mjx.sysid.flight_data import Segments, prepare
-from cfb_mjx.sysid.innovation import CHANNELS, drive, innovations, negative_log_likelihood
-from cfb_mjx.sysid.noise import Noise
-from cfb_mjx.sysid.result import Fit, summarise
-from cfb_mjx.sysid.robust import tempered
-from cfb_mjx.sysid.shooting import shoot
-from cfb_mjx.sysid.solver import least_squares
-from cfb_mjx.sysid.uncertainty import assess
-from cfb_mjx.sysid.unknowns import Unknowns, choose
+from cfb_mjx.sysid.identification.feedback import detect
+from cfb_mjx.sysid.identification.flight_data import Segments, prepare
+from cfb_mjx.sysid.identification.innovation import CHANNELS, drive, innovations, negative_log_likelihood
+from cfb_mjx.sysid.identification.noise import Noise
+from cfb_mjx.sysid.identification.result import Fit, summarise
+from cfb_mjx.sysid.identification.robust import tempered
+from cfb_mjx.sysid.identification.shooting import shoot
+from cfb_mjx.sysid.identification.solver import least_squares
+from cfb_mjx.sysid.identification.uncertainty import assess
+from cfb_mjx.sysid.identification.unknowns import Unknowns, choose
 
 ROUNDS = 8
 """Noise levels and parameters are found in turns, at most so often."""
@@ -60,12 +60,12 @@ def fit(
     Args:
         logs: flights; run with x64 enabled.
         nominal: where to start, and the values of all that is not fitted.
-        parameters: names or groups (`cfb_mjx.sysid.unknowns.choose`); None takes `default_parameters`, and those of
+        parameters: names or groups (`unknowns.choose`); None takes `default_parameters`, and those of
             `EXTRAS` that the flights ask for.
         use_measured: drive the body with measured rotor speeds where a log has them.
         robust: let outliers count linearly instead of squared.
-        estimator: ``innovation``, safe under feedback (`cfb_mjx.sysid.innovation`), or ``shooting``
-            (`cfb_mjx.sysid.shooting`), which is not. ``auto`` takes the first, which is right with and without
+        estimator: ``innovation``, safe under feedback (`innovation`), or ``shooting``
+            (`shooting`), which is not. ``auto`` takes the first, which is right with and without
             feedback, unless the observation delay is asked for: that shows in the pose only, which it does not read.
         progress: called with (done, total).
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfb_mjx.sysid.flight_data import FlightData
+from cfb_mjx.sysid.identification.flight_data import FlightData
 
 _SHORTEST, _LONGEST = 0.03, 3.0  # correlation time of the disturbance, s
 

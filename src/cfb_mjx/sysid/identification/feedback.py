@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cfb_mjx.model.rotors import POSITION_SIGNS_X, POSITION_SIGNS_Y, YAW_SIGNS
-from cfb_mjx.sysid.flight_data import Segments
+from cfb_mjx.sysid.identification.flight_data import Segments
 
 LAGS = 5
 """Rows within which a controller answers."""

@@ -17,7 +17,7 @@ def least_squares(residual: Callable[[Array], PyTree], start: Float[Array, "k"])
     """Levenberg-Marquardt from ``start``; forward-mode Jacobian, for few unknowns and many residuals.
 
     Normal equations, not QR: with k of about ten and residuals by the hundred thousand they are what costs, and the
-    uncertainty, which condition numbers would spoil, is computed elsewhere by QR (`cfb_mjx.sysid.uncertainty`).
+    uncertainty, which condition numbers would spoil, is computed elsewhere by QR (`uncertainty`).
     """
     solver = optx.LevenbergMarquardt(rtol=1e-6, atol=1e-6, linear_solver=lx.Normal(lx.Cholesky()))
 

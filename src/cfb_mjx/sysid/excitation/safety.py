@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cfb_mjx.sysid.excitation import Limits
-from cfb_mjx.sysid.experiment import CATCH, TICK, Experiment
+from cfb_mjx.sysid.excitation.experiment import CATCH, TICK, Experiment
+from cfb_mjx.sysid.excitation.manoeuvres import Limits
 
 SETTLED_TILT_DEG, SETTLED_SPEED = 10.0, 0.3
 """Caught means: below this tilt and speed (m/s) for good, at the latest `CATCH` seconds after the handover."""

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.state import State
-from cfb_mjx.sysid.flight_data import white_noise
+from cfb_mjx.sysid.identification.flight_data import white_noise
 from cfb_mjx.sysid.windows import Windows, find_windows
 
 HORIZONS = tuple(float(h) for h in np.round(np.arange(0.02, 0.2001, 0.02), 3))

@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cfb_mjx.sysid.unknowns import OFFSETS
+from cfb_mjx.sysid.identification.unknowns import OFFSETS
 
 LOOSEST = 0.5
 """A direction in which the estimate is free by more than this is not identified: 50 % of a value, half the unit of
-`cfb_mjx.sysid.unknowns.OFFSETS` (5 mm, 100 rad/s, 2 ms)."""
+`cfb_mjx.sysid.identification.unknowns.OFFSETS` (5 mm, 100 rad/s, 2 ms)."""
 SHARE = 0.3
 """A parameter belongs to an unidentified direction when its component there is at least this."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of the named quantities: relative, or in the units of `cfb_mjx.sysid.unknowns.OFFSETS`.
+    """Of the named quantities: relative, or in the units of `cfb_mjx.sysid.identification.unknowns.OFFSETS`.
 
     Attributes:
         covariance: (k, k), of the identified part.

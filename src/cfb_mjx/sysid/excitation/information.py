@@ -1,6 +1,6 @@
 """How well a flight will tell the parameters, before it is flown.
 
-`cfb fit` maximises the likelihood of one-step innovations (`cfb_mjx.sysid.innovation`). Its Fisher information is
+`cfb fit` maximises the likelihood of one-step innovations (`sysid.identification.innovation`). Its Fisher information is
 J^T J, with J the Jacobian of the whitened innovations at the true parameters, which in a simulated flight are known.
 """
 
@@ -20,11 +20,11 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import thrust
 from cfb_mjx.model.state import State
-from cfb_mjx.sysid.excitation import STEP
-from cfb_mjx.sysid.flight_data import Segments, prepare
-from cfb_mjx.sysid.innovation import Noise, drive, innovations
-from cfb_mjx.sysid.uncertainty import LOOSEST, Uncertainty, assess
-from cfb_mjx.sysid.unknowns import UNITS, Unknowns
+from cfb_mjx.sysid.excitation.manoeuvres import STEP
+from cfb_mjx.sysid.identification.flight_data import Segments, prepare
+from cfb_mjx.sysid.identification.innovation import Noise, drive, innovations
+from cfb_mjx.sysid.identification.uncertainty import LOOSEST, Uncertainty, assess
+from cfb_mjx.sysid.identification.unknowns import UNITS, Unknowns
 
 _ROUNDS = 2
 BLOCK = 128
@@ -166,7 +166,7 @@ def window_information(
     Args:
         model: the true drone; its parameters are those of ``unknowns``.
         commands: (n, 4) of the manoeuvre.
-        path: (n,) states after each of them (`cfb_mjx.sysid.excitation.flown`).
+        path: (n,) states after each of them (`cfb_mjx.sysid.excitation.manoeuvres.flown`).
         unknowns: what is to be told.
         noise: levels.
         measured_rotors: whether rotor speed is logged.

@@ -4,7 +4,7 @@
 rotor speed and that of spin-down where it lies below (paper eq. 5 with one T and d = 0). ``b`` wanders
 (Ornstein-Uhlenbeck): battery and load move the steady speed, and a controller answers what they do to the flight, so
 that its commands are correlated with them. Why the likelihood of one-step innovations is not bent by that:
-`cfb_mjx.sysid.innovation`, whose rotor filter this one generalises.
+`cfb_mjx.sysid.identification.innovation`, whose rotor filter this one generalises.
 
 Between two events, a row or a command taking effect, everything is constant and the speed never crosses its target,
 so the exponential is exact for any sampling and the dead time is continuous: events are sorted by time, not counted
@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.sysid.motor_tracks import Tracks
+from cfb_mjx.sysid.rotors.motor_tracks import Tracks
 
 NAMES = ("motor_gain", "motor_speed_offset", "spin_up_time_constant", "spin_down_time_constant", "dead_time")
 OFFSET_UNIT, DEAD_TIME_UNIT = 1000.0, 0.01

@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.sysid.motor_filter import Motor, simulate
-from cfb_mjx.sysid.motor_likelihood import Optimum
-from cfb_mjx.sysid.motor_tracks import MotorData, Tracks
+from cfb_mjx.sysid.rotors.motor_filter import Motor, simulate
+from cfb_mjx.sysid.rotors.motor_likelihood import Optimum
+from cfb_mjx.sysid.rotors.motor_tracks import MotorData, Tracks
 
 
 @eqx.filter_jit

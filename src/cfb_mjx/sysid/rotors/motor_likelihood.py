@@ -10,10 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
-from cfb_mjx.sysid.motor_filter import DEAD_TIME_UNIT, NAMES, OFFSET_UNIT, Motor, innovations, negative_log_likelihood
-from cfb_mjx.sysid.motor_filter import simulate as simulate_tracks
-from cfb_mjx.sysid.motor_tracks import ROWS, MotorData, Tracks
-from cfb_mjx.sysid.uncertainty import Uncertainty, assess
+from cfb_mjx.sysid.identification.uncertainty import Uncertainty, assess
+from cfb_mjx.sysid.rotors.motor_filter import (
+    DEAD_TIME_UNIT,
+    NAMES,
+    OFFSET_UNIT,
+    Motor,
+    innovations,
+    negative_log_likelihood,
+)
+from cfb_mjx.sysid.rotors.motor_filter import simulate as simulate_tracks
+from cfb_mjx.sysid.rotors.motor_tracks import ROWS, MotorData, Tracks
 
 ROUNDS, STEPS = 12, 8
 """Few steps between updates of the Fisher information: far from the optimum it changes a lot."""

@@ -22,8 +22,8 @@ from cfb_mjx.model.rotors import loads_at
 from cfb_mjx.model.rotors import prepare as prepare_rotors
 from cfb_mjx.model.state import State
 from cfb_mjx.model.vector import Vec, rotate_inverse
-from cfb_mjx.sysid.conditions import Conditions
-from cfb_mjx.sysid.excitation import STEP
+from cfb_mjx.sysid.excitation.conditions import Conditions
+from cfb_mjx.sysid.excitation.manoeuvres import STEP
 
 TICK = 0.002
 SETTLE, BRAKING, CATCH, RETURN = 1.0, 1.2, 2.0, 2.5

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.bench_tables import MotorRecord
-from cfb_mjx.sysid.flight_data import white_noise
+from cfb_mjx.sysid.identification.flight_data import white_noise
 
 ROWS = 512
 """Rows of a piece. With the number of pieces rounded up to a power of two, most fits share one compiled program."""

@@ -20,7 +20,8 @@ from jaxtyping import Array, Float
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
-from cfb_mjx.sysid.excitation import (
+from cfb_mjx.sysid.excitation.information import log_determinant, per_relative_change, window_information
+from cfb_mjx.sysid.excitation.manoeuvres import (
     MARGIN,
     STEP,
     Limits,
@@ -36,9 +37,8 @@ from cfb_mjx.sysid.excitation import (
     stepped,
     worst,
 )
-from cfb_mjx.sysid.information import log_determinant, per_relative_change, window_information
-from cfb_mjx.sysid.innovation import Noise
-from cfb_mjx.sysid.unknowns import Unknowns
+from cfb_mjx.sysid.identification.innovation import Noise
+from cfb_mjx.sysid.identification.unknowns import Unknowns
 
 KNOT = 0.02
 _PENALTY = 300.0
@@ -52,7 +52,7 @@ class Design:
 
     Attributes:
         commands: (n, 4).
-        log_det: of the information of one repetition (`cfb_mjx.sysid.information.log_determinant`).
+        log_det: of the information of one repetition (`cfb_mjx.sysid.excitation.information.log_determinant`).
         history: (iterations,) best objective over the starts, penalties included.
     """
 

@@ -2,7 +2,7 @@
 
 The paper (section III-B, eq. 5) has one time constant T and a gain K. Optional extras: an offset (steady speed affine
 in the command), separate time constants for spin-up and spin-down, and a dead time. Each extra is tested against the
-model without it. The estimator is described in `cfb_mjx.sysid.motor_filter`.
+model without it. The estimator is described in `cfb_mjx.sysid.rotors.motor_filter`.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from jax.scipy.special import gammaincc
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.bench_tables import MotorRecord
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.common_lag import common_lag
-from cfb_mjx.sysid.motor_filter import DEAD_TIME_UNIT, Motor
-from cfb_mjx.sysid.motor_likelihood import Optimum, first_guess, maximise
-from cfb_mjx.sysid.motor_tracks import MotorData, gather
-from cfb_mjx.sysid.result import Estimate
+from cfb_mjx.sysid.identification.result import Estimate
+from cfb_mjx.sysid.rotors.common_lag import common_lag
+from cfb_mjx.sysid.rotors.motor_filter import DEAD_TIME_UNIT, Motor
+from cfb_mjx.sysid.rotors.motor_likelihood import Optimum, first_guess, maximise
+from cfb_mjx.sysid.rotors.motor_tracks import MotorData, gather
 
 UNITS = {
     "motor_time_constant": "s",

@@ -1,14 +1,14 @@
 """Multiple shooting: parameters that predict best over a horizon, from the measured state of every window.
 
 The classical estimator, right for flights without feedback or without unmodelled disturbances. Under feedback it is
-biased (`cfb_mjx.sysid.innovation` says why and is the default); ``cfb fit --compare`` shows its answer beside the
+biased (`innovation` says why and is the default); ``cfb fit --compare`` shows its answer beside the
 default one.
 
 A window starts at a measured state, which carries noise, and at rotor speeds nobody may have measured. With free
 initial states these errors are unknowns too, as likely as the sensors' noise says; being many and each seen by its own
 window only, they are eliminated: with r the prediction errors at the measured start, whitened by the sensors' noise,
 and G their derivative by the start's errors in standard deviations, the covariance of r is I + G G^T, and r is whitened
-by its Cholesky factor (generalised least squares; the same estimate as fitting every start).
+by the inverse of its Cholesky factor (generalised least squares; the same estimate as fitting every start).
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
 from cfb_mjx.model.vector import Vec, multiply
 from cfb_mjx.parameters import Parameters
+from cfb_mjx.sysid.identification.result import Fit, summarise
+from cfb_mjx.sysid.identification.robust import tempered
+from cfb_mjx.sysid.identification.shooting_data import Batch, batches
+from cfb_mjx.sysid.identification.solver import least_squares
+from cfb_mjx.sysid.identification.uncertainty import assess
+from cfb_mjx.sysid.identification.unknowns import Unknowns, choose
 from cfb_mjx.sysid.prediction import predict_one
-from cfb_mjx.sysid.result import Fit, summarise
-from cfb_mjx.sysid.robust import tempered
-from cfb_mjx.sysid.shooting_data import Batch, batches
-from cfb_mjx.sysid.solver import least_squares
-from cfb_mjx.sysid.uncertainty import assess
-from cfb_mjx.sysid.unknowns import Unknowns, choose
 
 ROUNDS = 6
 SETTLED = 5e-4
@@ -56,7 +56,7 @@ def shoot(
     Args:
         logs: flights; run with x64 enabled.
         nominal: where to start, and the values of all that is not fitted.
-        parameters: names or groups (`cfb_mjx.sysid.unknowns.choose`). The observation delay, if asked for, is one for
+        parameters: names or groups (`unknowns.choose`). The observation delay, if asked for, is one for
             all logs and replaces what they say of it.
         use_measured: feed measured rotor speeds where a log has them, else commands.
         free_start: allow for errors of every window's initial state and rotor speeds; otherwise they are taken as
@@ -83,7 +83,9 @@ def shoot(
         vector = _solve(unknowns, vector, data, body, whiten, robust)
         if progress is not None:
             progress(done + 1, ROUNDS)
-        if done and float(jnp.max(jnp.abs(vector - before))) < SETTLED:
+        # With measured starts and a known delay there is nothing to repeat.
+        settled = done and float(jnp.max(jnp.abs(vector - before))) < SETTLED
+        if settled or not (free_start or delayed):
             break
     if progress is not None:
         progress(ROUNDS, ROUNDS)
@@ -95,11 +97,14 @@ def shoot(
     return summarise(unknowns, vector, uncertainty, "shooting", int(live.sum()))
 
 
-def _errors(parameters: Parameters, start: Float[Array, "w 16"], batch: Batch, body: Body) -> Float[Array, "w m"]:
+def _errors(
+    unknowns: Unknowns, vector: Array, start: Float[Array, "w 16"], batch: Batch, body: Body
+) -> Float[Array, "w m"]:
     """Prediction errors in standard deviations, with the starts moved by ``start`` standard deviations."""
+    parameters, delayed = unknowns.apply(vector), "observation_delay" in unknowns.names
     model = Quadrotor(parameters, body=body, integrator="rk4", rotor_loads="instant")
-    # What a row calls the pose at t is the pose at t + late.
-    late = batch.delay - parameters.observation_delay
+    # What a row calls the pose at t is the pose at t + late; the windows were cut with the logs' own delays.
+    late = batch.delay - parameters.observation_delay if delayed else 0.0
 
     def one(lead_step, lead_command, state, step, inputs, at, truth, noise, rotor_noise, move):
         speed = state.rotor_speed if batch.measured else _speed_after(parameters, lead_step, lead_command)
@@ -162,34 +167,37 @@ def _rotation(truth: Float[Array, "h 4"], found: Float[Array, "h 4"]) -> Float[A
 
 
 @eqx.filter_jit
-def _whitening(unknowns: Unknowns, vector, data: list[Batch], body: Body, free_start: bool) -> list[Array]:
-    """Lower Cholesky factor of the covariance of every window's errors."""
-    parameters = unknowns.apply(vector)
+def _start_slopes(unknowns: Unknowns, vector, data: list[Batch], body: Body) -> list[Float[Array, "w m 16"]]:
+    """Derivative of every window's errors by its own start."""
 
-    def factor(batch):
+    def slopes(batch):
         count = batch.step.shape[0]
-        if not free_start:
-            # Both ends of a window carry a row's noise.
-            return jnp.sqrt(2.0) * jnp.ones((count, 1, 1))
         # Every window's errors depend on its own start only: 16 directions serve all windows at once.
         directions = jnp.broadcast_to(jnp.eye(16)[:, None, :], (16, count, 16))
         zero = jnp.zeros((count, 16))
-        along = jax.vmap(lambda d: jax.jvp(lambda x: _errors(parameters, x, batch, body), (zero,), (d,))[1])
-        slope = jnp.moveaxis(along(directions), 0, -1)
-        return jnp.linalg.cholesky(jnp.eye(slope.shape[1]) + slope @ jnp.swapaxes(slope, 1, 2))
+        along = jax.vmap(lambda d: jax.jvp(lambda x: _errors(unknowns, vector, x, batch, body), (zero,), (d,))[1])
+        return jnp.moveaxis(along(directions), 0, -1)
 
-    return [factor(batch) for batch in data]
+    return [slopes(batch) for batch in data]
+
+
+def _whitening(unknowns: Unknowns, vector, data: list[Batch], body: Body, free_start: bool) -> list[Array]:
+    """What every window's errors are multiplied with to be white: (w, m, m), or (w, 1, 1) for a plain factor."""
+    if not free_start:
+        # Both ends of a window carry a row's noise.
+        return [jnp.full((len(batch.live), 1, 1), np.sqrt(0.5)) for batch in data]
+    slopes = (np.asarray(slope) for slope in _start_slopes(unknowns, vector, data, body))
+    # In NumPy: batched LAPACK calls inside a compiled program can starve XLA's thread pool of two, and hang.
+    factors = (np.linalg.cholesky(np.eye(g.shape[1]) + g @ np.swapaxes(g, 1, 2)) for g in slopes)
+    return [jnp.asarray(np.linalg.inv(factor)) for factor in factors]
 
 
 def _residual(vector, unknowns: Unknowns, data: list[Batch], body: Body, whiten: list[Array], robust: bool):
-    parameters = unknowns.apply(vector)
-
     def one(batch, factor):
-        errors = _errors(parameters, jnp.zeros((batch.step.shape[0], 16)), batch, body)
+        errors = _errors(unknowns, vector, jnp.zeros((batch.step.shape[0], 16)), batch, body)
         if factor.shape[-1] == 1:
-            return tempered(errors / factor[:, :, 0], robust)
-        solved = jax.scipy.linalg.solve_triangular(factor, errors[..., None], lower=True)[..., 0]
-        return tempered(solved, robust)
+            return tempered(errors * factor[:, :, 0], robust)
+        return tempered(jnp.einsum("wij,wj->wi", factor, errors), robust)
 
     return [one(batch, factor) for batch, factor in zip(data, whiten, strict=True)]
 

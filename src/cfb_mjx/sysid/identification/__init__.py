@@ -1,0 +1,7 @@
+"""Refitting the model to flights: parameters, noise, estimators, uncertainty."""
+
+from cfb_mjx.sysid.identification.fitting import default_parameters, fit
+from cfb_mjx.sysid.identification.result import Estimate, Fit
+from cfb_mjx.sysid.identification.shooting import shoot
+
+__all__ = ["Estimate", "Fit", "default_parameters", "fit", "shoot"]

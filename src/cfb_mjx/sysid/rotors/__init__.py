@@ -1,0 +1,1 @@
+"""Fitting the rotors on their own: motor dynamics, thrust and torque maps."""
