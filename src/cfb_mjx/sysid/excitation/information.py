@@ -1,7 +1,7 @@
 """How well a flight will tell the parameters, before it is flown.
 
-`cfb fit` maximises the likelihood of one-step innovations (`sysid.identification.innovation`). Its Fisher information is
-J^T J, with J the Jacobian of the whitened innovations at the true parameters, which in a simulated flight are known.
+`cfb fit` maximises the likelihood of one-step innovations (`sysid.identification.innovation`). Its Fisher information
+is J^T J, with J the Jacobian of the whitened innovations at the true parameters, which in a simulated flight are known.
 """
 
 from __future__ import annotations

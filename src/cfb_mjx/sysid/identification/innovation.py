@@ -30,7 +30,7 @@ from cfb_mjx.sysid.identification.filters import (
 )
 from cfb_mjx.sysid.identification.flight_data import Segments
 from cfb_mjx.sysid.identification.noise import Noise
-from cfb_mjx.sysid.identification.robust import tempered
+from cfb_mjx.sysid.identification.robust import surprise
 
 CHANNELS = ("rate_x", "rate_y", "rate_z", "specific_force_z", "rotor_1", "rotor_2", "rotor_3", "rotor_4")
 
@@ -122,4 +122,4 @@ def negative_log_likelihood(parameters, noise, segments, driven: Drive, robust: 
     """Of all innovations, per row, without the constant."""
     error, variance = innovations(parameters, noise, segments, driven, robust)
     rows = jnp.maximum(jnp.sum(segments.valid), 1.0)
-    return 0.5 * jnp.sum(jnp.log(variance) + tempered(error / jnp.sqrt(variance), robust) ** 2) / rows
+    return 0.5 * jnp.sum(jnp.log(variance) + surprise(error / jnp.sqrt(variance), robust)) / rows

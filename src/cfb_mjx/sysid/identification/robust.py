@@ -25,3 +25,20 @@ def tempered(whitened: Array, robust: bool) -> Array:
     # The inner maximum keeps the gradient of the branch not taken finite.
     outside = jnp.sqrt(2 * OUTLIER * jnp.maximum(size, OUTLIER) - OUTLIER**2)
     return jnp.where(size <= OUTLIER, whitened, jnp.sign(whitened) * outside)
+
+
+SHARE, SPREAD = 0.01, 50.0
+"""Outliers as noise levels are found: this share of the readings, with so many times the noise of the others."""
+
+
+def surprise(whitened: Array, robust: bool) -> Array:
+    """Minus twice the log-density of residuals in standard deviations, without the constant.
+
+    With ``robust``, of a mixture of good readings and outliers: a scale found with Huber's loss would still grow with
+    the size of the outliers.
+    """
+    if not robust:
+        return whitened**2
+    good = jnp.log(1 - SHARE) - 0.5 * whitened**2
+    bad = jnp.log(SHARE / SPREAD) - 0.5 * (whitened / SPREAD) ** 2
+    return -2 * jnp.logaddexp(good, bad)
