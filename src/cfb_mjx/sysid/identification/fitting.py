@@ -102,12 +102,17 @@ def fit(
             break
     if progress is not None:
         progress(ROUNDS, ROUNDS)
-    residual, jacobian = (np.asarray(x) for x in _linearise(unknowns, vector, noise, segments, use_measured, robust))
+    linear = _linearise(unknowns, vector, noise, segments, use_measured, robust)
+    return _finish(unknowns, vector, noise, segments, *linear, data.rows)
+
+
+def _finish(unknowns: Unknowns, vector, noise: Noise, segments: Segments, residual, jacobian, rows: int) -> Fit:
+    residual, jacobian = np.asarray(residual), np.asarray(jacobian)
     slope = np.linalg.inv(unknowns.slope(vector))
     uncertainty = assess(*_blocks(segments, residual, jacobian @ slope), unknowns.names)
     whiteness = dict(zip(CHANNELS, map(float, _lag_one(residual)), strict=True))
     more = {"noise": noise, "whiteness": whiteness, "feedback": detect(segments, residual)}
-    return summarise(unknowns, vector, uncertainty, "innovation", data.rows, **more)
+    return summarise(unknowns, vector, uncertainty, "innovation", rows, **more)
 
 
 def _differs(result: Fit, name: str) -> bool:
@@ -126,7 +131,7 @@ def _fit_noise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use
 
     # BFGS may stop short where a level does not matter; the rounds that follow go on from there.
     solver = optx.BFGS(rtol=1e-5, atol=1e-6)
-    found = optx.minimise(loss, solver, noise.to_vector(), max_steps=60, throw=False)
+    found = optx.minimise(loss, solver, noise.to_vector(), max_steps=40, throw=False)
     return Noise.from_vector(found.value)
 
 
