@@ -12,7 +12,7 @@ KEYS = ("windows", "commands_in", "rotor_speed_in", "hold", "logs")
 def test_help_names_every_command_and_loads_nothing_heavy(cfb):
     done = cfb("--help")
     assert done.returncode == 0
-    for name in ("import", "evaluate", "bench", "demo"):
+    for name in ("import", "evaluate", "fit", "fit-rotors", "excite", "bench", "demo"):
         assert name in done.stdout
     heavy = "{'jax', 'mujoco', 'tyro', 'numpy'}"
     code = f"import sys, cfb_mjx.cli as c; c.main(['--help']); print(sorted({heavy} & set(sys.modules)))"
@@ -24,7 +24,7 @@ def test_import_of_the_package_loads_nothing_heavy():
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "[]\n"
 
 
-@pytest.mark.parametrize("name", ["import", "evaluate", "bench", "demo"])
+@pytest.mark.parametrize("name", ["import", "evaluate", "fit", "fit-rotors", "excite", "bench", "demo"])
 def test_every_command_explains_itself(cfb, name):
     done = cfb(name, "--help")
     assert done.returncode == 0
