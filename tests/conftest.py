@@ -8,13 +8,8 @@ import os
 # the compilation cache. Has to be set before jax is imported.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
-from cfb_mjx.cli.runtime import share_cpu_kernels
-
-# As the commands run: must be set before jaxlib loads, too.
-share_cpu_kernels()
-
-import jax  # noqa: E402
-from jaxtyping import install_import_hook  # noqa: E402
+import jax
+from jaxtyping import install_import_hook
 
 # Float64 so that tests can tell a wrong term from rounding; model/test_rollout.py covers float32.
 jax.config.update("jax_enable_x64", True)

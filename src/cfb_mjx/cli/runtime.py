@@ -12,7 +12,8 @@ from pathlib import Path
 XLA_CPU_FLAGS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
 """On CPU a time step then becomes a few kernels that share what they compute, instead of some thirty that repeat it:
 up to 4 times faster; nothing changes elsewhere. XLA reads it when jaxlib loads, so the commands set it for themselves;
-scripts put it into XLA_FLAGS (docs/model.md)."""
+scripts put it into XLA_FLAGS (docs/model.md). Not for derivatives of the MJX body: jaxlib 0.10.1 aborts while compiling
+some of them with it."""
 
 
 def configure_jax(x64: bool) -> None:
