@@ -51,6 +51,7 @@ def problem():
         disturbance=jnp.full(3, 4.0),
         correlation_time=jnp.asarray(0.3),
         accelerometer=jnp.asarray(0.1),
+        accelerometer_lag=jnp.asarray(1e-3),
         force_disturbance=jnp.asarray(0.5),
         rotor=jnp.asarray(3.0),
         rotor_walk=jnp.asarray(30.0),
