@@ -8,7 +8,7 @@ import signal
 import sys
 
 from cfb_mjx import __version__
-from cfb_mjx.cli.runtime import share_cpu_kernels
+from cfb_mjx.cli.runtime import set_up_xla
 from cfb_mjx.errors import CfbError
 
 SUMMARY = {
@@ -29,10 +29,7 @@ def main(arguments: list[str] | None = None) -> int:
     # Ctrl-C must reach Python even where the caller's shell started us with it ignored (scripts, make -j).
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and sys.stdin is not None and sys.stdin.isatty():
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    # Programs from the compile cache make XLA log an error about tuning hints it takes for processor features; real
-    # errors reach Python as exceptions. Set here, for this process only, because jaxlib reads it when it loads.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    share_cpu_kernels()
+    set_up_xla()
     try:
         status = _dispatch(sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()

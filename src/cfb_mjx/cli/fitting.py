@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from dataclasses import replace
 from datetime import date
-from hashlib import sha256
 from pathlib import Path
 
-from cfb_mjx import __version__
 from cfb_mjx.cli.evaluating import changed_model
+from cfb_mjx.cli.fitted_model import provenance, require_model_path
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json
@@ -40,8 +37,7 @@ def run_fit(
         CfbError: bad logs, parameters or outputs.
     """
     require_folder(output, json, figure)
-    if output.suffix not in (".yaml", ".yml"):
-        raise CfbError(f"{output}: the output is a model and must end in .yaml.")
+    require_model_path(output)
     logs = [read_log(path) for path in paths]
     judged = [read_log(path) for path in held_out] or [_last(log) for log in logs]
     fitted = logs if held_out else [_first(log) for log in logs]
@@ -52,12 +48,13 @@ def run_fit(
     from cfb_mjx.sysid.identification.fitting import fit
 
     base = changed_model(model, changes)
+    kept = [path.name for path in held_out] or f"last {HELD_OUT_SHARE:.0%} of each log"
     result = fit(fitted, base.parameters(), parameters, not commands_only, robust, estimator, Progress("fitting"))
     corrected = replace(
         result.model_file(base, f"cfb fit on {len(paths)} log(s), {date.today().isoformat()}"),
         name=output.stem,
         description=f"{base.name} refitted to {', '.join(log.name for log in logs)}",
-        provenance=_provenance(paths, held_out, base.name),
+        provenance=provenance("fit", base.name, "fit_logs_sha256", paths, held_out=kept),
     )
     other = _other(result, fitted, base, not commands_only, robust) if compare else None
     before = evaluate(Quadrotor.from_file(base), judged)
@@ -92,18 +89,6 @@ def _other(result, logs, base, use_measured, robust):
         return fit(logs, base.parameters(), result.names, use_measured, robust, other, Progress(f"fitting ({other})"))
     except CfbError:
         return None
-
-
-def _provenance(paths: list[Path], held_out: list[Path], base: str) -> dict:
-    hashes = {path.name: sha256(path.read_bytes()).hexdigest() for path in paths}
-    return {
-        "command": shlex.join(["cfb", "fit", *(Path(a).name if "/" in a else a for a in sys.argv[2:])]),
-        "base_model": base,
-        "fit_logs_sha256": hashes,
-        "held_out": [path.name for path in held_out] or f"last {HELD_OUT_SHARE:.0%} of each log",
-        "cfb_mjx": __version__,
-        "environment": environment(),
-    }
 
 
 _NAMES = {"innovation": "innovations", "shooting": "multiple shooting"}

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from dataclasses import replace
 from datetime import date
-from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cfb_mjx import __version__
 from cfb_mjx.cli.evaluating import changed_model
+from cfb_mjx.cli.fitted_model import provenance, require_model_path
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, require_folder, write_json
@@ -50,8 +47,7 @@ def run_fit_rotors(
         CfbError: bad files, nothing that can be fitted, or outputs that cannot be written.
     """
     require_folder(output, json, figure)
-    if output.suffix not in (".yaml", ".yml"):
-        raise CfbError(f"{output}: the output is a model and must end in .yaml.")
+    require_model_path(output)
     if figure is not None:
         from cfb_mjx.view.style import check_path
 
@@ -159,15 +155,9 @@ def _corrected(base: ModelFile, motors, maps, output: Path, paths: list[Path]) -
             scale[motor - 1], std[motor - 1] = value, deviation
         if len(fitted.motors) or np.any(base.entries[f"{name}_scale"].value != 1):
             put(f"{name}_scale", scale, std if len(fitted.motors) else None)
-    provenance = {
-        "command": shlex.join(["cfb", "fit-rotors", *(Path(a).name if "/" in a else a for a in sys.argv[2:])]),
-        "base_model": base.name,
-        "files_sha256": {path.name: sha256(path.read_bytes()).hexdigest() for path in paths},
-        "cfb_mjx": __version__,
-        "environment": environment(),
-    }
+    origin = provenance("fit-rotors", base.name, "files_sha256", paths)
     description = f"{base.name} with rotors fitted to {', '.join(path.name for path in paths)}"
-    return replace(base, entries=entries, name=output.stem, description=description, provenance=provenance), written
+    return replace(base, entries=entries, name=output.stem, description=description, provenance=origin), written
 
 
 def _coefficients(maps: dict[str, MapFit], base: ModelFile) -> dict[str, dict]:

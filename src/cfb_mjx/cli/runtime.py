@@ -22,10 +22,7 @@ def configure_jax(x64: bool) -> None:
     The cache lies in the user's cache folder (``XDG_CACHE_HOME`` is honoured); ``JAX_COMPILATION_CACHE_DIR`` overrides
     it. Where jax has not been loaded yet, XLA's CPU kernels are told to share results (`XLA_CPU_FLAGS`).
     """
-    if "jaxlib" not in sys.modules:
-        share_cpu_kernels()
-        # Programs from the compile cache make XLA log an error about tuning hints it takes for processor features.
-        os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+    set_up_xla()
     import jax
 
     jax.config.update("jax_enable_x64", x64)
@@ -41,8 +38,14 @@ def configure_jax(x64: bool) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 
-def share_cpu_kernels() -> None:
-    """Put `XLA_CPU_FLAGS` into ``XLA_FLAGS`` unless it speaks of extra options already; read when jaxlib loads."""
+def set_up_xla() -> None:
+    """Set for this process what jaxlib reads when it loads; afterwards it changes nothing.
+
+    `XLA_CPU_FLAGS` go into ``XLA_FLAGS`` unless that speaks of extra options already.
+    """
+    # Programs from the compile cache make XLA log an error about tuning hints it takes for processor features; real
+    # errors reach Python as exceptions.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if "xla_backend_extra_options" not in os.environ.get("XLA_FLAGS", ""):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {XLA_CPU_FLAGS}".strip()
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.logs.gaps import longest_step, stretches
 from cfb_mjx.logs.tabular import Table, read_table, require_numbers
 
 STEP_LAYOUT = "t (s), u or u1..u4 (0 to 1), omega or omega1..omega4 (rad/s)"
@@ -39,9 +39,7 @@ class MotorRecord:
 
     def segments(self) -> list[slice]:
         """Stretches of rows without a gap (a gap is longer than three nominal intervals + 0.5 ms)."""
-        steps = np.diff(self.time)
-        gaps = np.flatnonzero(steps > 3 * np.median(steps) + 0.5e-3) + 1
-        return [slice(a, b) for a, b in itertools.pairwise([0, *gaps.tolist(), len(self.time)])]
+        return stretches(self.time, longest_step(np.median(np.diff(self.time))))
 
 
 @dataclass(frozen=True)

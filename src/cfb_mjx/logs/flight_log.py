@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import math
 from collections.abc import Mapping
@@ -11,6 +10,8 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+
+from cfb_mjx.logs.gaps import longest_step, stretches
 
 REQUIRED = ("time", "position", "velocity", "quaternion", "body_rate", "specific_force", "command")
 OPTIONAL = ("rotor_speed", "battery_voltage")
@@ -101,7 +102,7 @@ class FlightLog:
     @property
     def gap_threshold(self) -> float:
         """Two rows further apart than this, s, have a gap between them (three nominal intervals + 0.5 ms)."""
-        return 3.0 * self.nominal_interval + 0.5e-3
+        return longest_step(self.nominal_interval)
 
     def gaps(self) -> np.ndarray:
         """Indices ``i`` of the rows after which a gap begins: ``time[i + 1] - time[i] > gap_threshold``."""
@@ -109,8 +110,7 @@ class FlightLog:
 
     def segments(self) -> list[slice]:
         """The contiguous stretches between gaps, in order, as slices of rows."""
-        edges = [0, *(self.gaps() + 1).tolist(), len(self.time)]
-        return [slice(a, b) for a, b in itertools.pairwise(edges) if b > a]
+        return stretches(self.time, self.gap_threshold)
 
     def slice(self, start: float, stop: float) -> FlightLog:
         """The rows with ``start <= time <= stop`` (s). Times keep their values."""

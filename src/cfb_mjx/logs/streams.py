@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.logs.gaps import longest_step
 
 RADIO_WRAP_MS = 1 << 24  # a log packet carries its time stamp in three bytes of milliseconds: it wraps after 4.7 h
 
@@ -39,7 +40,7 @@ class Stream:
     @property
     def gap_threshold(self) -> float:
         """Two samples further apart than this, s, have a gap between them (as in `FlightLog`)."""
-        return 3.0 * self.interval + 0.5e-3
+        return longest_step(self.interval)
 
 
 def unwrap(ticks: np.ndarray, modulus: int) -> tuple[np.ndarray, int]:

@@ -41,7 +41,7 @@ class _Prepared(eqx.Module):
     data: mjx.Data
     mass_diagonal: Float[Array, "6"]
     """Diagonal of the joint-space inertia. For one free body in its centre-of-gravity frame that matrix is diagonal
-    and the same in every state, so it is computed and inverted once instead of at every step."""
+    and the same in every state, so it is computed once instead of at every step."""
 
 
 class MjxBody:

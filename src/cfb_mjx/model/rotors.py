@@ -20,6 +20,8 @@ YAW_SIGNS = (-1.0, 1.0, -1.0, 1.0)
 POSITION_SIGNS_X = (1.0, -1.0, -1.0, 1.0)
 POSITION_SIGNS_Y = (-1.0, -1.0, 1.0, 1.0)
 """Rotor positions in units of l/2: front-right, back-right, back-left, front-left."""
+TORQUE_SIGNS = (POSITION_SIGNS_Y, tuple(-x for x in POSITION_SIGNS_X), YAW_SIGNS)
+"""Sign of the torque about +x, +y and +z when a rotor turns faster (paper eqs. 6-7), one row per axis."""
 
 
 class RotorLoads(eqx.Module):

@@ -154,6 +154,6 @@ def _measured_rotor_speed(log: FlightLog, instants: np.ndarray) -> np.ndarray:
         out[..., motor] = np.interp(instants, time, speed)
         after = np.clip(np.searchsorted(time, instants), 1, len(time) - 1)
         outside = (instants < time[0]) | (instants > time[-1])
-        far = time[after] - time[after - 1] > 3 * log.nominal_interval + 0.5e-3
+        far = time[after] - time[after - 1] > log.gap_threshold
         out[..., motor][outside | far] = np.nan
     return out

@@ -37,7 +37,7 @@ from cfb_mjx.sysid.excitation.manoeuvres import (
     stepped,
     worst,
 )
-from cfb_mjx.sysid.identification.innovation import Noise
+from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.unknowns import Unknowns
 
 KNOT = 0.02

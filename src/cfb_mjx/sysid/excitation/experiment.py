@@ -23,7 +23,7 @@ from cfb_mjx.model.rotors import prepare as prepare_rotors
 from cfb_mjx.model.state import State
 from cfb_mjx.model.vector import Vec, rotate_inverse
 from cfb_mjx.sysid.excitation.conditions import Conditions
-from cfb_mjx.sysid.excitation.manoeuvres import STEP
+from cfb_mjx.sysid.excitation.manoeuvres import STEP, stepped
 
 TICK = 0.002
 SETTLE, BRAKING, CATCH, RETURN = 1.0, 1.2, 2.0, 2.5
@@ -88,7 +88,7 @@ def fly(
         seed: of noise and disturbances.
         name: of the log.
     """
-    model = replace_choices(model)
+    model = stepped(model, dt=TICK)
     hold = round(STEP / TICK)
     open_loop = np.repeat(np.asarray(sequence, dtype=float), hold, axis=0)
     settle, brake, catch, back = (round(t / TICK) for t in (SETTLE, BRAKING, CATCH, RETURN))
@@ -119,11 +119,6 @@ def fly(
 
 OPEN, HANDOVER, BRAKE, BACK = 1, 2, 3, 4
 """Phases of a flight besides 0, holding a position."""
-
-
-def replace_choices(model: Quadrotor) -> Quadrotor:
-    """The model stepped every `TICK` with RK4, which follows commands that jump."""
-    return Quadrotor(model.parameters, model.effects, model.body, dt=TICK, integrator="rk4")
 
 
 class _Push(Effect):

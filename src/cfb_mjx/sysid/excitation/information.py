@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
 from cfb_mjx.errors import CfbError
@@ -21,14 +20,14 @@ from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import thrust
 from cfb_mjx.model.state import State
 from cfb_mjx.sysid.excitation.manoeuvres import STEP
+from cfb_mjx.sysid.identification.fitting import fit_noise, fit_slopes, in_blocks
 from cfb_mjx.sysid.identification.flight_data import Segments, prepare
-from cfb_mjx.sysid.identification.innovation import Noise, drive, innovations
+from cfb_mjx.sysid.identification.innovation import whitened
+from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.uncertainty import LOOSEST, Uncertainty, assess
 from cfb_mjx.sysid.identification.unknowns import UNITS, Unknowns
 
-_ROUNDS = 2
-BLOCK = 128
-"""Rows the bootstrap keeps together, as in the fit: half a second at 250 Hz."""
+_ROUNDS = 3
 _HOVER_ROWS = 50
 """Hover before the manoeuvre in `window_information`: by then the filter knows the disturbance as well as it can."""
 
@@ -67,7 +66,7 @@ class Linearised(eqx.Module):
     """The fit's residuals about the true parameters."""
 
     residual: Float[np.ndarray, "blocks rows 8"]
-    """Whitened innovations at the truth, in blocks of `BLOCK` rows."""
+    """Whitened innovations at the truth, in the fit's blocks of rows."""
     jacobian: Float[np.ndarray, "blocks rows 8 k"]
     """Their derivatives by relative changes of the quantities (offsets: in their units)."""
     noise: Noise
@@ -90,11 +89,10 @@ def linearise(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = Tr
     segments = jax.tree.map(jnp.asarray, data.segments)
     noise = Noise.first(data)
     for _ in range(_ROUNDS):
-        noise = _levels(unknowns, noise, segments, use_measured)
-    residual, jacobian = (np.asarray(x) for x in _linearise(unknowns, noise, segments, use_measured))
-    counts = np.asarray(segments.valid * (1 - segments.warm_up))[:, 1:]
-    jacobian = jacobian @ per_relative_change(unknowns)
-    return Linearised(_blocks(residual, counts), _blocks(jacobian, counts), noise)
+        noise = fit_noise(unknowns, unknowns.start, noise, segments, use_measured, False)
+    residual, jacobian = fit_slopes(unknowns, unknowns.start, noise, segments, use_measured, False)
+    jacobian = np.asarray(jacobian) @ per_relative_change(unknowns)
+    return Linearised(*in_blocks(segments, np.asarray(residual), jacobian), noise)
 
 
 def predict(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = True) -> Prediction:
@@ -117,39 +115,6 @@ def typical(predictions: list[Prediction]) -> Prediction:
         return len(prediction.unidentifiable), float(np.log(prediction.uncertainty.std).sum())
 
     return sorted(predictions, key=unsure)[len(predictions) // 2]
-
-
-def _blocks(values: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """(s, n, ...) cut into blocks of `BLOCK` consecutive rows, without those in which nothing counts."""
-    more = -values.shape[1] % BLOCK
-    padded = np.pad(values, [(0, 0), (0, more)] + [(0, 0)] * (values.ndim - 2)).reshape(-1, BLOCK, *values.shape[2:])
-    return padded[np.pad(counts, [(0, 0), (0, more)]).reshape(-1, BLOCK).any(axis=1)]
-
-
-@eqx.filter_jit
-def _levels(unknowns: Unknowns, noise: Noise, segments: Segments, use_measured: bool) -> Noise:
-    driven = drive(unknowns.nominal, noise, segments, use_measured)
-
-    def loss(x, _):
-        error, variance = innovations(unknowns.nominal, Noise.from_vector(x), segments, driven)
-        return 0.5 * jnp.sum(jnp.log(variance) + error**2 / variance) / jnp.sum(segments.valid)
-
-    solver = optx.BFGS(rtol=1e-5, atol=1e-6)
-    return Noise.from_vector(optx.minimise(loss, solver, noise.to_vector(), max_steps=60, throw=False).value)
-
-
-@eqx.filter_jit
-def _linearise(unknowns: Unknowns, noise: Noise, segments: Segments, use_measured: bool):
-    def residual(x):
-        return whitened(unknowns.apply(x), noise, segments, use_measured)
-
-    return residual(unknowns.start), jax.jacfwd(residual)(unknowns.start)
-
-
-def whitened(parameters, noise: Noise, segments: Segments, use_measured: bool) -> Float[Array, "s n 8"]:
-    """Innovations over their standard deviations, which as weights are not differentiated (as in the fit)."""
-    error, variance = innovations(parameters, noise, segments, drive(parameters, noise, segments, use_measured))
-    return error / jnp.sqrt(jax.lax.stop_gradient(variance))
 
 
 def window_information(

@@ -13,15 +13,13 @@ from jaxtyping import Array, Float
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rollout import rollout
-from cfb_mjx.model.rotors import YAW_SIGNS
+from cfb_mjx.model.rotors import TORQUE_SIGNS
 from cfb_mjx.model.state import State
 from cfb_mjx.model.vector import Vec, up_axis
 
 STEP = 0.004
 """Time each row of a sequence is held, s."""
-_ROLL, _PITCH = np.array([-1.0, -1.0, 1.0, 1.0]), np.array([-1.0, 1.0, 1.0, -1.0])
-_YAW = np.array(YAW_SIGNS)
-"""Commands that turn about +x, +y and +z (paper eqs. 6-7), M1..M4."""
+_ROLL, _PITCH, _YAW = np.array(TORQUE_SIGNS)
 _THERE_AND_BACK = np.array([1.0, -1.0, -1.0, 1.0])
 """Quarters of a doublet pair: rate and angle are both near zero after it."""
 MARGIN = 0.75
@@ -99,8 +97,8 @@ def demand(path: State) -> Demand:
 
 
 def stepped(model: Quadrotor, **choices) -> Quadrotor:
-    """The model with one step per row of a sequence; RK4, which follows commands that jump, unless told otherwise."""
-    return Quadrotor(model.parameters, model.effects, model.body, dt=STEP, **({"integrator": "rk4"} | choices))
+    """The model with one step per row of a sequence; RK4, which follows commands that jump; unless told otherwise."""
+    return Quadrotor(model.parameters, model.effects, model.body, **({"dt": STEP, "integrator": "rk4"} | choices))
 
 
 def rows(duration: float) -> int:

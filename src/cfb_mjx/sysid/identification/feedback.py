@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cfb_mjx.model.rotors import POSITION_SIGNS_X, POSITION_SIGNS_Y, YAW_SIGNS
+from cfb_mjx.model.rotors import TORQUE_SIGNS
 from cfb_mjx.sysid.identification.flight_data import Segments
 
 LAGS = 5
@@ -38,7 +38,7 @@ def detect(segments: Segments, residual: np.ndarray) -> Feedback:
         segments: flight data.
         residual: (s, n - 1, 8) whitened innovations, zero where a row does not count.
     """
-    mix = np.stack([POSITION_SIGNS_Y, -np.asarray(POSITION_SIGNS_X), YAW_SIGNS])
+    mix = np.asarray(TORQUE_SIGNS)
     counts = np.asarray(segments.valid * (1 - segments.warm_up))[:, 1:]
     change = np.diff(np.asarray(segments.command) @ mix.T, axis=1)  # into each row, from the one before
     length, best = change.shape[1], 0.0

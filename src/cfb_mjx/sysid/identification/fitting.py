@@ -17,7 +17,7 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.identification.feedback import detect
 from cfb_mjx.sysid.identification.flight_data import Segments, prepare
-from cfb_mjx.sysid.identification.innovation import CHANNELS, drive, innovations, negative_log_likelihood
+from cfb_mjx.sysid.identification.innovation import CHANNELS, drive, negative_log_likelihood, whitened
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.result import Fit, summarise
 from cfb_mjx.sysid.identification.robust import tempered
@@ -94,7 +94,7 @@ def fit(
     vector, noise = unknowns.start, Noise.first(data)
     for done in range(ROUNDS):
         before = vector
-        noise = _fit_noise(unknowns, vector, noise, segments, use_measured, robust)
+        noise = fit_noise(unknowns, vector, noise, segments, use_measured, robust)
         vector = _fit_vector(unknowns, vector, noise, segments, use_measured, robust)
         if progress is not None:
             progress(done + 1, ROUNDS)
@@ -102,14 +102,14 @@ def fit(
             break
     if progress is not None:
         progress(ROUNDS, ROUNDS)
-    linear = _linearise(unknowns, vector, noise, segments, use_measured, robust)
+    linear = fit_slopes(unknowns, vector, noise, segments, use_measured, robust)
     return _finish(unknowns, vector, noise, segments, *linear, data.rows)
 
 
 def _finish(unknowns: Unknowns, vector, noise: Noise, segments: Segments, residual, jacobian, rows: int) -> Fit:
     residual, jacobian = np.asarray(residual), np.asarray(jacobian)
     slope = np.linalg.inv(unknowns.slope(vector))
-    uncertainty = assess(*_blocks(segments, residual, jacobian @ slope), unknowns.names)
+    uncertainty = assess(*in_blocks(segments, residual, jacobian @ slope), unknowns.names)
     whiteness = dict(zip(CHANNELS, map(float, _lag_one(residual)), strict=True))
     more = {"noise": noise, "whiteness": whiteness, "feedback": detect(segments, residual)}
     return summarise(unknowns, vector, uncertainty, "innovation", rows, **more)
@@ -121,7 +121,8 @@ def _differs(result: Fit, name: str) -> bool:
 
 
 @eqx.filter_jit
-def _fit_noise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool) -> Noise:
+def fit_noise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool) -> Noise:
+    """Noise levels of largest likelihood at ``vector``, from ``noise`` on; at most some forty steps."""
     parameters = unknowns.apply(vector)
     # The smoothed rotor speeds stay those of the last round's noise: the rotors' own readings say how noisy they are.
     driven = drive(parameters, noise, segments, use_measured, robust)
@@ -136,11 +137,7 @@ def _fit_noise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use
 
 
 def _residual(vector, unknowns: Unknowns, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
-    parameters = unknowns.apply(vector)
-    driven = drive(parameters, noise, segments, use_measured, robust)
-    error, variance = innovations(parameters, noise, segments, driven, robust)
-    # The variance follows the parameters a little (the motors' lag); as a weight it must not be fitted.
-    return tempered(error / jnp.sqrt(jax.lax.stop_gradient(variance)), robust)
+    return tempered(whitened(unknowns.apply(vector), noise, segments, use_measured, robust), robust)
 
 
 @eqx.filter_jit
@@ -152,14 +149,15 @@ def _fit_vector(unknowns: Unknowns, vector, noise: Noise, segments: Segments, us
 
 
 @eqx.filter_jit
-def _linearise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
+def fit_slopes(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
+    """Residuals (s, n, 8) of the fit at ``vector``, and their derivatives (s, n, 8, k) by it."""
     residual = partial(
         _residual, unknowns=unknowns, noise=noise, segments=segments, use_measured=use_measured, robust=robust
     )
     return residual(vector), jax.jacfwd(residual)(vector)
 
 
-def _blocks(segments: Segments, residual: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def in_blocks(segments: Segments, residual: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Residuals and Jacobians cut into blocks of `BLOCK` rows, without those in which nothing counts."""
     counts = np.asarray(segments.valid * (1 - segments.warm_up))[:, 1:].reshape(-1, BLOCK).any(axis=1)
     channels, k = jacobian.shape[-2:]

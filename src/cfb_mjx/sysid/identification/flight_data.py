@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -66,9 +65,8 @@ def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
     pieces, owners = [], []
     for index, log in enumerate(logs):
         lead = min(max(2, round(warm_up / log.nominal_interval)), ROWS_PER_SEGMENT // 2)
-        edges = np.concatenate([[0], log.gaps() + 1, [len(log.time)]]).astype(int)
-        for begin, end in itertools.pairwise(edges):
-            first = begin
+        for stretch in log.segments():
+            first, end = stretch.start, stretch.stop
             while end - first > lead + 16:
                 last = min(first + ROWS_PER_SEGMENT, end)
                 pieces.append((log, first, last, lead))

@@ -118,6 +118,16 @@ def _loads(parameters, dt, start, end, command, measured):
     return torque.stack(), jnp.sum(rotors.thrust(parameters, end))
 
 
+def whitened(
+    parameters: Parameters, noise: Noise, segments: Segments, use_measured: bool = True, robust: bool = False
+) -> Float[Array, "s n 8"]:
+    """Innovations over their standard deviations, which as weights are not differentiated."""
+    driven = drive(parameters, noise, segments, use_measured, robust)
+    error, variance = innovations(parameters, noise, segments, driven, robust)
+    # The variance follows the parameters a little (the motors' lag); as a weight it must not be fitted.
+    return error / jnp.sqrt(jax.lax.stop_gradient(variance))
+
+
 def negative_log_likelihood(parameters, noise, segments, driven: Drive, robust: bool = False) -> Float[Array, ""]:
     """Of all innovations, per row, without the constant."""
     error, variance = innovations(parameters, noise, segments, driven, robust)

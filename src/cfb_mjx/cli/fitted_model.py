@@ -1,0 +1,34 @@
+"""What every command that writes a fitted model does alike: where it may go, and what it says of its origin."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from hashlib import sha256
+from pathlib import Path
+
+from cfb_mjx import __version__
+from cfb_mjx.cli.runtime import environment
+from cfb_mjx.errors import CfbError
+
+
+def require_model_path(output: Path) -> None:
+    """Refuse an output that no command would read back as a model.
+
+    Raises:
+        CfbError: it does not end in .yaml.
+    """
+    if output.suffix not in (".yaml", ".yml"):
+        raise CfbError(f"{output}: the output is a model and must end in .yaml.")
+
+
+def provenance(command: str, base: str, hashes_name: str, paths: list[Path], **more) -> dict:
+    """Command line without folders, model started from, hashes of the fitted files, versions; and ``more``."""
+    return {
+        "command": shlex.join(["cfb", command, *(Path(a).name if "/" in a else a for a in sys.argv[2:])]),
+        "base_model": base,
+        hashes_name: {path.name: sha256(path.read_bytes()).hexdigest() for path in paths},
+        **more,
+        "cfb_mjx": __version__,
+        "environment": environment(),
+    }
