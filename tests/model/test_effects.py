@@ -1,6 +1,9 @@
-"""The effect interface and parasitic drag: neutral vanishes, closed forms hold, mappings survive a round trip."""
+"""What holds for every effect: neutral vanishes, derivatives exist, batches and steps agree, mappings survive."""
 
 from __future__ import annotations
+
+import dataclasses
+import functools
 
 import helpers
 import jax
@@ -9,34 +12,204 @@ import numpy as np
 import pytest
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.model import CATALOGUE, Effect, ParasiticDrag, Quadrotor
-from cfb_mjx.model.effects import effect_from_mapping, effect_to_mapping
+from cfb_mjx.model import CATALOGUE, Effect, ParasiticDrag, Quadrotor, State, begin, rollout, step
+from cfb_mjx.model.effects import Reading, effect_from_mapping, effect_to_mapping
+from cfb_mjx.model.vector import Vec
+
+STEP = 1e-5
+"""Of the difference quotients, as a share of the prior's width."""
+INSIDE = (0.7, 0.4, 0.6, 0.8)
+"""Shares of the prior at which effects are strong, component by component."""
+# They share what one worker compiled.
+ONE_WORKER = pytest.mark.xdist_group("effects")
 
 
 def _one(model):
     return jax.tree.map(lambda x: x[None], model)
 
 
+def _at(name: str, place: tuple[float, ...]) -> Effect:
+    """The effect with every field at these shares of its prior, components in turn."""
+    kind = CATALOGUE[name]
+    values = {}
+    for key, (low, high) in kind.prior.items():
+        shape = getattr(kind.neutral(), key).shape
+        values[key] = low + (high - low) * np.resize(place, shape)
+    return kind(**values)
+
+
+def _direction(name: str) -> Effect:
+    """Over every prior's width, components unlike each other."""
+    return jax.tree.map(lambda b, a: b - a, _at(name, (1.0, 0.4, 0.8, 0.6)), _at(name, (0.0,)))
+
+
+def _moved(effect: Effect, by: Effect, share: float) -> Effect:
+    return jax.tree.map(lambda x, d: x + share * d, effect, by)
+
+
 @pytest.mark.parametrize("name", sorted(CATALOGUE))
 def test_every_effect_describes_itself(name):
     kind = CATALOGUE[name]
     neutral = kind.neutral()
-    fields = set(vars(neutral))
+    fields = {field.name for field in dataclasses.fields(neutral)}
     assert kind.name == name
     assert set(kind.units) == fields == set(kind.prior)
     assert kind.source
     assert all(low < high for low, high in kind.prior.values())
     assert isinstance(neutral, Effect)
+    assert kind.strengths
+    assert set(kind.strengths) <= fields
+    for strength in kind.strengths:
+        np.testing.assert_array_equal(getattr(neutral, strength), 0)
+        assert kind.prior[strength][0] <= 0 <= kind.prior[strength][1]
+    assert kind.probes
+    for probe in kind.probes:
+        assert set(probe) <= fields - set(kind.strengths)
+        assert all(kind.prior[key][0] <= value <= kind.prior[key][1] for key, value in probe.items())
 
 
-@pytest.mark.parametrize("name", sorted(CATALOGUE))
-@pytest.mark.parametrize("integrator", ["euler", "rk4"])
-def test_neutral_effects_change_nothing(name, integrator, guards, fly_fleet):
+def _sensed(model: Quadrotor, state: State) -> State:
+    """The state once a log has told a voltage and a time: only then do some effects show."""
+    memory = [jax.tree.map(Vec.unstack, memory) for memory in begin(model, state).memory]
+    reading = Reading(voltage=jnp.asarray(3.9, jnp.result_type(float)), time=jnp.asarray(6.0, jnp.result_type(float)))
+    memory = [effect.sense(each, reading) for effect, each in zip(model.effects, memory, strict=True)]
+    memory = jax.tree.map(lambda v: v.stack(), tuple(memory), is_leaf=lambda x: isinstance(x, Vec))
+    return dataclasses.replace(state, memory=memory)
+
+
+@functools.partial(jax.jit, compiler_options=helpers.QUICK_COMPILE)
+def _study(effects, directions, parameters, state, commands):
+    """For a batch of effects: the trajectories, a number that sums each up, and its derivatives in both modes."""
+
+    def summary(effects):
+        model = Quadrotor(parameters, effects)
+        flown = rollout(model, _sensed(model, state), commands)
+        total = 0.0
+        for part, weight in zip(helpers.NAMES, (1.0, 0.5, 2.0, 0.1, 1e-3), strict=True):
+            last = getattr(flown, part)[-1]
+            # Weights unlike each other, or rotors and axes would cancel.
+            total += weight * jnp.sum(last * jnp.arange(1.0, 1 + last.size))
+        return total, flown
+
+    reverse = jax.vmap(jax.value_and_grad(summary, has_aux=True))(effects)
+    forward = jax.vmap(lambda x, d: jax.jvp(summary, (x,), (d,), has_aux=True)[1])(effects, directions)
+    return *reverse, forward
+
+
+@functools.partial(jax.jit, compiler_options=helpers.QUICK_COMPILE)
+def _stepped(model, state, commands):
+    def one(state, command):
+        state = step(model, state, command)
+        return state, state
+
+    return jax.lax.scan(one, _sensed(model, state), commands)[1]
+
+
+@pytest.fixture(scope="module")
+def manoeuvre():
     y, commands = helpers.aggressive_manoeuvre(0.1)
-    arguments = helpers.state_of(y), jnp.asarray(commands)
-    without = fly_fleet(_one(Quadrotor(guards, integrator=integrator)), *arguments)
-    neutral = fly_fleet(_one(Quadrotor(guards, (CATALOGUE[name].neutral(),), integrator=integrator)), *arguments)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12), neutral, without)
+    return helpers.state_of(y), jnp.asarray(commands)
+
+
+def _alone(effect: Effect) -> tuple[Effect, ...]:
+    """Every effect of the catalogue, all but this one neutral: whatever the effect, the same program flies it."""
+    return tuple(effect if kind is type(effect) else kind.neutral() for kind in CATALOGUE.values())
+
+
+@pytest.fixture(scope="module")
+def studied(guards, manoeuvre):
+    """What `_study` finds, by name: the effect neutral and neutral moved a little; inside its prior and moved a little
+    there and back; then every probe with no strength."""
+    effects, directions, rows = [], [], {}
+    for name, kind in CATALOGUE.items():
+        direction, neutral = _direction(name), kind.neutral()
+        inside = _at(name, INSIDE)
+        mine = [neutral, _moved(neutral, direction, STEP), inside]
+        mine += [_moved(inside, direction, STEP), _moved(inside, direction, -STEP)]
+        mine += [dataclasses.replace(neutral, **probe) for probe in kind.probes]
+        rows[name] = slice(len(effects), len(effects) + len(mine))
+        effects += [_alone(effect) for effect in mine]
+        nothing = jax.tree.map(jnp.zeros_like, _alone(neutral))
+        directions += [tuple(direction if type(x) is kind else x for x in nothing)] * len(mine)
+    batches = [jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (effects, directions)]
+    (value, flown), reverse, forward = _study(*batches, guards, *manoeuvre)
+    return {
+        name: jax.tree.map(lambda x, r=r: np.asarray(x[r]), (flown, value, reverse, forward))
+        for name, r in rows.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def without(guards, manoeuvre, fly_fleet):
+    """The same flight without effects, by integrator."""
+    return {
+        integrator: helpers.pack(fly_fleet(_one(Quadrotor(guards, integrator=integrator)), *manoeuvre))[0]
+        for integrator in ("euler", "rk4")
+    }
+
+
+@ONE_WORKER
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_neutral_effects_change_nothing(name, studied, without):
+    flown = helpers.pack(studied[name][0])
+    for row in (0, *range(5, len(flown))):
+        np.testing.assert_allclose(flown[row], without["euler"], rtol=1e-12, atol=1e-12)
+    assert np.abs(flown[2] - without["euler"]).max() > 1e-6, "the test would not see it"
+
+
+@ONE_WORKER
+def test_all_neutral_effects_change_nothing_with_rk4(guards, manoeuvre, fly_fleet, without):
+    effects = tuple(kind.neutral() for kind in CATALOGUE.values())
+    flown = helpers.pack(fly_fleet(_one(Quadrotor(guards, effects, integrator="rk4")), *manoeuvre))[0]
+    np.testing.assert_allclose(flown, without["rk4"], rtol=1e-12, atol=1e-12)
+
+
+@ONE_WORKER
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_derivatives_exist_and_agree_with_differences(name, studied):
+    _, value, reverse, forward = studied[name]
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(reverse))
+    mine = next(effect for effect in reverse if effect.name == name)
+    products = jax.tree.map(lambda g, d: np.sum((g * d).reshape(len(g), -1), axis=-1), mine, _direction(name))
+    np.testing.assert_allclose(sum(jax.tree.leaves(products)), forward, rtol=1e-8, atol=1e-8)
+    # At neutral the quotient is one-sided: a delay or a lag cannot be negative.
+    np.testing.assert_allclose(forward[0], (value[1] - value[0]) / STEP, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(forward[2], (value[3] - value[4]) / (2 * STEP), rtol=1e-5, atol=1e-6)
+    assert abs(forward[0]) > 1e-6, "a search that starts at neutral would not find it"
+
+
+@ONE_WORKER
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_a_batched_rollout_is_every_effect_stepped(name, studied, guards, manoeuvre):
+    """Steps alone keep the memory's structure, equal a rollout, and equal it without ``vmap``."""
+    alone = _stepped(Quadrotor(guards, _alone(_at(name, INSIDE))), *manoeuvre)
+    batched = jax.tree.map(lambda x: x[2], studied[name][0])
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), alone, batched)
+
+
+def test_all_effects_together_keep_float32(guards, manoeuvre):
+    with jax.enable_x64(False):
+        cast = functools.partial(jax.tree.map, lambda x: jnp.asarray(np.asarray(x, np.float32)))
+        effects = tuple(cast(_at(name, INSIDE)) for name in CATALOGUE)
+        flown = _stepped(Quadrotor(cast(guards), effects), *cast(manoeuvre))
+        assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(flown))
+        assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(flown))
+
+
+def test_effects_may_carry_batch_axes(guards):
+    """A batch of effects makes a batch of changed parameters, of one drone and of a batch of drones."""
+    fleet = jax.tree.map(lambda x: jnp.stack([x, 1.1 * x]), guards)
+    for name in CATALOGUE:
+        effects = [_at(name, (share, 0.4, 0.6, 0.8)) for share in (0.7, 0.3)]
+        batch = jax.tree.map(lambda *x: jnp.stack(x), *effects)
+        for parameters in (guards, fleet):
+            changed = Quadrotor(parameters, (batch,)).changed_parameters()
+            for i, effect in enumerate(effects):
+                drone = guards if parameters is guards else jax.tree.map(lambda x, i=i: x[i], fleet)
+                wanted = Quadrotor(drone, (effect,)).changed_parameters()
+                for got, one, base in zip(*map(jax.tree.leaves, (changed, wanted, drone)), strict=True):
+                    got = got if got.ndim == base.ndim else got[i]
+                    np.testing.assert_allclose(got, one, rtol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -77,10 +250,17 @@ def test_drag_acts_per_axis_and_only_slows(fall):
     np.testing.assert_allclose(helpers.part(flown, "body_rate"), 0, atol=1e-12)
 
 
-def test_mapping_round_trip():
-    drag = ParasiticDrag(linear=[0.1, 0.2, 0.3], quadratic=0.01)
-    again = effect_from_mapping(effect_to_mapping(drag), "here")
-    jax.tree.map(np.testing.assert_array_equal, again, drag)
+@pytest.mark.parametrize("name", sorted(CATALOGUE))
+def test_mapping_round_trip(name):
+    effect = _at(name, INSIDE)
+    again = effect_from_mapping(effect_to_mapping(effect), "here")
+    assert type(again) is type(effect)
+    jax.tree.map(np.testing.assert_array_equal, again, effect)
+    left_out = effect_from_mapping({"name": name}, "here")
+    jax.tree.map(np.testing.assert_array_equal, left_out, CATALOGUE[name].neutral())
+
+
+def test_what_a_mapping_leaves_out_is_neutral():
     partial = effect_from_mapping({"name": "parasitic_drag", "parameters": {"linear": 0.1}}, "here")
     np.testing.assert_array_equal(partial.quadratic, 0)
     np.testing.assert_array_equal(partial.linear, jnp.full(3, 0.1))

@@ -25,7 +25,7 @@ import open_loop
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid.identification.unknowns import choose
-from cfb_mjx.sysid.prediction import predict, rotor_speed_at_start
+from cfb_mjx.sysid.prediction import predict, start_of_windows
 from cfb_mjx.sysid.windows import Windows, find_windows
 
 NOMINAL = load_model_file("cfb-guards").parameters()
@@ -59,7 +59,7 @@ def test_the_same_windows_have_the_same_minimum(drone):
     def residual(vector):
         model = Quadrotor(unknowns.apply(jnp.asarray(vector)), integrator="rk4")
         pairs = zip(logs, cut, strict=True)
-        speed = np.concatenate([rotor_speed_at_start(model, log.time, log.command, w) for log, w in pairs])
+        speed = np.concatenate([start_of_windows(model, log, w, 0.008)[0] for log, w in pairs])
         found = predict(model, joined, speed)
         q, p = joined.true_quaternion, found.quaternion
         turn = q[..., :1] * p[..., 1:] - p[..., :1] * q[..., 1:] - np.cross(q[..., 1:], p[..., 1:])

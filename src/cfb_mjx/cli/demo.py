@@ -151,14 +151,14 @@ def _fly_randomised(model: ModelFile, log: FlightLog, count: int, figure: Path) 
 
     from cfb_mjx.model import Quadrotor, rollout
     from cfb_mjx.sysid.evaluation import HORIZONS
-    from cfb_mjx.sysid.prediction import rotor_speed_at_start
+    from cfb_mjx.sysid.prediction import start_of_windows
     from cfb_mjx.sysid.windows import find_windows
 
     nominal = Quadrotor.from_file(model)
     delay = log.observation_delay
     delay = float(nominal.parameters.observation_delay) if delay is None else delay
     windows = find_windows(log, HORIZONS, delay)
-    speeds = rotor_speed_at_start(nominal, log.time, log.command, windows)
+    speeds = start_of_windows(nominal, log, windows, delay)[0]
     window = len(windows) // 2
     start = windows.start[window]
     steps = KEPT * round(SECONDS / nominal.dt / KEPT)

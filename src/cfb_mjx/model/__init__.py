@@ -3,7 +3,7 @@
 from cfb_mjx.model.bodies import Body, RigidBody
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.effects import CATALOGUE, Condition, Effect, ParasiticDrag, Wrench
-from cfb_mjx.model.quadrotor import Quadrotor, step
+from cfb_mjx.model.quadrotor import Quadrotor, begin, specific_force, step
 from cfb_mjx.model.rollout import in_chunks, rollout, rollout_final
 from cfb_mjx.model.rotors import hover_command, hover_rotor_speed, rotor_speed_history, thrust, torque
 from cfb_mjx.model.state import State
@@ -20,12 +20,14 @@ __all__ = [
     "RigidBody",
     "State",
     "Wrench",
+    "begin",
     "hover_command",
     "hover_rotor_speed",
     "in_chunks",
     "rollout",
     "rollout_final",
     "rotor_speed_history",
+    "specific_force",
     "step",
     "thrust",
     "torque",

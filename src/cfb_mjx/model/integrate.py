@@ -31,6 +31,7 @@ def euler(accelerations: Accelerations, state: Components, dt) -> Components:
         quaternion=renormalise(multiply(state.quaternion, exponential(body_rate * (0.5 * dt)))),
         body_rate=body_rate,
         rotor_speed=state.rotor_speed,
+        memory=state.memory,
     )
 
 
@@ -60,6 +61,7 @@ def runge_kutta(accelerations: Accelerations, state: Components, dt) -> Componen
             state.quaternion + by.quaternion * step,
             state.body_rate + by.body_rate * step,
             state.rotor_speed,
+            state.memory,
         )
 
     k1 = rates(state, START)
@@ -77,6 +79,7 @@ def runge_kutta(accelerations: Accelerations, state: Components, dt) -> Componen
         quaternion=renormalise(combine("quaternion")),
         body_rate=combine("body_rate"),
         rotor_speed=state.rotor_speed,
+        memory=state.memory,
     )
 
 

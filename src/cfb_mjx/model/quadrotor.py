@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import rotors
 from cfb_mjx.model.bodies import Body, RigidBody
-from cfb_mjx.model.effects import Condition, Effect, Wrench, effect_from_mapping
+from cfb_mjx.model.effects import Condition, Effect, Motors, Wrench, effect_from_mapping, overrides
 from cfb_mjx.model.integrate import END, INTEGRATORS, MIDDLE, START
 from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec, rotate_inverse
@@ -66,13 +66,32 @@ class Quadrotor(eqx.Module):
         effects = tuple(effect_from_mapping(item, where) for item in model.effects)
         return cls(parameters=model.parameters(), effects=effects, **choices)
 
+    def changed_parameters(self) -> Parameters:
+        """The parameters with what effects change in them (payload, centre of gravity ...)."""
+        parameters = self.parameters
+        for effect in self.effects:
+            parameters = effect.change(parameters)
+        return parameters
+
     def hover_state(self, position=(0.0, 0.0, 1.0)) -> State:
-        """Level and motionless at ``position`` [m], rotors carrying the weight (effects not considered)."""
-        return State.at_rest(position, rotors.hover_rotor_speed(self.parameters))
+        """Level and motionless at ``position`` [m], rotors carrying the weight (forces of effects not considered)."""
+        return begin(self, State.at_rest(position, rotors.hover_rotor_speed(self.changed_parameters())))
 
     def hover_command(self) -> Float[Array, "4"]:
-        """Commands that hold `hover_state` (effects not considered)."""
-        return rotors.hover_command(self.parameters)
+        """Commands that hold `hover_state` (forces of effects not considered)."""
+        return rotors.hover_command(self.changed_parameters())
+
+
+def begin(model: Quadrotor, state: State) -> State:
+    """The state with a memory for every effect of the model, if it has none yet: that of a long steady flight."""
+    if len(state.memory) == len(model.effects):
+        return state
+    if len(state.memory):
+        raise ValueError(f"the state remembers {len(state.memory)} effects, the model has {len(model.effects)}")
+    parameters, speed = _unstacked(model.changed_parameters()), Vec.unstack(jnp.asarray(state.rotor_speed))
+    memory = tuple(effect.start(speed, parameters) for effect in model.effects)
+    memory = jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec))
+    return State(state.position, state.velocity, state.quaternion, state.body_rate, state.rotor_speed, memory)
 
 
 class Prepared(eqx.Module):
@@ -90,7 +109,7 @@ def prepare(model: Quadrotor, dt: float | Float[Array, ""] | None = None) -> Pre
     """Compute once what every integration step of ``dt`` seconds (default: the model's) needs."""
     dt = model.dt / model.substeps if dt is None else dt
     dt = jnp.asarray(dt, model.parameters.mass.dtype)
-    parameters = _unstacked(model.parameters)
+    parameters = _unstacked(model.changed_parameters())
     return Prepared(model, parameters, rotors.prepare(parameters, dt), model.body.prepare(parameters, dt), dt)
 
 
@@ -103,7 +122,7 @@ def step(model: Quadrotor, state: State, command: Float[Array, "4"]) -> State:
     """Advance by ``model.dt`` with ``command`` (clipped to [0, 1]) held."""
     prepared = prepare(model)
     center = prepared.parameters.center_of_gravity
-    return stack(advance(prepared, unstack(state, center), Vec.unstack(command)), center)
+    return stack(advance(prepared, unstack(begin(model, state), center), Vec.unstack(command)), center)
 
 
 def advance(prepared: Prepared, state: Components, command: Vec) -> Components:
@@ -115,12 +134,28 @@ def advance(prepared: Prepared, state: Components, command: Vec) -> Components:
 
 def integrate_commanded(prepared: Prepared, state: Components, command: Vec) -> Components:
     """One integration step of ``prepared.dt`` with the command held."""
-    model = prepared.model
+    path, memory = commanded_path(prepared, state.rotor_speed, state.memory, command)
+    return _integrate(prepared, remembering(state, memory), path)
+
+
+def commanded_path(prepared: Prepared, rotor_speed: Vec, memory: tuple, command: Vec) -> tuple[rotors.RotorPath, tuple]:
+    """How the rotors run from ``rotor_speed`` while the command is held for ``prepared.dt``, and the new memory."""
+    model, parameters, memory = prepared.model, prepared.parameters, list(memory)
     command = command.map(lambda u: jnp.clip(u, 0.0, 1.0))
-    for effect in model.effects:
-        command = effect.command(command, prepared.parameters)
-    target = rotors.steady_speed(prepared.rotors, command)
-    return _integrate(prepared, state, rotors.path_to(prepared.rotors, state.rotor_speed, target))
+    for i, effect in enumerate(model.effects):
+        command, memory[i] = effect.command(command, memory[i], prepared.dt, parameters)
+    motors = Motors(rotors.steady_speed(prepared.rotors, command), parameters.motor_time_constant)
+    for i, effect in enumerate(model.effects):
+        motors, memory[i] = effect.motors(motors, rotor_speed, memory[i], prepared.dt, parameters)
+    constants = prepared.rotors
+    if any(overrides(effect, "motors") for effect in model.effects):
+        constants = rotors.with_time_constant(constants, motors.time_constant, prepared.dt)
+    return rotors.path_to(constants, rotor_speed, motors.target), tuple(memory)
+
+
+def remembering(state: Components, memory: tuple) -> Components:
+    """The state with another memory."""
+    return Components(state.position, state.velocity, state.quaternion, state.body_rate, state.rotor_speed, memory)
 
 
 def integrate_measured(prepared: Prepared, state: Components, end_speed: Vec) -> Components:
@@ -139,28 +174,71 @@ def _integrate(prepared: Prepared, state: Components, path: rotors.RotorPath) ->
     def accelerations(at: Components, stage: int) -> tuple[Vec, Vec]:
         speed, rate = stages[stage]
         loads = path.mean if model.rotor_loads == "mean" else rotors.loads_at(prepared.rotors, speed, rate)
-        if model.effects:
-            condition = Condition(
-                at.position,
-                at.velocity,
-                rotate_inverse(at.quaternion, at.velocity) - at.body_rate.cross(parameters.center_of_gravity),
-                at.quaternion,
-                at.body_rate,
-                speed,
-                parameters,
-            )
-            for effect in model.effects:
-                loads = effect.rotors(loads, condition)
-        wrench = wrench_of(parameters, loads)
-        for effect in model.effects:
-            wrench = effect.body(wrench, condition)
+        wrench = loaded(model, parameters, loads, conditions(prepared, at, speed))
         # Every component of the acceleration needs the wrench; without the barrier XLA recomputes it for each.
         wrench = jax.lax.optimization_barrier(wrench)
         about_center = Wrench(wrench.force, wrench.torque - parameters.center_of_gravity.cross(wrench.force))
         return model.body.accelerations(prepared.body, at, about_center)
 
     moved = INTEGRATORS[model.integrator](accelerations, state, prepared.dt)
-    return Components(moved.position, moved.velocity, moved.quaternion, moved.body_rate, path.end)
+    memory = state.memory
+    if any(overrides(effect, "advance") for effect in model.effects):
+        pushed = (moved.velocity - state.velocity) * prepared.rotors.inverse_dt
+        memory = advanced(prepared, conditions(prepared, state, path.start), pushed)
+    return Components(moved.position, moved.velocity, moved.quaternion, moved.body_rate, path.end, memory)
+
+
+def specific_force(model: Quadrotor, state: State) -> Float[Array, "3"]:
+    """What an ideal accelerometer at the rotors' centre reads, body axes, m/s^2 (rotor speeds taken as steady)."""
+    prepared = prepare(model, 0.0)
+    center = prepared.parameters.center_of_gravity
+    at = unstack(begin(model, state), center)
+    loads = rotors.loads_at(prepared.rotors, at.rotor_speed, 0.0 * at.rotor_speed)
+    wrench = loaded(model, prepared.parameters, loads, conditions(prepared, at, at.rotor_speed))
+    return at_rotor_center(prepared.parameters, wrench, at.body_rate)[1].stack()
+
+
+def at_rotor_center(parameters: Parameters, wrench: Wrench, body_rate: Vec) -> tuple[Vec, Vec]:
+    """Angular acceleration [rad/s^2] and specific force [m/s^2] at the rotors' centre under ``wrench`` about it.
+
+    Body axes, free flight: what a gyro's slope and an accelerometer there show.
+    """
+    center, inertia = parameters.center_of_gravity, parameters.inertia
+    about = wrench.torque - center.cross(wrench.force)
+    turning = (about - body_rate.cross(inertia * body_rate)) * inertia.map(lambda x: 1 / x)
+    lever = -center
+    # The centre of gravity moves with F / m; a point beside it also turns about it.
+    force = wrench.force * (1 / parameters.mass) + turning.cross(lever) + body_rate.cross(body_rate.cross(lever))
+    return turning, force
+
+
+def conditions(prepared: Prepared, at: Components, speed: Vec) -> tuple[Condition, ...]:
+    """The flight condition as each effect sees it."""
+    if not prepared.model.effects:
+        return ()
+    parameters = prepared.parameters
+    velocity_body = rotate_inverse(at.quaternion, at.velocity) - at.body_rate.cross(parameters.center_of_gravity)
+    return tuple(
+        Condition(at.position, at.velocity, velocity_body, at.quaternion, at.body_rate, speed, parameters, memory)
+        for memory in at.memory
+    )
+
+
+def advanced(prepared: Prepared, at: tuple[Condition, ...], acceleration: Vec) -> tuple:
+    """Memory of every effect after ``prepared.dt`` seconds with this acceleration (world, m/s^2)."""
+    pairs = zip(prepared.model.effects, at, strict=True)
+    return tuple(effect.advance(condition, acceleration, prepared.dt) for effect, condition in pairs)
+
+
+def loaded(model: Quadrotor, parameters: Parameters, loads: rotors.RotorLoads, conditions: tuple) -> Wrench:
+    """Wrench of the rotors and of every effect about the rotors' centre, body axes."""
+    pairs = list(zip(model.effects, conditions, strict=True))
+    for effect, condition in pairs:
+        loads = effect.rotors(loads, condition)
+    wrench = wrench_of(parameters, loads)
+    for effect, condition in pairs:
+        wrench = effect.body(wrench, condition)
+    return wrench
 
 
 def wrench_of(parameters: Parameters, loads: rotors.RotorLoads) -> Wrench:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, prepare
+from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec
 
@@ -69,7 +69,7 @@ def _fly(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Co
 def _carry(prepared: Prepared, state: State, commands: Array):
     # One precision throughout, or the scan's carry would change type.
     dtype = jnp.result_type(prepared.parameters.mass, state.position, commands)
-    components = unstack(state, prepared.parameters.center_of_gravity)
+    components = unstack(begin(prepared.model, state), prepared.parameters.center_of_gravity)
     return jax.tree.map(lambda x: x.astype(dtype), components)
 
 

@@ -93,26 +93,39 @@ def polynomial(coefficients: Array | Vec, scale: Array | Vec, sigma: Array) -> P
 def prepare(parameters: Parameters, dt: Float[Array, ""] | float) -> RotorConstants:
     """Constants of the exact zero-order-hold solution of eq. (5) over ``dt`` seconds (``dt`` = 0 is allowed)."""
     time_constant = Vec.unstack(parameters.motor_time_constant)
+    dt = jnp.asarray(dt, time_constant[0].dtype)
+    return RotorConstants(
+        **_lag(time_constant, dt),
+        inverse_dt=jnp.where(dt > 0, 1 / jnp.where(dt > 0, dt, 1.0), 0.0),
+        gain=Vec.unstack(parameters.motor_gain),
+        offset=Vec.unstack(parameters.motor_speed_offset),
+        thrust=polynomial(parameters.thrust_polynomial, parameters.thrust_scale, parameters.reference_rotor_speed),
+        torque=polynomial(parameters.torque_polynomial, parameters.torque_scale, parameters.reference_rotor_speed),
+    )
+
+
+def with_time_constant(constants: RotorConstants, time_constant: Vec, dt) -> RotorConstants:
+    """The same rotors with other lags, s."""
+    changed = _lag(time_constant, dt)
+    return eqx.tree_at(lambda c: tuple(getattr(c, name) for name in changed), constants, tuple(changed.values()))
+
+
+def _lag(time_constant: Vec, dt) -> dict[str, Vec]:
+    """What depends on the lags, per rotor."""
     x = dt / time_constant.stack()
     safe = jnp.where(x > 0, x, 1.0)
 
     def mean_of_exponential(n: int) -> Vec:
         return Vec.unstack(jnp.where(x > 0, -jnp.expm1(-n * safe) / (n * safe), 1.0))
 
-    dt = jnp.asarray(dt, x.dtype)
-    return RotorConstants(
-        decay=Vec.unstack(jnp.exp(-x)),
-        decay_half=Vec.unstack(jnp.exp(-x / 2)),
-        mean1=mean_of_exponential(1),
-        mean2=mean_of_exponential(2),
-        mean3=mean_of_exponential(3),
-        inverse_dt=jnp.where(dt > 0, 1 / jnp.where(dt > 0, dt, 1.0), 0.0),
-        inverse_time_constant=time_constant.map(lambda t: 1 / t),
-        gain=Vec.unstack(parameters.motor_gain),
-        offset=Vec.unstack(parameters.motor_speed_offset),
-        thrust=polynomial(parameters.thrust_polynomial, parameters.thrust_scale, parameters.reference_rotor_speed),
-        torque=polynomial(parameters.torque_polynomial, parameters.torque_scale, parameters.reference_rotor_speed),
-    )
+    return {
+        "decay": Vec.unstack(jnp.exp(-x)),
+        "decay_half": Vec.unstack(jnp.exp(-x / 2)),
+        "mean1": mean_of_exponential(1),
+        "mean2": mean_of_exponential(2),
+        "mean3": mean_of_exponential(3),
+        "inverse_time_constant": time_constant.map(lambda t: 1 / t),
+    }
 
 
 def steady_speed(constants: RotorConstants, command: Vec) -> Vec:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -25,6 +28,8 @@ class State(eqx.Module):
     """Angular velocity, body axes, rad/s."""
     rotor_speed: Float[AnyArray, "*batch 4"]
     """Rotor speeds, motors M1..M4, rad/s."""
+    memory: Any = ()
+    """What effects remember (`cfb_mjx.model.Effect.start`), one entry per effect; empty means long steady flight."""
 
     @classmethod
     def at_rest(cls, position=(0.0, 0.0, 0.0), rotor_speed=0.0) -> State:
@@ -54,6 +59,7 @@ class Components(eqx.Module):
     quaternion: Vec
     body_rate: Vec
     rotor_speed: Vec
+    memory: Any = ()
 
 
 def unstack(state: State, center_of_gravity: Vec) -> Components:
@@ -65,6 +71,7 @@ def unstack(state: State, center_of_gravity: Vec) -> Components:
         quaternion,
         body_rate,
         Vec.unstack(state.rotor_speed),
+        jax.tree.map(Vec.unstack, state.memory),
     )
 
 
@@ -78,4 +85,5 @@ def stack(state: Components, center_of_gravity: Vec) -> State:
         state.quaternion.stack(),
         state.body_rate.stack(),
         state.rotor_speed.stack(),
+        jax.tree.map(lambda x: x.stack(), state.memory, is_leaf=lambda x: isinstance(x, Vec)),
     )

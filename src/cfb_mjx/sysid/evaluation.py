@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.sysid import metrics
-from cfb_mjx.sysid.prediction import hold, predict, rotor_speed_at_start, select
+from cfb_mjx.sysid.prediction import hold, predict, select, start_of_windows
 from cfb_mjx.sysid.windows import Windows, find_windows
 
 HORIZONS = (0.05, 0.1, 0.2, 0.5)
@@ -106,13 +107,14 @@ def _evaluate_log(model: Quadrotor, log: FlightLog, horizons: tuple[float, ...])
     predictions: dict[str, State | None] = dict.fromkeys(VARIANTS)
     errors: dict[str, dict[str, np.ndarray] | None] = dict.fromkeys(VARIANTS)
     if len(windows):
-        start = rotor_speed_at_start(model, log.time, log.command, windows)
-        predictions["commands_in"] = predict(model, windows, start)
+        start, memory = start_of_windows(model, log, windows, delay)
+        predictions["commands_in"] = predict(model, windows, start, memory)
         predictions["hold"] = hold(windows, horizons)
         for variant in ("commands_in", "hold"):
             errors[variant] = metrics.errors(windows, predictions[variant])
         if measured.any():
             chosen = select(windows, measured)
-            predictions["rotor_speed_in"] = predict(model, chosen)
+            kept = jax.tree.map(lambda x: x[measured], memory)
+            predictions["rotor_speed_in"] = predict(model, chosen, memory=kept)
             errors["rotor_speed_in"] = metrics.errors(chosen, predictions["rotor_speed_in"])
     return LogEvaluation(log, delay, windows, measured, predictions, errors)

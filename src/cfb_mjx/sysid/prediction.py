@@ -9,17 +9,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.model.quadrotor import Quadrotor, integrate_commanded, integrate_measured, prepare
-from cfb_mjx.model.rotors import rotor_speed_history
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model.quadrotor import Quadrotor, begin, commanded_path, integrate_commanded, integrate_measured, prepare
 from cfb_mjx.model.state import State, stack, unstack
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.sysid.flight import Flight, prepare_flight
+from cfb_mjx.sysid.replay import remembered
 from cfb_mjx.sysid.windows import Windows
 
 WINDOWS_PER_BLOCK, STEPS_PER_BLOCK = 128, 160
 _STATE = ("position", "velocity", "quaternion", "body_rate")
 
 
-def predict(model: Quadrotor, windows: Windows, rotor_speed: np.ndarray | None = None) -> State:
+def predict(model: Quadrotor, windows: Windows, rotor_speed: np.ndarray | None = None, memory: tuple = ()) -> State:
     """Predict the measured states at the horizons.
 
     Args:
@@ -27,6 +29,7 @@ def predict(model: Quadrotor, windows: Windows, rotor_speed: np.ndarray | None =
         windows: W windows.
         rotor_speed: (W, 4) rotor speeds at the window starts, rad/s, with the logged commands in; None feeds the
             measured rotor speeds instead.
+        memory: what the effects remember at the window starts (`start_of_windows`).
 
     Returns:
         `State` of numpy arrays (W, H, ...); W must not be 0.
@@ -34,7 +37,7 @@ def predict(model: Quadrotor, windows: Windows, rotor_speed: np.ndarray | None =
     measured = rotor_speed is None
     start = windows.rotor_speed[:, 0] if measured else rotor_speed
     inputs = windows.rotor_speed[:, 1:] if measured else windows.command
-    state = State(*(getattr(windows, name) for name in _STATE), rotor_speed=start)
+    state = State(*(getattr(windows, name) for name in _STATE), rotor_speed=start, memory=memory)
     count, width = windows.step.shape
     # Blocks of one shape, whatever the logs: the program is compiled once and then comes from the cache.
     steps = STEPS_PER_BLOCK * -(-max(width, 1) // STEPS_PER_BLOCK)
@@ -52,7 +55,8 @@ def predict(model: Quadrotor, windows: Windows, rotor_speed: np.ndarray | None =
 
 @eqx.filter_jit
 def _predict_batch(model: Quadrotor, state: State, step, inputs, measured: bool) -> State:
-    return jax.vmap(lambda *x: predict_one(model, *x, measured))(state, step, inputs)
+    flown = jax.vmap(lambda *x: predict_one(model, *x, measured))(state, step, inputs)
+    return eqx.tree_at(lambda s: s.memory, flown, (), is_leaf=lambda x: isinstance(x, tuple))
 
 
 def predict_one(model: Quadrotor, state: State, step, inputs, measured: bool) -> State:
@@ -65,7 +69,7 @@ def predict_one(model: Quadrotor, state: State, step, inputs, measured: bool) ->
         inputs: (S, 4) commands held in each step, or rotor speeds at its end if ``measured``.
         measured: what ``inputs`` are.
     """
-    center = Vec.unstack(model.parameters.center_of_gravity)
+    center = Vec.unstack(model.changed_parameters().center_of_gravity)
 
     def advance(components, row):
         dt, value = row
@@ -74,28 +78,43 @@ def predict_one(model: Quadrotor, state: State, step, inputs, measured: bool) ->
         components = move(prepared, components, value)
         return components, components
 
-    first = unstack(state, center)
+    first = unstack(begin(model, state), center)
     _, rest = jax.lax.scan(advance, first, (step, Vec.unstack(inputs)))
     whole = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
     return stack(whole, center)
 
 
-def rotor_speed_at_start(model: Quadrotor, time: np.ndarray, command: np.ndarray, windows: Windows) -> np.ndarray:
-    """Rotor speeds at the window starts from the motor model driven by the commands since the log began, (W, 4)."""
-    rows = 8192 * -(-len(time) // 8192)
-    # Padding repeats the last row with zero time between: it changes nothing before it.
-    history = _history(model, _pad(time, rows), _pad(command, rows))
-    speed = np.asarray(history)[windows.row]
-    since = (windows.start - time[windows.row])[:, None]
-    parameters = model.parameters
-    gain, offset = np.asarray(parameters.motor_gain), np.asarray(parameters.motor_speed_offset)
-    target = gain * np.clip(command[windows.row], 0, 1) + offset
-    return target + (speed - target) * np.exp(-since / np.asarray(parameters.motor_time_constant))
+def start_of_windows(model: Quadrotor, log: FlightLog, windows: Windows, delay: float) -> tuple[np.ndarray, tuple]:
+    """Rotor speeds (W, 4) and memories of the effects (leading axis W) at the window starts.
+
+    Both come from the commands since the log began and from what the log measured before each start, never after.
+    """
+    flight = prepare_flight(log, delay)
+    # Indexing in NumPy: the number of windows differs from log to log, and the program should not.
+    speed, memory = jax.tree.map(lambda x: np.asarray(x)[windows.row], _remembered(model, flight))
+    since = windows.start - log.time[windows.row]
+    command = np.clip(log.command[windows.row], 0, 1)
+    count = len(windows)
+    blocks = WINDOWS_PER_BLOCK * -(-count // WINDOWS_PER_BLOCK)
+    inputs = jax.tree.map(lambda x: _pad(x, blocks), (speed, memory, command, since))
+    return jax.tree.map(lambda x: np.asarray(x)[:count], _advance_rotors(model, *inputs))
 
 
 @eqx.filter_jit
-def _history(model: Quadrotor, time, command):
-    return rotor_speed_history(model.parameters, time, command)
+def _remembered(model: Quadrotor, flight: Flight):
+    return remembered(model, flight, jnp.zeros(()))
+
+
+@eqx.filter_jit
+def _advance_rotors(model: Quadrotor, speed, memory, command, since):
+    def one(speed, memory, command, since):
+        prepared = prepare(model, since)
+        parts = (Vec.unstack(x) for x in (speed, command))
+        speed, command = parts
+        path, memory = commanded_path(prepared, speed, jax.tree.map(Vec.unstack, memory), command)
+        return path.end.stack(), jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec))
+
+    return jax.vmap(one)(speed, memory, command, since)
 
 
 def hold(windows: Windows, horizons: tuple[float, ...]) -> State:

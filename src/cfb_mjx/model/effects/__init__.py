@@ -1,7 +1,61 @@
 """Physical effects the basic model leaves out, one module each, and the catalogue that names them."""
 
-from cfb_mjx.model.effects.base import Condition, Effect, Wrench
+from cfb_mjx.model.effects.base import Condition, Effect, Memory, Motors, Reading, Wrench, overrides
+from cfb_mjx.model.effects.battery_sag import BatterySag
+from cfb_mjx.model.effects.blade_flapping import BladeFlapping
 from cfb_mjx.model.effects.catalogue import CATALOGUE, effect_from_mapping, effect_to_mapping
+from cfb_mjx.model.effects.cog_offset import CogOffset
+from cfb_mjx.model.effects.command_delay import CommandDelay
+from cfb_mjx.model.effects.esc_rate_limit import EscRateLimit
+from cfb_mjx.model.effects.ground_effect import GroundEffect
+from cfb_mjx.model.effects.gyroscopic import Gyroscopic
+from cfb_mjx.model.effects.inertia import Inertia
+from cfb_mjx.model.effects.inflow_thrust import InflowThrust
+from cfb_mjx.model.effects.motor_asymmetry import MotorAsymmetry
+from cfb_mjx.model.effects.motor_gain_mismatch import MotorGainMismatch
+from cfb_mjx.model.effects.motor_second_order import MotorSecondOrder
+from cfb_mjx.model.effects.motor_thermal_drift import MotorThermalDrift
+from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
 from cfb_mjx.model.effects.parasitic_drag import ParasiticDrag
+from cfb_mjx.model.effects.payload import Payload
+from cfb_mjx.model.effects.payload_swing import PayloadSwing
+from cfb_mjx.model.effects.rotor_drag import RotorDrag
+from cfb_mjx.model.effects.thrust_scale import ThrustScale
+from cfb_mjx.model.effects.thrust_tilt import ThrustTilt
+from cfb_mjx.model.effects.torque_scale import TorqueScale
+from cfb_mjx.model.effects.wind import Wind
 
-__all__ = ["CATALOGUE", "Condition", "Effect", "ParasiticDrag", "Wrench", "effect_from_mapping", "effect_to_mapping"]
+__all__ = [
+    "CATALOGUE",
+    "BatterySag",
+    "BladeFlapping",
+    "CogOffset",
+    "CommandDelay",
+    "Condition",
+    "Effect",
+    "EscRateLimit",
+    "GroundEffect",
+    "Gyroscopic",
+    "Inertia",
+    "InflowThrust",
+    "Memory",
+    "MotorAsymmetry",
+    "MotorGainMismatch",
+    "MotorSecondOrder",
+    "MotorThermalDrift",
+    "MotorTimeConstant",
+    "Motors",
+    "ParasiticDrag",
+    "Payload",
+    "PayloadSwing",
+    "Reading",
+    "RotorDrag",
+    "ThrustScale",
+    "ThrustTilt",
+    "TorqueScale",
+    "Wind",
+    "Wrench",
+    "effect_from_mapping",
+    "effect_to_mapping",
+    "overrides",
+]

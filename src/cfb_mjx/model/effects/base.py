@@ -1,14 +1,18 @@
-"""What an effect is: parameters plus pure functions that may change the command, the rotor loads or the wrench."""
+"""What an effect is: parameters plus pure functions that may change the drone, its motors, the loads or the wrench."""
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+from jaxtyping import Array
 
 from cfb_mjx.model.rotors import RotorLoads
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.parameters import Parameters
+
+Memory = tuple[Vec, ...]
+"""What one effect remembers from step to step: hidden states such as a delay line or a swinging load."""
 
 
 class Condition(eqx.Module):
@@ -24,6 +28,9 @@ class Condition(eqx.Module):
     body_rate: Vec
     rotor_speed: Vec
     parameters: Parameters
+    """With what effects change in them; `Vec` in place of arrays."""
+    memory: Memory = ()
+    """Of the effect that is asked."""
 
 
 class Wrench(eqx.Module):
@@ -33,26 +40,65 @@ class Wrench(eqx.Module):
     torque: Vec
 
 
+class Motors(eqx.Module):
+    """What each motor does during one step."""
+
+    target: Vec
+    """Steady rotor speed the command leads to, rad/s."""
+    time_constant: Vec
+    """Lag towards it, s."""
+
+
+class Reading(eqx.Module):
+    """What a log says about hidden conditions at one row, beside the state."""
+
+    voltage: Array
+    """Of the battery under load, V; NaN where unknown."""
+    time: Array
+    """Since the log began, s."""
+
+
 class Effect(eqx.Module):
     """One physical effect. Subclasses hold their parameters as fields and override what they change.
 
     Every subclass sets ``name`` (DESIGN names), ``units`` (per field), ``source``, ``prior`` (per field, the plausible
-    range as low and high) and has a ``neutral()`` at which it vanishes.
+    range as low and high) and has a ``neutral()`` at which it vanishes. For tracing it says which fields measure its
+    strength (``strengths``; the others describe its shape) and at which values it is looked for first (``probes``).
     """
 
     name: ClassVar[str]
     units: ClassVar[dict[str, str]]
     source: ClassVar[str]
     prior: ClassVar[dict[str, tuple[float, float]]]
+    strengths: ClassVar[tuple[str, ...]]
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({},)
 
     @classmethod
     def neutral(cls) -> Effect:
         """The effect at the values where it vanishes."""
         raise TypeError(f"{cls.__name__} must say at which values it vanishes")
 
-    def command(self, command: Vec, parameters: Parameters) -> Vec:
-        """Change what the motors receive, once per step."""
-        return command
+    def change(self, parameters: Parameters) -> Parameters:
+        """Change the drone itself, once per rollout."""
+        return parameters
+
+    def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
+        """Memory after a long steady flight at ``rotor_speed``."""
+        return ()
+
+    def sense(self, memory: Memory, reading: Reading) -> Memory:
+        """Take over what a log measured of the hidden state."""
+        return memory
+
+    def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
+        """Change what the motors receive during the next ``dt`` seconds."""
+        return command, memory
+
+    def motors(
+        self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
+    ) -> tuple[Motors, Memory]:
+        """Change how the motors answer, from ``rotor_speed`` on."""
+        return motors, memory
 
     def rotors(self, loads: RotorLoads, condition: Condition) -> RotorLoads:
         """Change thrust and torque rotor by rotor."""
@@ -61,3 +107,12 @@ class Effect(eqx.Module):
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         """Change the force and torque on the body."""
         return wrench
+
+    def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
+        """Memory after ``dt`` seconds that began in ``condition`` with this acceleration (world, m/s^2)."""
+        return condition.memory
+
+
+def overrides(effect: Effect, hook: str) -> bool:
+    """Whether the effect does anything in one of the functions above."""
+    return getattr(type(effect), hook) is not getattr(Effect, hook)

@@ -10,9 +10,56 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.effects.base import Effect
+from cfb_mjx.model.effects.battery_sag import BatterySag
+from cfb_mjx.model.effects.blade_flapping import BladeFlapping
+from cfb_mjx.model.effects.cog_offset import CogOffset
+from cfb_mjx.model.effects.command_delay import CommandDelay
+from cfb_mjx.model.effects.esc_rate_limit import EscRateLimit
+from cfb_mjx.model.effects.ground_effect import GroundEffect
+from cfb_mjx.model.effects.gyroscopic import Gyroscopic
+from cfb_mjx.model.effects.inertia import Inertia
+from cfb_mjx.model.effects.inflow_thrust import InflowThrust
+from cfb_mjx.model.effects.motor_asymmetry import MotorAsymmetry
+from cfb_mjx.model.effects.motor_gain_mismatch import MotorGainMismatch
+from cfb_mjx.model.effects.motor_second_order import MotorSecondOrder
+from cfb_mjx.model.effects.motor_thermal_drift import MotorThermalDrift
+from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
 from cfb_mjx.model.effects.parasitic_drag import ParasiticDrag
+from cfb_mjx.model.effects.payload import Payload
+from cfb_mjx.model.effects.payload_swing import PayloadSwing
+from cfb_mjx.model.effects.rotor_drag import RotorDrag
+from cfb_mjx.model.effects.thrust_scale import ThrustScale
+from cfb_mjx.model.effects.thrust_tilt import ThrustTilt
+from cfb_mjx.model.effects.torque_scale import TorqueScale
+from cfb_mjx.model.effects.wind import Wind
 
-CATALOGUE: dict[str, type[Effect]] = {effect.name: effect for effect in (ParasiticDrag,)}
+CATALOGUE: dict[str, type[Effect]] = {
+    effect.name: effect
+    for effect in (
+        ThrustScale,
+        TorqueScale,
+        Inertia,
+        CogOffset,
+        Payload,
+        MotorGainMismatch,
+        MotorTimeConstant,
+        MotorAsymmetry,
+        MotorSecondOrder,
+        MotorThermalDrift,
+        BatterySag,
+        CommandDelay,
+        EscRateLimit,
+        InflowThrust,
+        GroundEffect,
+        Gyroscopic,
+        ThrustTilt,
+        RotorDrag,
+        ParasiticDrag,
+        BladeFlapping,
+        Wind,
+        PayloadSwing,
+    )
+}
 
 
 def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:

@@ -9,11 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
+from cfb_mjx.model.effects.fields import vector
 from cfb_mjx.model.vector import Vec
-
-
-def _vector(value) -> Array:
-    return jnp.broadcast_to(jnp.asarray(value, jnp.result_type(float)), (3,))
 
 
 class ParasiticDrag(Effect):
@@ -25,9 +22,11 @@ class ParasiticDrag(Effect):
         "linear part: drone-models cf21B_500 (drag matrix); quadratic part: bluff-body drag, 0.5 rho C_d A"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"linear": (0.0, 0.05), "quadratic": (0.0, 0.02)}
+    # The linear part is what `rotor_drag` does at hover; tracing looks for it there.
+    strengths: ClassVar[tuple[str, ...]] = ("quadratic",)
 
-    linear: Float[Array, "*batch 3"] = eqx.field(converter=_vector)
-    quadratic: Float[Array, "*batch 3"] = eqx.field(converter=_vector)
+    linear: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
+    quadratic: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
 
     @classmethod
     def neutral(cls) -> ParasiticDrag:

@@ -17,11 +17,9 @@ from jaxtyping import Array, Float
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.effects import Condition, Effect, Wrench
-from cfb_mjx.model.quadrotor import Quadrotor, step, wrench_of
-from cfb_mjx.model.rotors import loads_at
-from cfb_mjx.model.rotors import prepare as prepare_rotors
+from cfb_mjx.model.quadrotor import Quadrotor, begin, specific_force, step
 from cfb_mjx.model.state import State
-from cfb_mjx.model.vector import Vec, rotate_inverse
+from cfb_mjx.model.vector import Vec
 from cfb_mjx.sysid.excitation.conditions import Conditions
 from cfb_mjx.sysid.excitation.manoeuvres import STEP, stepped
 
@@ -185,24 +183,10 @@ def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs):
     memory = stabiliser.start(start)
     line = DelayLine.filled(start, TICK, 0.1)
     wandering = wander * jnp.concatenate([first["torque"], first["force"], first["rotor"]])
-    carry = (start, line, memory, start.position, wandering)
+    # The push remembers nothing, but a state has an entry for each effect.
+    pushed = eqx.tree_at(lambda q: q.effects, model, (*model.effects, _Push(jnp.zeros(3), jnp.zeros(3))))
+    carry = (begin(pushed, start), line, memory, start.position, wandering)
     return jax.lax.scan(tick, carry, jax.tree.map(jnp.asarray, inputs))[1]
-
-
-def specific_force(model: Quadrotor, state: State) -> Float[Array, "3"]:
-    """What an ideal accelerometer at the centre of gravity reads, body axes, m/s^2."""
-    p, speed = model.parameters, Vec.unstack(state.rotor_speed)
-    loads = loads_at(prepare_rotors(p, TICK), speed, 0.0 * speed)
-    velocity, quaternion, rate = (Vec.unstack(x) for x in (state.velocity, state.quaternion, state.body_rate))
-    condition = Condition(
-        Vec.unstack(state.position), velocity, rotate_inverse(quaternion, velocity), quaternion, rate, speed, p
-    )
-    for effect in model.effects:
-        loads = effect.rotors(loads, condition)
-    wrench = wrench_of(p, loads)
-    for effect in model.effects:
-        wrench = effect.body(wrench, condition)
-    return jnp.stack([jnp.asarray(f) + 0.0 for f in wrench.force]) / p.mass
 
 
 def _times(quaternion, small):

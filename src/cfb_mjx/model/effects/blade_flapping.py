@@ -1,0 +1,49 @@
+"""Hub moments of rotors moved along their discs: the advancing blade lifts more than the retreating one.
+
+The disc tilts or, on stiff blades, the hub is twisted:
+
+    tau = coefficient (Omega / 1594 rad/s) (1 + climb v_z) e_z x v
+
+in body axes with the mean rotor speed: tau_x = -c v_y, tau_y = c v_x. The sign is free, because stiffness and the
+height of the discs over the rotors' centre pull in opposite directions. ``climb`` lets the moment depend on the flow
+through the discs.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Condition, Effect, Wrench
+from cfb_mjx.model.effects.fields import mean_hover_ratio, number
+from cfb_mjx.model.vector import Vec
+
+
+class BladeFlapping(Effect):
+    """tau = coefficient (Omega / 1594) (1 + climb v_z) e_z x v."""
+
+    name: ClassVar[str] = "blade_flapping"
+    units: ClassVar[dict[str, str]] = {"coefficient": "N s", "climb": "s/m"}
+    source: ClassVar[str] = (
+        "R. Mahony, V. Kumar, P. Corke, Multirotor aerial vehicles, IEEE RAM 19(3), 2012; G. Hoffmann, H. Huang, S."
+        " Waslander, C. Tomlin, Quadrotor helicopter flight dynamics and control: theory and experiment, AIAA GNC "
+        "2007"
+    )
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (-0.001, 0.001), "climb": (-0.5, 0.5)}
+    strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
+
+    coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Of the four rotors together at hover speed."""
+    climb: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Relative change of the moment per velocity along body z."""
+
+    @classmethod
+    def neutral(cls) -> BladeFlapping:
+        return cls(coefficient=0.0, climb=0.0)
+
+    def body(self, wrench: Wrench, condition: Condition) -> Wrench:
+        vx, vy, vz = condition.velocity_body
+        c = self.coefficient * mean_hover_ratio(condition) * (1 + self.climb * vz)
+        return Wrench(wrench.force, wrench.torque + Vec(-c * vy, c * vx, 0.0))

@@ -1,0 +1,61 @@
+"""A speed controller that limits how fast its output changes: |du/dt| <= 1 / slowness.
+
+The output runs towards the command at that rate and stops there. What the motors receive in a step is the exact mean of
+this ramp; remembered is where it ended. Given as slowness, the time from zero to full output, so that zero is no limit;
+the mean makes the effect grow from there with a slope, where the end of the ramp alone would show nothing until the
+limit is slower than a step.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Effect, Memory
+from cfb_mjx.model.effects.fields import number
+from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.parameters import Parameters
+
+
+class EscRateLimit(Effect):
+    """|du/dt| <= 1 / slowness."""
+
+    name: ClassVar[str] = "esc_rate_limit"
+    units: ClassVar[dict[str, str]] = {"slowness": "s"}
+    source: ClassVar[str] = (
+        "B. Stevens, F. Lewis, E. Johnson, Aircraft Control and Simulation, 3rd ed. 2016 (rate-limited actuator)"
+    )
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"slowness": (0.0, 0.1)}
+    strengths: ClassVar[tuple[str, ...]] = ("slowness",)
+
+    slowness: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Time from zero to full output; zero or positive."""
+
+    @classmethod
+    def neutral(cls) -> EscRateLimit:
+        return cls(slowness=0.0)
+
+    def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
+        steady = (rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
+        return (steady.map(lambda u: jnp.clip(u, 0.0, 1.0)),)
+
+    def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
+        (last,) = memory
+        # Comparison instead of maximum: at zero the derivative is that of a growing slowness.
+        slowness = jnp.where(self.slowness >= 0, self.slowness, 0.0)
+        limit = dt / jnp.where(slowness > 0, slowness, 1.0)
+        inverse = 1 / jnp.where(dt > 0, dt, 1.0)
+
+        def ramp(wanted, output):
+            way = wanted - output
+            duration = jnp.abs(way) * slowness
+            arrives = duration <= dt
+            end = jnp.where(arrives, wanted, output + jnp.sign(way) * limit)
+            mean = jnp.where(arrives, wanted - 0.5 * way * duration * inverse, output + 0.5 * jnp.sign(way) * limit)
+            return mean, end
+
+        ramps = command.map(ramp, last)
+        return Vec(*(mean for mean, _ in ramps)), (Vec(*(end for _, end in ramps)),)

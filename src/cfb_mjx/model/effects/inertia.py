@@ -1,0 +1,37 @@
+"""Moments of inertia other than the model says: J_k *= 1 + relative_k on each principal axis.
+
+Nothing keeps the result within the triangle inequality that real bodies obey: the effect is there to show by how much a
+flight asks for another inertia, and a derivative must not stop at that border.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Effect
+from cfb_mjx.model.effects.fields import vector
+from cfb_mjx.parameters.parameters import Parameters
+
+
+class Inertia(Effect):
+    """J_k *= 1 + relative_k."""
+
+    name: ClassVar[str] = "inertia"
+    units: ClassVar[dict[str, str]] = {"relative": "1"}
+    source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, eq. 4"
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.5, 0.5)}
+    strengths: ClassVar[tuple[str, ...]] = ("relative",)
+
+    relative: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
+    """Change about body x, y and z; above -1."""
+
+    @classmethod
+    def neutral(cls) -> Inertia:
+        return cls(relative=0.0)
+
+    def change(self, parameters: Parameters) -> Parameters:
+        changed = parameters.inertia * (1 + self.relative)
+        return eqx.tree_at(lambda p: p.inertia, parameters, changed)

@@ -1,0 +1,44 @@
+"""Thrust lost to axial inflow: a rotor climbing along its axis sees its blades' angle of attack reduced.
+
+    f_i -= coefficient (Omega_i / 1594 rad/s) (v + omega x r_i)_z
+
+in body axes, rotor by rotor: it damps heave, and through the hubs' own motion roll and pitch. A positive coefficient
+means that a climbing rotor loses thrust. The change is not clamped: near zero rotor speed it vanishes by itself.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Condition, Effect
+from cfb_mjx.model.effects.fields import HOVER_SPEED, hub_velocities, number
+from cfb_mjx.model.rotors import RotorLoads
+
+
+class InflowThrust(Effect):
+    """f_i -= coefficient (Omega_i / 1594) v_i,z."""
+
+    name: ClassVar[str] = "inflow_thrust"
+    units: ClassVar[dict[str, str]] = {"coefficient": "N s/m"}
+    source: ClassVar[str] = (
+        "J. G. Leishman, Principles of Helicopter Aerodynamics, 2nd ed. 2006, ch. 3; H. Huang, G. Hoffmann, S. "
+        "Waslander, C. Tomlin, Aerodynamics and control of autonomous quadrotor helicopters in aggressive "
+        "maneuvering, ICRA 2009"
+    )
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (-0.01, 0.03)}
+    strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
+
+    coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Per rotor at hover speed."""
+
+    @classmethod
+    def neutral(cls) -> InflowThrust:
+        return cls(coefficient=0.0)
+
+    def rotors(self, loads: RotorLoads, condition: Condition) -> RotorLoads:
+        _, _, axial = hub_velocities(condition)
+        lost = condition.rotor_speed * axial * (self.coefficient / HOVER_SPEED)
+        return RotorLoads(loads.thrust - lost, loads.torque, loads.rate)

@@ -1,0 +1,36 @@
+"""Motors that turn faster or slower than the model says for the same command: K_i *= 1 + relative_i."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Effect
+from cfb_mjx.model.effects.fields import vector
+from cfb_mjx.parameters.parameters import Parameters
+
+
+class MotorGainMismatch(Effect):
+    """K_i *= 1 + relative_i."""
+
+    name: ClassVar[str] = "motor_gain_mismatch"
+    units: ClassVar[dict[str, str]] = {"relative": "1"}
+    source: ClassVar[str] = (
+        "Q. Quan, Introduction to Multicopter Design and Control, 2017, ch. 4 (steady speed is affine in throttle, "
+        "fitted motor by motor)"
+    )
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.15, 0.15)}
+    strengths: ClassVar[tuple[str, ...]] = ("relative",)
+
+    relative: Float[Array, "*batch 4"] = eqx.field(converter=vector(4))
+    """Change of each motor's gain, motors M1..M4."""
+
+    @classmethod
+    def neutral(cls) -> MotorGainMismatch:
+        return cls(relative=0.0)
+
+    def change(self, parameters: Parameters) -> Parameters:
+        changed = parameters.motor_gain * (1 + self.relative)
+        return eqx.tree_at(lambda p: p.motor_gain, parameters, changed)

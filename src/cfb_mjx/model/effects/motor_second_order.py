@@ -1,0 +1,55 @@
+"""A second lag in front of the motor's own, as of the current in its windings or a filter in its controller:
+
+    lag y' = K u - y,   T Omega' = y - Omega
+
+y is remembered; its exact mean over a step is what the motor heads for during the step.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Effect, Memory, Motors
+from cfb_mjx.model.effects.fields import number
+from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.parameters import Parameters
+
+
+class MotorSecondOrder(Effect):
+    """lag y' = K u - y, T Omega' = y - Omega."""
+
+    name: ClassVar[str] = "motor_second_order"
+    units: ClassVar[dict[str, str]] = {"lag": "s"}
+    source: ClassVar[str] = (
+        "G. Franklin, J. D. Powell, A. Emami-Naeini, Feedback Control of Dynamic Systems, ch. 2 (motor with winding"
+        " inductance)"
+    )
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"lag": (0.0, 0.03)}
+    strengths: ClassVar[tuple[str, ...]] = ("lag",)
+
+    lag: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Of the additional first-order lag; zero or positive."""
+
+    @classmethod
+    def neutral(cls) -> MotorSecondOrder:
+        return cls(lag=0.0)
+
+    def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
+        return (rotor_speed,)
+
+    def motors(
+        self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
+    ) -> tuple[Motors, Memory]:
+        (last,) = memory
+        # Comparison instead of maximum: at zero the derivative is that of a growing lag.
+        lag = jnp.where(self.lag >= 0, self.lag, 0.0)
+        # exp(-100) is nothing; asking for less would divide by the square of a vanishing lag in the derivative.
+        slow = lag > 0.01 * dt
+        decay = jnp.where(slow, jnp.exp(-dt / jnp.where(slow, lag, 1.0)), 0.0)
+        mean = jnp.where(dt > 0, lag * (1 - decay) / jnp.where(dt > 0, dt, 1.0), 1.0)
+        away = last - motors.target
+        return Motors(motors.target + away * mean, motors.time_constant), (motors.target + away * decay,)

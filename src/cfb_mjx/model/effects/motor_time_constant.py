@@ -1,0 +1,33 @@
+"""Motors quicker or lazier than the model says: T *= 1 + relative, the same for all four."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Effect
+from cfb_mjx.model.effects.fields import number
+from cfb_mjx.parameters.parameters import Parameters
+
+
+class MotorTimeConstant(Effect):
+    """T *= 1 + relative."""
+
+    name: ClassVar[str] = "motor_time_constant"
+    units: ClassVar[dict[str, str]] = {"relative": "1"}
+    source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, eq. 5"
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.5, 0.5)}
+    strengths: ClassVar[tuple[str, ...]] = ("relative",)
+
+    relative: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Change of the motors' lag; above -1."""
+
+    @classmethod
+    def neutral(cls) -> MotorTimeConstant:
+        return cls(relative=0.0)
+
+    def change(self, parameters: Parameters) -> Parameters:
+        changed = parameters.motor_time_constant * (1 + self.relative[..., None])
+        return eqx.tree_at(lambda p: p.motor_time_constant, parameters, changed)

@@ -1,0 +1,53 @@
+"""A payload fixed to the body on its z axis, ``height`` above the rotors' centre (negative: below).
+
+It adds its mass, draws the centre of gravity towards itself and adds m M / (m + M) (|d|^2 - d_k^2) to the moment of
+inertia about axis k, d being the way from the old centre of gravity to the payload (parallel axes, about the common
+centre). The payload's own moment of inertia and, where the centre of gravity lies beside the z axis, products of
+inertia are left out.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Effect
+from cfb_mjx.model.effects.fields import number
+from cfb_mjx.parameters.parameters import Parameters
+
+
+class Payload(Effect):
+    """A point mass on the body's z axis."""
+
+    name: ClassVar[str] = "payload"
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "height": "m"}
+    source: ClassVar[str] = (
+        "J. L. Meriam, L. G. Kraige, Engineering Mechanics: Dynamics, app. B (parallel-axis theorem)"
+    )
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"mass": (0.0, 0.02), "height": (-0.05, 0.05)}
+    strengths: ClassVar[tuple[str, ...]] = ("mass",)
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({"height": -0.02}, {"height": 0.02})
+
+    mass: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Of the payload, as a point."""
+    height: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Above the rotors' centre."""
+
+    @classmethod
+    def neutral(cls) -> Payload:
+        return cls(mass=0.0, height=-0.02)
+
+    def change(self, parameters: Parameters) -> Parameters:
+        total = parameters.mass + self.mass
+        height = self.height[..., None]
+        place = jnp.concatenate([0 * height, 0 * height, height], axis=-1)
+        way = place - parameters.center_of_gravity
+        center = parameters.center_of_gravity + way * (self.mass / total)[..., None]
+        squares = way * way
+        added = (parameters.mass * self.mass / total)[..., None] * (squares.sum(-1, keepdims=True) - squares)
+        return eqx.tree_at(
+            lambda p: (p.mass, p.center_of_gravity, p.inertia), parameters, (total, center, parameters.inertia + added)
+        )

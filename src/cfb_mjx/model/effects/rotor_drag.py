@@ -1,0 +1,47 @@
+"""Rotor drag: a turning rotor resists being moved along its disc (induced drag and H-force).
+
+On each rotor i, with v_i = v + omega x r_i the velocity of its hub in body axes:
+
+    F_i,xy = -(coefficient / 4) (Omega_i / 1594 rad/s) v_i,xy
+
+acting at the hub, so besides braking the body it damps yaw.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Condition, Effect, Wrench
+from cfb_mjx.model.effects.fields import HOVER_SPEED, hub_positions, hub_velocities, number
+from cfb_mjx.model.vector import Vec
+
+
+class RotorDrag(Effect):
+    """F_xy = -coefficient (Omega / 1594) v_xy, shared by the four rotors."""
+
+    name: ClassVar[str] = "rotor_drag"
+    units: ClassVar[dict[str, str]] = {"coefficient": "N s/m"}
+    source: ClassVar[str] = (
+        "P. Martin, E. Salaun, The true role of accelerometer feedback in quadrotor control, ICRA 2010; M. "
+        "Faessler, A. Franchi, D. Scaramuzza, RA-L 3(2), 2018"
+    )
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (0.0, 0.05)}
+    strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
+
+    coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Of the four rotors together at hover speed."""
+
+    @classmethod
+    def neutral(cls) -> RotorDrag:
+        return cls(coefficient=0.0)
+
+    def body(self, wrench: Wrench, condition: Condition) -> Wrench:
+        x, y = hub_positions(condition.parameters)
+        along_x, along_y, _ = hub_velocities(condition)
+        share = condition.rotor_speed * (-0.25 / HOVER_SPEED * self.coefficient)
+        force_x, force_y = share * along_x, share * along_y
+        yaw = (x * force_y - y * force_x).sum()
+        return Wrench(wrench.force + Vec(force_x.sum(), force_y.sum(), 0.0), wrench.torque + Vec(0.0, 0.0, yaw))

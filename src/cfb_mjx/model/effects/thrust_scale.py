@@ -1,0 +1,33 @@
+"""All rotors pull harder or weaker than the model says: thrust_scale *= 1 + relative."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Effect
+from cfb_mjx.model.effects.fields import number
+from cfb_mjx.parameters.parameters import Parameters
+
+
+class ThrustScale(Effect):
+    """thrust_scale *= 1 + relative."""
+
+    name: ClassVar[str] = "thrust_scale"
+    units: ClassVar[dict[str, str]] = {"relative": "1"}
+    source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, eq. 8"
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.2, 0.2)}
+    strengths: ClassVar[tuple[str, ...]] = ("relative",)
+
+    relative: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Change of every rotor's thrust."""
+
+    @classmethod
+    def neutral(cls) -> ThrustScale:
+        return cls(relative=0.0)
+
+    def change(self, parameters: Parameters) -> Parameters:
+        changed = parameters.thrust_scale * (1 + self.relative[..., None])
+        return eqx.tree_at(lambda p: p.thrust_scale, parameters, changed)

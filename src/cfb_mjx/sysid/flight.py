@@ -1,0 +1,120 @@
+"""A log made ready for replay: every column at the time of its row, padded to one of a few lengths."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float
+
+from cfb_mjx.logs import FlightLog
+
+LENGTHS = (2560, 4608, 7680)
+"""Rows a flight is padded to (beyond, a multiple of the last): few shapes, so that programs come from the cache."""
+WARM_UP = 0.3
+"""After the start and after every gap rotor speeds are not known from commands for so long, s: six motor lags."""
+_VOLTAGE_SMOOTHING = 0.25
+
+
+class Flight(eqx.Module):
+    """N rows of one log; the padding repeats the last row with zero time between."""
+
+    time: Float[Array, "n"]
+    """Since the log's time zero, s."""
+    interval: Float[Array, "n"]
+    """To the next row, s; 0 at the last and in the padding."""
+    position: Float[Array, "n 3"]
+    velocity: Float[Array, "n 3"]
+    quaternion: Float[Array, "n 4"]
+    """Pose and velocity when the row's time stamp was written, not ``observation_delay`` before."""
+    body_rate: Float[Array, "n 3"]
+    specific_force: Float[Array, "n 3"]
+    command: Float[Array, "n 4"]
+    rotor_speed: Float[Array, "n 4"]
+    """Measured, rad/s; 0 where not."""
+    measured: Float[Array, ""]
+    """1 where the log has rotor speeds throughout."""
+    voltage: Float[Array, "n"]
+    """Of the battery, V, smoothed over past rows; NaN where not measured."""
+    fresh: Float[Array, "n"]
+    """1 at the first row and at the first after a gap."""
+    valid: Float[Array, "n"]
+    """1 where what the model predicts can be compared with the row."""
+
+
+def prepare_flight(log: FlightLog, delay: float) -> Flight:
+    """Rows of a log at their own time.
+
+    Args:
+        log: the flight.
+        delay: age of pose and velocity in a row, s.
+    """
+    n, time = len(log), log.time
+    gaps = log.gaps()
+    fresh = np.zeros(n)
+    fresh[0] = 1.0
+    fresh[gaps + 1] = 1.0
+    since = time - time[np.maximum.accumulate(np.where(fresh > 0, np.arange(n), 0))]
+    ends = np.append(time[gaps], time[-1])
+    until = ends[np.searchsorted(ends, time)] - time
+    # Pose at a row's own time is read from later rows, which must not lie behind a gap.
+    valid = (since >= WARM_UP) & (until >= delay)
+
+    def late(values):
+        return np.stack([np.interp(time + delay, time, column) for column in values.T], axis=1)
+
+    quaternion = late(_continuous(log.quaternion))
+    speed, measured = _rotor_speed(log)
+    flight = {
+        "time": time,
+        "interval": np.append(np.diff(time), 0.0),
+        "position": late(log.position),
+        "velocity": late(log.velocity),
+        "quaternion": quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+        "body_rate": log.body_rate,
+        "specific_force": log.specific_force,
+        "command": np.clip(log.command, 0.0, 1.0),
+        "rotor_speed": speed,
+        "voltage": _smoothed_voltage(log),
+        "fresh": fresh,
+        "valid": valid.astype(float),
+    }
+    length = next((x for x in LENGTHS if x >= n), -(-n // LENGTHS[-1]) * LENGTHS[-1])
+    padded = {key: np.concatenate([v, np.repeat(v[-1:], length - n, axis=0)]) for key, v in flight.items()}
+    padded["valid"][n:] = 0.0
+    padded["fresh"][n:] = 0.0
+    return Flight(**padded, measured=np.array(float(measured)))
+
+
+def _continuous(quaternion: np.ndarray) -> np.ndarray:
+    """Signs chosen so that neighbouring rows are close."""
+    flips = np.sign(np.sum(quaternion[1:] * quaternion[:-1], axis=1))
+    return quaternion * np.concatenate([[1.0], np.cumprod(np.where(flips < 0, -1.0, 1.0))])[:, None]
+
+
+def _rotor_speed(log: FlightLog) -> tuple[np.ndarray, bool]:
+    """Measured rotor speeds with short holes bridged, and whether all motors were measured throughout."""
+    if log.rotor_speed is None:
+        return np.zeros((len(log), 4)), False
+    out = log.rotor_speed.copy()
+    for motor in range(4):
+        good = np.isfinite(out[:, motor])
+        if good.mean() < 0.98:
+            return np.zeros((len(log), 4)), False
+        out[:, motor] = np.interp(log.time, log.time[good], out[good, motor])
+    return out, True
+
+
+def _smoothed_voltage(log: FlightLog) -> np.ndarray:
+    """Voltage over past rows only: it serves at the start of a prediction too."""
+    if log.battery_voltage is None:
+        return np.full(len(log), np.nan)
+    good = np.isfinite(log.battery_voltage)
+    if not good.any():
+        return np.full(len(log), np.nan)
+    raw = np.interp(log.time, log.time[good], log.battery_voltage[good])
+    keep = np.exp(-np.diff(log.time) / _VOLTAGE_SMOOTHING)
+    out = np.empty_like(raw)
+    out[0] = raw[: max(1, round(_VOLTAGE_SMOOTHING / max(log.nominal_interval, 1e-4)))].mean()
+    for k in range(1, len(raw)):
+        out[k] = keep[k - 1] * out[k - 1] + (1 - keep[k - 1]) * raw[k]
+    return out

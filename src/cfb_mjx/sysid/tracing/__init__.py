@@ -1,0 +1,1 @@
+"""From flights to the named physical effect a model lacks."""

@@ -1,0 +1,100 @@
+"""The numbers a search may change: strengths and shapes of every effect of the catalogue, one column each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cfb_mjx.model.effects import CATALOGUE, Effect
+
+LEAD = "command_lead"
+"""Nuisance: commands sent between two rows are not in the log. Always free, never reported as an effect."""
+_COARSE = {"esc_rate_limit": 0.5, "command_delay": 0.2, "motor_second_order": 0.3}
+"""Effects whose slope at zero says little are looked for at this share of their prior range."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """One number: a component of a field of an effect, with other fields at a probe's values."""
+
+    effect: str
+    field: str
+    index: int | None
+    probe: tuple[tuple[str, float], ...] = ()
+    scale: float = field(default=1.0, compare=False)
+    """Half the prior range: the unit in which the search counts."""
+
+    @property
+    def label(self) -> str:
+        """As printed: the field, with the component's number where there are several."""
+        return self.field if self.index is None else f"{self.field}[{self.index}]"
+
+
+def neutral_effects(names: tuple[str, ...]) -> tuple[Effect, ...]:
+    """The named effects of the catalogue where they vanish."""
+    return tuple(CATALOGUE[name].neutral() for name in names)
+
+
+def columns_of(name: str, fields: tuple[str, ...], probe: dict[str, float]) -> list[Column]:
+    """Columns of some fields of an effect."""
+    kind = CATALOGUE[name]
+    neutral = kind.neutral()
+    found = []
+    for item in fields:
+        low, high = kind.prior[item]
+        value = np.asarray(getattr(neutral, item))
+        for index in range(value.size) if value.ndim else [None]:
+            found.append(Column(name, item, index, tuple(probe.items()), (high - low) / 2))
+    return found
+
+
+def strengths(name: str) -> list[list[Column]]:
+    """Columns of an effect's strengths, one list for each probe of its shape."""
+    kind = CATALOGUE[name]
+    return [columns_of(name, kind.strengths, probe) for probe in kind.probes]
+
+
+def shapes(effect: Effect) -> list[Column]:
+    """Columns of what describes the shape of an effect that is there: fitted once its strength is known."""
+    kind = type(effect)
+    moving = {key for probe in kind.probes for key in probe}
+    return columns_of(kind.name, tuple(f for f in kind.prior if f in moving), {})
+
+
+def step_of(column: Column, present: bool) -> float:
+    """Step of the finite difference by which a column is found."""
+    share = 0.02 if present else _COARSE.get(column.effect, 0.05)
+    # A step towards positive values: where zero is the lowest value possible there is nothing on the other side.
+    return share * 2 * column.scale
+
+
+def moved(effect: Effect, column: Column, by: float, present: bool) -> Effect:
+    """The effect with one number changed, and at the column's probe if it is not there yet."""
+    if not present:
+        for key, value in column.probe:
+            effect = eqx.tree_at(lambda e, k=key: getattr(e, k), effect, jnp.full_like(getattr(effect, key), value))
+    old = getattr(effect, column.field)
+    new = old + by if column.index is None else old.at[column.index].add(by)
+    return eqx.tree_at(lambda e: getattr(e, column.field), effect, new)
+
+
+def stacked(
+    effects: tuple[Effect, ...], columns: list[Column], present: set[str]
+) -> tuple[tuple[Effect, ...], np.ndarray]:
+    """The effects as they are and once for every column moved: leaves with a leading axis (1 + columns), and steps."""
+    order = {type(effect).name: i for i, effect in enumerate(effects)}
+    every, steps = [effects], []
+    for column in columns:
+        if column.effect == LEAD:
+            every.append(effects)
+            steps.append(0.05)
+            continue
+        i, here = order[column.effect], column.effect in present
+        step = step_of(column, here)
+        every.append(tuple(moved(e, column, step, here) if j == i else e for j, e in enumerate(effects)))
+        steps.append(step)
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *every), np.array(steps)

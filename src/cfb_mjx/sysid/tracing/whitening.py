@@ -1,0 +1,224 @@
+"""Turning what a model misses into white noise: the filters that say how surprising a residual is, and to which levels.
+
+Three domains, each a scalar filter per axis or motor with two states: the accumulated error of a quantity (body rate,
+velocity, rotor speed) and a wandering disturbance behind it (Ornstein-Uhlenbeck). Innovations of these filters are
+white where the model is right, whatever the controller does (see `cfb_mjx.sysid.identification.innovation`). The
+filters are linear, so the derivative of a residual by a parameter is whitened by the same filter as the residual.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.vector import Vec, rotate
+from cfb_mjx.sysid.flight import Flight
+from cfb_mjx.sysid.replay import replay
+
+BLOCK = 512
+"""Rows that stay together: about two seconds at 250 Hz. A filter starts anew in every block."""
+DOMAINS = {"torque": slice(0, 3), "force": slice(3, 6), "rotor": slice(6, 10)}
+CHANNELS = 10
+MOTOR_LAG = 0.05
+
+
+class Levels(eqx.Module):
+    """Noise levels of the filters, one per channel (body rate 3, velocity 3, rotor speed 4) unless said otherwise."""
+
+    reading: Float[Array, "10"]
+    """White noise of a row: rad/s, m/s, rad/s."""
+    accelerometer: Float[Array, ""]
+    """White noise of a row, m/s^2."""
+    walk: Float[Array, "10"]
+    """White noise driving the quantity, its unit per square root of a second."""
+    disturbance: Float[Array, "10"]
+    """Of the wandering disturbance: rad/s^2, m/s^2, rad/s."""
+    correlation_time: Float[Array, "10"]
+    """Of the disturbance, s."""
+
+
+class Signals(eqx.Module):
+    """What the filters read, row by row; the last axis may hold a residual and its derivatives side by side."""
+
+    quantity: Float[Array, "n 10 *c"]
+    """Body rate, velocity and rotor speed minus what the model accumulates from its accelerations."""
+    acceleration: Float[Array, "n 3 *c"]
+    """Accelerometer minus model, world axes."""
+
+
+def predicted(model: Quadrotor, flight: Flight, driven: Array, lead: Array) -> Signals:
+    """What the model says the sensors read, accumulated from its accelerations (so only changes mean something)."""
+    found = replay(model, flight, driven, lead)
+    dt = flight.interval[:, None]
+    force = Vec.unstack(found.specific_force)
+    following = jnp.concatenate([flight.quaternion[1:], flight.quaternion[-1:]])
+    middle = 0.5 * (flight.quaternion + following)
+    middle = middle / jnp.linalg.norm(middle, axis=1, keepdims=True)
+    world = rotate(Vec.unstack(middle), force).stack()
+    gravity = jnp.array([0.0, 0.0, 1.0]) * model.parameters.gravity
+
+    def accumulated(rate):
+        return jnp.concatenate([jnp.zeros((1, 3)), jnp.cumsum(rate * dt, axis=0)[:-1]])
+
+    before = jnp.concatenate([world[:1], world[:-1]])
+    return Signals(
+        jnp.concatenate(
+            [accumulated(found.angular_acceleration), accumulated(world - gravity), found.rotor_speed], axis=1
+        ),
+        0.5 * (before + world),
+    )
+
+
+def measured(flight: Flight) -> Signals:
+    """What the sensors read."""
+    world = rotate(Vec.unstack(flight.quaternion), Vec.unstack(flight.specific_force)).stack()
+    return Signals(jnp.concatenate([flight.body_rate, flight.velocity, flight.rotor_speed], axis=1), world)
+
+
+class Blocks(eqx.Module):
+    """Signals cut into B blocks of `BLOCK` rows, with what the filters need to know of each row."""
+
+    signals: Signals
+    interval: Float[Array, "b r"]
+    """From the row before, s."""
+    valid: Float[Array, "b r 10"]
+
+
+def cut(flight: Flight, signals: Signals) -> Blocks:
+    """Blocks of a padded flight."""
+    count = flight.time.shape[0] // BLOCK
+    interval = jnp.concatenate([jnp.zeros(1), flight.interval[:-1]])
+    rotor = flight.valid * flight.measured
+    valid = jnp.concatenate([jnp.repeat(flight.valid[:, None], 6, 1), jnp.repeat(rotor[:, None], 4, 1)], axis=1)
+
+    def chop(x):
+        return x[: count * BLOCK].reshape(count, BLOCK, *x.shape[1:])
+
+    return Blocks(jax.tree.map(chop, signals), chop(interval), chop(valid))
+
+
+def innovations(blocks: Blocks, levels: Levels) -> tuple[Array, Array, Array]:
+    """Whitened innovations (b, r, 13, c) of quantities and accelerometer, their log-variances, and where they count.
+
+    Signals need their last axis (c).
+    """
+    return jax.vmap(lambda block: _walk(block, levels))(blocks)
+
+
+def _walk(block: Blocks, levels: Levels):
+    columns = block.signals.quantity.shape[-1]
+    r, ra = levels.reading**2, levels.accelerometer**2
+    is_force = (jnp.arange(CHANNELS) >= 3) & (jnp.arange(CHANNELS) < 6)
+    is_rotor = jnp.arange(CHANNELS) >= 6
+
+    def row(carry, inputs):
+        x, d, pxx, pxd, pdd, known = carry
+        y, a, dt, valid = inputs
+        keep = jnp.exp(-dt / levels.correlation_time)
+        fade = jnp.where(is_rotor, jnp.exp(-dt / MOTOR_LAG), 1.0)
+        gain = jnp.where(is_rotor, 1 - fade, dt)
+        x = fade[:, None] * x + gain[:, None] * d
+        d = keep[:, None] * d
+        pxx = fade**2 * pxx + 2 * fade * gain * pxd + gain**2 * pdd + levels.walk**2 * dt
+        pxd = keep * (fade * pxd + gain * pdd)
+        pdd = keep**2 * pdd + levels.disturbance**2 * (1 - keep**2)
+        # The first row that counts only says where the quantity starts.
+        new = valid * (1 - known)
+        x = jnp.where(new[:, None] > 0, y, x)
+        d = jnp.where(new[:, None] > 0, 0.0, d)
+        pxx = jnp.where(new > 0, r, pxx)
+        pxd = jnp.where(new > 0, 0.0, pxd)
+        pdd = jnp.where(new > 0, levels.disturbance**2, pdd)
+        counts = valid * known
+        s = pxx + r
+        e = y - x
+        kx, kd = counts * pxx / s, counts * pxd / s
+        x, d = x + kx[:, None] * e, d + kd[:, None] * e
+        pxx, pxd, pdd = pxx - kx * pxx, pxd - kx * pxd, pdd - kd * pxd
+        # The accelerometer reads the disturbance of the force itself.
+        also = (counts * is_force)[3:6]
+        s2 = pdd[3:6] + ra
+        e2 = a - d[3:6]
+        kx2, kd2 = also * pxd[3:6] / s2, also * pdd[3:6] / s2
+        x = x.at[3:6].add(kx2[:, None] * e2)
+        d = d.at[3:6].add(kd2[:, None] * e2)
+        pxx = pxx.at[3:6].add(-kx2 * pxd[3:6])
+        pxd_new = pxd.at[3:6].add(-kx2 * pdd[3:6])
+        pdd = pdd.at[3:6].add(-kd2 * pdd[3:6])
+        error = jnp.concatenate([e, e2])
+        variance = jnp.concatenate([s, s2])
+        use = jnp.concatenate([counts, also])
+        return (x, d, pxx, pxd_new, pdd, valid), (
+            error * (use / jnp.sqrt(variance))[:, None],
+            use * jnp.log(variance),
+            use,
+        )
+
+    zero = jnp.zeros(CHANNELS)
+    wide = jnp.zeros((CHANNELS, columns))
+    inputs = (block.signals.quantity, block.signals.acceleration, block.interval, block.valid)
+    return jax.lax.scan(row, (wide, wide, zero, zero, zero, zero), inputs)[1]
+
+
+def domain_of_channel() -> np.ndarray:
+    """(13,) index into `DOMAINS` of every innovation channel."""
+    return np.array([0] * 3 + [1] * 3 + [2] * 4 + [1] * 3)
+
+
+_LOWEST = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-1] * 4)
+
+
+def levels_from(vector: Array, noise: dict[str, np.ndarray]) -> Levels:
+    """Levels from the numbers a likelihood is maximised in (23: walk, disturbance and time per domain and axis)."""
+    spread = jnp.array([0, 1, 2, 3, 4, 5, 6, 6, 6, 6])
+    x = jnp.exp(vector)
+    times = jnp.array([0, 0, 0, 1, 1, 1, 2, 2, 2, 2])
+    reading = jnp.concatenate([noise["gyro"], jnp.full(3, noise["velocity"]), jnp.full(4, noise["rotor"])])
+    return Levels(
+        reading=reading,
+        accelerometer=jnp.asarray(noise["accelerometer"]),
+        walk=_LOWEST + x[:7][spread],
+        disturbance=10 * _LOWEST + x[7:14][spread],
+        correlation_time=jnp.clip(x[14:17][times], 0.05, 3.0),
+    )
+
+
+FIRST = np.log(np.array([0.1] * 3 + [0.02] * 3 + [10.0] + [0.5] * 3 + [0.1] * 3 + [10.0] + [0.4, 0.4, 0.5]))
+
+
+@eqx.filter_jit
+def _loss(vector, noise, blocks: Blocks):
+    wide = jax.tree.map(lambda x: x[..., None], blocks.signals)
+    e, logs, use = innovations(Blocks(wide, blocks.interval, blocks.valid), levels_from(vector, noise))
+    # Very long tails (a gust, a glitch) must not set the level of everything.
+    size = jnp.abs(e[..., 0])
+    surprise = jnp.where(size < 4, size**2, 8 * size - 16)
+    prior = 0.05 * jnp.sum((vector - FIRST) ** 2)
+    return (0.5 * jnp.sum(logs + surprise * use) + prior) / jnp.maximum(jnp.sum(use), 1.0)
+
+
+_slope = eqx.filter_jit(jax.value_and_grad(_loss))
+
+
+def fit_levels(blocks: Blocks, noise: dict[str, np.ndarray], start: np.ndarray = FIRST) -> np.ndarray:
+    """Noise levels of largest likelihood for a residual: the vector of `levels_from`."""
+    from scipy.optimize import minimize
+
+    def both(x):
+        value, slope = _slope(jnp.asarray(x), noise, blocks)
+        return float(value), np.asarray(slope)
+
+    low, high = FIRST - 7, FIRST + 6
+    found = minimize(
+        both,
+        np.clip(start, low, high),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": 40, "ftol": 1e-7},
+    )
+    return found.x

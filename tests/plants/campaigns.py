@@ -1,0 +1,153 @@
+"""Cases and the logs a user would have recorded of them: fit flights and held-out flights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+from plants import constants as c
+from plants import effects, physics
+from plants.controller import POSITION
+from plants.manoeuvres import MANOEUVRES
+from plants.sensors import Instruments, draw_instruments, row_ticks
+from plants.simulation import Flight, Lane, simulate
+
+FIT = ("lateral", "roll_pitch_excitation", "vertical", "low_altitude", "motor_excitation", "long_hover")
+SECONDS = {"hover": (10.0, 13.0), "long_hover": (24.0, 30.0)}
+TRIES = 6
+MARGIN = 25  # ticks a log starts after the warm-up, so that late columns have a past
+
+
+@dataclass(frozen=True)
+class Case:
+    """A drone to draw: ``effects`` are (name, strength); none for a nominal drone."""
+
+    name: str
+    seed: int
+    effects: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def labels(self) -> list[str]:
+        """Names a perfect diagnosis would give; empty for a nominal drone."""
+        return sorted({effects.label(name) for name, _ in self.effects})
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Logs of one drone; ``truth`` holds the labels and all that was drawn."""
+
+    case: Case
+    fit: list[FlightLog]
+    held_out: list[FlightLog]
+    truth: dict
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A flight to make: of which case, which of its logs, and what is common to the case's flights."""
+
+    case: Case
+    drone: dict[str, np.ndarray]
+    instruments: Instruments
+    index: int
+    manoeuvre: str
+    held_out: bool
+    duration_scale: float
+
+
+def fly_campaigns(cases: list[Case], duration_scale: float = 1.0) -> list[Campaign]:
+    """Fly all logs of all cases in one run. A flight that crashes is drawn anew, gentler each time.
+
+    Args:
+        cases: whose names should differ; a case's logs do not depend on the others.
+        duration_scale: factor on the logs' lengths.
+    """
+    drawn = [_draw(case, duration_scale) for case in cases]
+    waiting = [plan for plans, _ in drawn for plan in plans]
+    logs: dict[tuple[int, int], FlightLog] = {}
+    order = {id(plan): (i, plan.index) for i, (plans, _) in enumerate(drawn) for plan in plans}
+    for attempt in range(TRIES):
+        flights = [_lane(plan, attempt) for plan in waiting]
+        crashed = []
+        for plan, lane, flight in zip(waiting, flights, simulate(flights), strict=True):
+            if flight.crashed:
+                crashed.append(plan)
+            else:
+                logs[order[id(plan)]] = _log(plan, lane, flight, attempt)
+                drawn[order[id(plan)][0]][1]["tries"][plan.index] = attempt + 1
+        waiting = crashed
+        if not waiting:
+            break
+    if waiting:
+        raise RuntimeError("cannot stay in the air: " + ", ".join(f"{p.case.name}/{p.manoeuvre}" for p in waiting))
+    campaigns = []
+    for i, (plans, truth) in enumerate(drawn):
+        own = [(plan.held_out, logs[i, plan.index]) for plan in plans]
+        fit, held_out = [log for held, log in own if not held], [log for held, log in own if held]
+        campaigns.append(Campaign(cases[i], fit, held_out, truth))
+    return campaigns
+
+
+def _draw(case: Case, duration_scale: float) -> tuple[list[_Plan], dict]:
+    """The flights of a case and its truth."""
+    drone = physics.nominal()
+    truth: dict = {"labels": case.labels, "effects": {}}
+    for order, (name, strength) in enumerate(case.effects):
+        rng = np.random.default_rng([case.seed, 1000 + order])
+        truth["effects"][name] = effects.apply(name, rng, drone, strength)
+    rng = np.random.default_rng([case.seed, 2000])
+    instruments = draw_instruments(rng)
+    fit = [*FIT, "hover"] if rng.random() < 0.6 else list(FIT)
+    held_out = [rng.choice(["figure8", "circle"]), "waypoints", rng.choice(["mixed_excitation", "yaw_recovery"])]
+    names = [*fit, *map(str, held_out), "climb_dive"]
+    plans = [_Plan(case, drone, instruments, i, name, i >= len(fit), duration_scale) for i, name in enumerate(names)]
+    truth |= {"instruments": vars(instruments), "manoeuvres": names, "tries": [0] * len(names)}
+    return plans, truth
+
+
+def _lane(plan: _Plan, attempt: int) -> Lane:
+    """Draw one flight."""
+    rng, noise = np.random.default_rng([plan.case.seed, plan.index, attempt]).spawn(2)
+    seconds = plan.duration_scale * rng.uniform(*SECONDS.get(plan.manoeuvre, (13.0, 17.0)))
+    setpoints = MANOEUVRES[plan.manoeuvre](rng, seconds, 0.85**attempt)
+    if plan.drone["bob_mass"] > 0:
+        setpoints[:, POSITION.stop - 1] += plan.drone["bob_length"] + 0.1  # nobody drags a load over the floor
+    rows = row_ticks(rng, len(setpoints) * c.SETPOINT_TICKS - MARGIN, plan.instruments.irregular, rng.random() < 0.4)
+    return Lane(
+        plan.drone,
+        plan.instruments,
+        setpoints,
+        rows + MARGIN,
+        voltage=rng.uniform(3.4, 3.95),
+        gyro_bias=0.003 * rng.standard_normal(3),
+        rng=noise,
+    )
+
+
+def _log(plan: _Plan, lane: Lane, flight: Flight, attempt: int) -> FlightLog:
+    """A log of a flight, with the noise of whatever the controller did not use."""
+    rng = np.random.default_rng([plan.case.seed, plan.index, attempt, 1])
+    instruments, count = plan.instruments, len(lane.rows)
+    bias = 0.03 * rng.standard_normal(3)
+    speed = None
+    if instruments.measures_rotors and rng.random() < 0.7:
+        speed = flight.motors[:, 4:] + instruments.rotor_speed * rng.standard_normal((count, 4))
+    return FlightLog(
+        time=(lane.rows - lane.rows[0]) * c.TICK,
+        position=flight.pose[:, :3],
+        velocity=flight.pose[:, 3:6] * plan.drone["velocity_scale"],
+        quaternion=flight.pose[:, 6:],
+        body_rate=flight.inertial[:, :3],
+        specific_force=flight.inertial[:, 3:6] + bias + instruments.accelerometer * rng.standard_normal((count, 3)),
+        command=flight.motors[:, :4],
+        rotor_speed=speed,
+        battery_voltage=flight.inertial[:, 6] + instruments.battery * rng.standard_normal(count),
+        metadata={
+            "name": f"log_{plan.index + 1:02d}",
+            "source": "plant",
+            "format": "made",
+            "observation_delay": c.POSE_TICKS * c.TICK,
+        },
+    )

@@ -1,0 +1,116 @@
+"""Forces of the four rotors and the lag of their motors. Arrays are (4, F); body axes; SI units."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from plants import constants as c
+
+HUB_EFFECTS = frozenset({"inflow", "rotor_drag", "flapping", "ground"})
+DISC = np.pi * c.BLADE_RADIUS**2
+ESC_SETTLING = 0.002  # s: a rate-limited speed controller's lag for small changes
+
+
+def motor_rates(p: SimpleNamespace, gain, command, speed, esc, lagged):
+    """Rates of rotor speed and, where simulated, of the speed controller's and of the second lag's output."""
+    esc_rate = lag_rate = None
+    if "esc_rate" in p.on:
+        limit = np.maximum(p.esc_rate, 1e-6)
+        esc_rate = p.esc_rate * np.tanh((command - esc) / (limit * ESC_SETTLING))
+        command = np.where(p.esc_rate > 0, esc, command)
+    if "second_lag" in p.on:
+        has = p.second_lag > 0
+        lag_rate = np.where(has, (command - lagged) / np.where(has, p.second_lag, 1.0), 0.0)
+        command = np.where(has, lagged, command)
+    missing = gain * command - speed
+    lag = p.lag
+    if "asymmetry" in p.on:
+        # Braking relies on drag and is slower; geometric mean of both constants is the plain one.
+        lag = lag * np.exp(-0.5 * p.asymmetry * np.tanh(missing / p.asymmetry_width))
+    return missing / lag, esc_rate, lag_rate
+
+
+def rotor_wrench(p: SimpleNamespace, height, rotation, body_velocity, w, speed, speed_rate):
+    """Force (3, F) and moment (3, F) of all rotors about their centre.
+
+    Args:
+        p: physics.
+        height: (F,) of the rotors' centre, m.
+        rotation: (3, 3, F) body to world.
+        body_velocity: (3, F) m/s, body axes.
+        w: (3, F) rad/s.
+        speed, speed_rate: (4, F) rad/s and rad/s^2.
+    """
+    thrust, drag = c.thrust_curve(speed), c.torque_curve(speed)
+    if "thrust_scale" in p.on:
+        thrust = thrust * (p.thrust_scale + p.thrust_bend * (speed / c.SPEED_SCALE - 0.55))
+    if "torque_scale" in p.on:
+        drag = drag * p.torque_scale
+    hub = None
+    if p.on & HUB_EFFECTS:
+        hub = (
+            body_velocity[0] - w[2] * c.ROTOR_Y,
+            body_velocity[1] + w[2] * c.ROTOR_X,
+            body_velocity[2] + w[0] * c.ROTOR_Y - w[1] * c.ROTOR_X,
+        )
+        across2 = hub[0] ** 2 + hub[1] ** 2
+    if "inflow" in p.on:
+        thrust = thrust * _inflow(p, thrust, hub[2], across2, speed)
+    if "ground" in p.on:
+        thrust = thrust * _ground(p, height, rotation, across2)
+    spin = (c.ROTOR_INERTIA * speed_rate + drag) * c.YAW
+    force = np.empty((3, thrust.shape[1]))
+    moment = np.empty_like(force)
+    force[:2] = 0.0
+    force[2] = thrust.sum(0)
+    moment[0] = (c.ROTOR_Y * thrust).sum(0)
+    moment[1] = -(c.ROTOR_X * thrust).sum(0)
+    moment[2] = spin.sum(0)
+    if "tilt" in p.on:
+        side_x, side_y = p.tilt[0] * thrust, p.tilt[1] * thrust
+        force[0] += side_x.sum(0)
+        force[1] += side_y.sum(0)
+        moment[2] += (c.ROTOR_X * side_y - c.ROTOR_Y * side_x).sum(0)
+        moment[0] += (p.tilt[0] * spin).sum(0)
+        moment[1] += (p.tilt[1] * spin).sum(0)
+    if p.on & {"rotor_drag", "flapping"}:
+        loading = np.sqrt(thrust / c.HOVER_THRUST)
+    if "rotor_drag" in p.on:
+        size = loading / np.sqrt(1 + across2 / p.rotor_drag_speed**2)
+        side_x, side_y = -p.rotor_drag[0] * size * hub[0], -p.rotor_drag[1] * size * hub[1]
+        force[0] += side_x.sum(0)
+        force[1] += side_y.sum(0)
+        moment[2] += (c.ROTOR_X * side_y - c.ROTOR_Y * side_x).sum(0)
+    if "flapping" in p.on:
+        # The disc tips away from the motion: nose up when flying forward. The part at right angles to the motion
+        # turns with each rotor's sense and nearly cancels over the four.
+        size = 0.25 * p.flapping * loading**2 / np.sqrt(1 + across2 / 49.0)
+        size = size * (1 - p.flapping_climb * np.tanh(hub[2] / 2.0))
+        turn = p.flapping_cross * c.YAW
+        moment[0] += (size * (hub[1] + turn * hub[0])).sum(0)
+        moment[1] += (size * (turn * hub[1] - hub[0])).sum(0)
+    if "gyro_inertia" in p.on:
+        momentum = -p.gyro_inertia * (c.YAW * speed).sum(0)  # rotors turn against the torque they put on the body
+        moment[0] -= w[1] * momentum
+        moment[1] += w[0] * momentum
+    return force, moment
+
+
+def _inflow(p, thrust, climb, across2, speed):
+    """Thrust ratio for a rotor moving along its axis (momentum theory) and, less, across it."""
+    hover2 = thrust / (2 * c.AIR_DENSITY * DISC)
+    hover = np.sqrt(hover2)
+    through = 0.5 * climb + np.sqrt(0.25 * climb**2 + hover2 / np.sqrt(1 + 0.04 * across2 / (hover2 + 1.0)))
+    tip = c.BLADE_RADIUS * np.maximum(speed, 500.0)
+    return 1 - 0.3 * np.tanh(p.inflow * (through - hover) / (0.3 * tip))
+
+
+def _ground(p, height, rotation, across2):
+    """Thrust ratio near the floor: an image rotor below, softened close in, weaker when tilted or blown away."""
+    level = height + rotation[2, 0] * c.ROTOR_X + rotation[2, 1] * c.ROTOR_Y
+    level = np.maximum(level, 0.0)
+    image = p.ground / (level**2 + p.ground_core**2)
+    image = image * rotation[2, 2] ** 2 / (1 + across2 / p.ground_wash**2)
+    return 1 + image / (1 - 0.6 * np.minimum(image, 1.0))

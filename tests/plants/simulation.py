@@ -1,0 +1,211 @@
+"""The time loop: many flights at once, each with its own physics, sensors and set-points. SI units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+
+import numpy as np
+
+from plants import constants as c
+from plants import physics
+from plants.airframe import BOB, BOB_V, ESC, LAGGED, PLAIN_ROWS, ROWS, SPEED, P, Q, V, W, advance
+from plants.controller import DITHER, POSITION, YAW_ANGLE, Controller
+from plants.sensors import Instruments, LowPass, Recorder
+
+CHUNK = 250  # ticks of noise drawn at a time
+# Columns of the noise: position, velocity, quaternion, gyro, then what drives push, twist and gust.
+NOISES = 21
+PUSH_KEEP = np.exp(-c.TICK / 0.3)
+GUST_KEEP = np.exp(-c.TICK / 1.5)
+HOVER_CURRENT, IDLE_CURRENT, RESISTANCE, DISCHARGE = 4.5, 0.3, 0.045, 6e-4  # A, A, ohm, V/C
+CURRENT_KEEP = np.exp(-c.TICK / 0.03)
+# Beyond these a flight counts as crashed, rad/s and cosine of tilt.
+RATE_LIMIT, TILT_LIMIT = 15.0, np.cos(np.radians(80.0))
+EXTRA = frozenset({"esc_rate", "second_lag", "bob_mass", "flex"})
+DELAY_RING = 16
+
+
+@dataclass(frozen=True)
+class Lane:
+    """One flight to fly.
+
+    Attributes:
+        drone: physics, as `physics.nominal` gives.
+        instruments: noise levels.
+        setpoints: (n, 17) at 100 Hz; flown after a warm-up at the first one.
+        rows: ticks from the start of the log at which it has rows.
+        voltage: of the resting battery at the start, V.
+        gyro_bias: (3,) rad/s.
+        rng: of the noise in the loop.
+    """
+
+    drone: dict[str, np.ndarray]
+    instruments: Instruments
+    setpoints: np.ndarray
+    rows: np.ndarray
+    voltage: float
+    gyro_bias: np.ndarray
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What was recorded: ``crashed``; late pose (n, 10); gyro, accelerometer, voltage (n, 7); command, speed (n, 8)."""
+
+    crashed: bool
+    pose: np.ndarray
+    inertial: np.ndarray
+    motors: np.ndarray
+
+
+def simulate(lanes: list[Lane]) -> list[Flight]:
+    """Fly all lanes side by side; nothing drawn or computed in one depends on the others."""
+    loop = _Loop(lanes)
+    for tick in range(loop.ticks):
+        loop.step(tick)
+    return [
+        Flight(bool(loop.crashed[i]), loop.pose.lane(i), loop.inertial.lane(i), loop.motors.lane(i))
+        for i in range(len(lanes))
+    ]
+
+
+class _Loop:
+    """State of all lanes."""
+
+    def __init__(self, lanes: list[Lane]):
+        count = len(lanes)
+        self.lanes = lanes
+        self.p = p = physics.stack([lane.drone for lane in lanes])
+        self.goals = _padded([lane.setpoints for lane in lanes])
+        self.ends = np.array([c.WARM_UP_TICKS + len(lane.setpoints) * c.SETPOINT_TICKS for lane in lanes])
+        shift, extra = p.motor_shift.astype(int), p.extra_delay.astype(int)
+        rows = [c.WARM_UP_TICKS + lane.rows for lane in lanes]
+        self.pose = Recorder([r - e for r, e in zip(rows, extra, strict=True)], 10)
+        self.inertial = Recorder(rows, 7)
+        # Motor columns of a row hold what was true `motor_shift` ticks before it.
+        self.motors = Recorder([r - s for r, s in zip(rows, shift, strict=True)], 8)
+        self.ticks = int(self.ends.max()) + max(0, -int(shift.min())) + 1
+        self.x = self.start = _start(p, self.goals[0])
+        self.levels = _levels([lane.instruments for lane in lanes])
+        self.gyro_bias = np.stack([lane.gyro_bias for lane in lanes], axis=1)
+        self.controller, self.low_pass = Controller(count), LowPass(p.gyro_corner)
+        self.past = [self.x[: W.start]] * c.POSE_TICKS
+        self.commands = np.full((DELAY_RING, 4, count), c.HOVER_SPEED / c.MOTOR_GAIN)
+        self.wander = np.zeros((8, count))
+        self.phase = np.array([lane.rng.uniform(0, 2 * np.pi) for lane in lanes])
+        self.heat = np.zeros((4, count))
+        self.charge, self.current = np.zeros(count), np.full(count, HOVER_CURRENT)
+        self.resting = np.array([lane.voltage for lane in lanes])
+        self.crashed = np.zeros(count, dtype=bool)
+
+    def step(self, tick: int) -> None:
+        """One tick: measure, decide, record, move on."""
+        if tick % CHUNK == 0:
+            self.noise = np.stack([lane.rng.standard_normal((CHUNK, NOISES)) for lane in self.lanes], axis=-1)
+        noise = self.noise[tick % CHUNK] * self.levels
+        self.past.append(self.x[: W.start])
+        late = self.past.pop(0) + noise[:10]
+        late[Q] /= np.sqrt((late[Q] ** 2).sum(0))
+        gyro = self.x[W] + noise[10:13] + self.gyro_bias
+        goal = self.goals[min(max(tick - c.WARM_UP_TICKS, 0) // c.SETPOINT_TICKS, len(self.goals) - 1)]
+        seen = SimpleNamespace(position=late[P], velocity=late[V], quaternion=late[Q])
+        command = self.controller(goal, seen, gyro)
+        voltage = self._battery()
+        held = self._held(noise, voltage)
+        self.commands[tick % DELAY_RING] = command
+        moved, specific = self._move(tick, command, held)
+        self.pose(tick, late)
+        self.inertial(tick, self.low_pass(gyro), specific, voltage[None])
+        self.motors(tick, command, self.x[SPEED])
+        self.x = moved
+        if tick % 5 == 0:
+            self._check(tick)
+
+    def _move(self, tick, command, held):
+        x, first, step = self.x, None, c.TICK / c.SUBSTEPS
+        for sub in range(c.SUBSTEPS):
+            time = tick * c.TICK + sub * step
+            x, specific = advance(self.p, x, self._arrived(tick, sub, command), held, time, step)
+            first = specific if first is None else first
+        return x, first
+
+    def _arrived(self, tick, sub, command):
+        """Commands as they reach the motors, each lane's own delay (whole substeps) later."""
+        if "delay_ms" not in self.p.on:
+            return command
+        past = (c.SUBSTEPS * tick + sub - self.p.delay_ms.astype(int)) // c.SUBSTEPS
+        return self.commands[past % DELAY_RING, :, np.arange(command.shape[1])].T
+
+    def _battery(self):
+        """Voltage (F,); drained and pulled down by the rotors' power."""
+        load = IDLE_CURRENT + (HOVER_CURRENT - IDLE_CURRENT) / 4 * ((self.x[SPEED] / c.HOVER_SPEED) ** 3).sum(0)
+        self.current = CURRENT_KEEP * self.current + (1 - CURRENT_KEEP) * load
+        self.charge += c.TICK * self.current
+        return self.resting - DISCHARGE * self.charge - RESISTANCE * (self.current - HOVER_CURRENT)
+
+    def _held(self, noise, voltage):
+        """Whatever stays constant over a tick."""
+        p = self.p
+        keep = PUSH_KEEP
+        self.wander[:6] = keep * self.wander[:6] + np.sqrt(1 - keep**2) * noise[13:19]
+        self.wander[6:] = GUST_KEEP * self.wander[6:] + np.sqrt(1 - GUST_KEEP**2) * noise[19:21]
+        gain = p.gain
+        if "sag" in p.on:
+            gain = gain * np.maximum(voltage / p.sag_voltage, 0.1) ** p.sag
+        if "thermal_drop" in p.on:
+            self.heat += c.TICK / p.thermal_time * ((self.x[SPEED] / c.HOVER_SPEED) ** 3 - self.heat)
+            gain = gain * (1 - p.thermal_drop * np.tanh(self.heat) / np.tanh(1.0))
+        return SimpleNamespace(
+            gain=gain,
+            push=self.wander[:3],
+            twist=self.wander[3:6],
+            gust=p.gust * self.wander[6:],
+            phase=self.phase,
+        )
+
+    def _check(self, tick):
+        """Mark crashed flights, and set them back to hover so that they cannot overflow."""
+        x = self.x
+        level = 1 - 2 * (x[7] ** 2 + x[8] ** 2)
+        wild = (np.abs(x[W]).max(0) > RATE_LIMIT) | (level < TILT_LIMIT) | (x[2] < 0.0)
+        wild |= (np.abs(x[P]).max(0) > 30.0) | ~np.isfinite(x).all(0)
+        if wild.any():
+            self.crashed |= wild & (tick < self.ends)
+            self.x = np.where(wild, self.start, x)
+
+
+def _levels(instruments: list[Instruments]) -> np.ndarray:
+    """(21, F) standard deviations of the noise columns."""
+    return np.array(
+        [
+            [i.position] * 3 + [i.velocity] * 3 + [i.quaternion] * 4 + [i.gyro] * 3 + [i.push] * 3
+            + [i.twist, i.twist, 0.4 * i.twist, 1.0, 1.0]
+            for i in instruments
+        ]
+    ).T  # fmt: skip
+
+
+def _padded(setpoints: list[np.ndarray]) -> np.ndarray:
+    """(n, 17, F) set-points; a flight that is over stays where it is."""
+    length = max(map(len, setpoints))
+    goals = np.zeros((length, setpoints[0].shape[1], len(setpoints)))
+    for lane, own in enumerate(setpoints):
+        goals[: len(own), :, lane] = own
+        goals[len(own) :, POSITION, lane] = own[-1, POSITION]
+        goals[len(own) :, YAW_ANGLE, lane] = own[-1, YAW_ANGLE]
+    goals[0, POSITION.stop : YAW_ANGLE] = 0.0
+    goals[0, YAW_ANGLE + 1 : DITHER.stop] = 0.0
+    return goals
+
+
+def _start(p: SimpleNamespace, goal: np.ndarray) -> np.ndarray:
+    """Level, at rest at the first set-point, rotors at the nominal hover speed; a bob hangs straight down."""
+    x = np.zeros((ROWS if p.on & EXTRA else PLAIN_ROWS, goal.shape[1]))
+    x[P], x[6] = goal[POSITION], 1.0
+    x[SPEED] = c.HOVER_SPEED
+    if len(x) > PLAIN_ROWS:
+        x[ESC] = x[LAGGED] = c.HOVER_SPEED / c.MOTOR_GAIN
+        x[BOB.stop - 1] = -p.bob_length
+        x[BOB_V] = 0.0
+    return x
