@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
@@ -19,8 +18,11 @@ from cfb_mjx.sysid.tracing.columns import LEAD, Column
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, evidence, solve
 from cfb_mjx.sysid.tracing.gram import driven_by, gram, residual_blocks
 from cfb_mjx.sysid.tracing.noise import sensor_noise
+from cfb_mjx.sysid.tracing.sensors import SensorCheck
 from cfb_mjx.sysid.tracing.whitening import FIRST, Blocks, fit_levels, levels_from
 
+LEAD_RANGE = (0.0, 0.6)
+"""Share of the next command in the mean over an interval: half at most, if commands not logged came right behind."""
 PAD = 8
 """Columns are padded to a multiple of this with copies of the lead, so that one compiled program serves all rounds."""
 
@@ -74,16 +76,17 @@ class Search:
 
     parameters: Parameters
     flights: list[Flight]
+    logs: list[FlightLog]
     noise: dict[str, np.ndarray]
     names: tuple[str, ...]
     levels: np.ndarray = field(default_factory=lambda: FIRST.copy())
-    progress: Callable[[str], None] = print
 
     @classmethod
-    def start(cls, logs: list[FlightLog], parameters: Parameters, delay: float, **choices) -> Search:
-        """Prepare flights for a search over the whole catalogue."""
+    def start(cls, logs: list[FlightLog], parameters: Parameters, delay: float, sensors: SensorCheck) -> Search:
+        """Prepare flights, with what is known of their sensors taken out, for a search over the whole catalogue."""
+        logs = [sensors.corrected(log) for log in logs]
         flights = [prepare_flight(log, delay) for log in logs]
-        return cls(parameters, flights, sensor_noise(logs), tuple(CATALOGUE), **choices)
+        return cls(parameters, flights, logs, sensor_noise(logs), tuple(CATALOGUE))
 
     def nothing(self) -> Hypothesis:
         """The declared model."""
@@ -164,7 +167,7 @@ class Search:
             effects[column.effect] = eqx.tree_at(
                 lambda e, f=column.field: getattr(e, f), effect, jnp.asarray(value)
             )
-        lead = float(np.clip(hypothesis.lead + by[0], -1.0, 2.0))
+        lead = float(np.clip(hypothesis.lead + by[0], *LEAD_RANGE))
         return Hypothesis(tuple(effects[type(e).name] for e in hypothesis.effects), hypothesis.present, lead)
 
     def adding(self, hypothesis: Hypothesis, linear: Linear, variant: list[Column]) -> Evidence | None:

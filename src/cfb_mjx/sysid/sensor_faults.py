@@ -1,0 +1,99 @@
+"""What measuring does to a flight: lags, scales and shifts of columns, taken out before a model is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.rotation import tidy
+
+UNITS = {
+    "sensor_delay": ("delay", "s"),
+    "sensor_velocity_scale": ("scale", "1"),
+    "sensor_gyro_lowpass": ("lag", "s"),
+    "sensor_time_shift": ("shift", "s"),
+}
+"""Field and unit of every fault a model file may list among its effects."""
+
+
+@dataclass(frozen=True)
+class SensorFaults:
+    """Of a recording chain; the defaults are healthy.
+
+    Attributes:
+        delay: age of pose and velocity beyond the declared observation delay, s.
+        velocity_scale: logged velocity over true velocity.
+        gyro_lag: lag of the gyro column, s.
+        motor_shift: how late command and rotor-speed columns are against all others, s (negative: early).
+    """
+
+    delay: float = 0.0
+    velocity_scale: float = 1.0
+    gyro_lag: float = 0.0
+    motor_shift: float = 0.0
+
+    @property
+    def healthy(self) -> bool:
+        """Whether there is nothing to take out."""
+        return self == SensorFaults()
+
+    def repaired(self, log: FlightLog) -> FlightLog:
+        """The log a healthy chain would have recorded; rows whose replacements lie in a gap or beyond the end go."""
+        if self.healthy:
+            return log
+        time = log.time
+        gaps = log.gaps()
+        changes = {}
+
+        def later(values, by):
+            return np.stack([np.interp(time + by, time, column) for column in values.T], axis=1)
+
+        if self.delay:
+            changes["position"] = later(log.position, self.delay)
+            changes["quaternion"] = tidy(later(_continuous(log.quaternion), self.delay))
+        if self.delay or self.velocity_scale != 1.0:
+            changes["velocity"] = later(log.velocity, self.delay) / self.velocity_scale
+        if self.gyro_lag:
+            changes["body_rate"] = later(log.body_rate, self.gyro_lag)
+        if self.motor_shift:
+            # Commands are held, so the row in force is taken, not a value between two.
+            at = np.searchsorted(time, time + self.motor_shift + 1e-9, side="right") - 1
+            changes["command"] = log.command[np.clip(at, 0, len(time) - 1)]
+            if log.rotor_speed is not None:
+                changes["rotor_speed"] = later(log.rotor_speed, self.motor_shift)
+        low, high = min(0.0, self.motor_shift), max(self.delay, self.gyro_lag, self.motor_shift)
+        begin, end = time[gaps], time[gaps + 1]
+        crossing = (time[:, None] + high > begin) & (time[:, None] <= begin)
+        crossing |= (time[:, None] + low < end) & (time[:, None] >= end)
+        keep = (time + high <= time[-1]) & (time + low >= time[0]) & ~crossing.any(axis=1)
+        return log.replace(**changes).rows(keep)
+
+    def to_mappings(self) -> list[dict]:
+        """As listed among the effects of a model file."""
+        values = (self.delay, self.velocity_scale, self.gyro_lag, self.motor_shift)
+        healthy = SensorFaults()
+        usual = (healthy.delay, healthy.velocity_scale, healthy.gyro_lag, healthy.motor_shift)
+        return [
+            {"name": name, "parameters": {field: value}}
+            for (name, (field, _)), value, normal in zip(UNITS.items(), values, usual, strict=True)
+            if value != normal
+        ]
+
+    @classmethod
+    def from_mappings(cls, items) -> SensorFaults:
+        """The faults among the effects of a model file."""
+        found = {item["name"]: (item.get("parameters") or {}) for item in items if item.get("name") in UNITS}
+        pick = {name: values.get(UNITS[name][0]) for name, values in found.items()}
+        return cls(
+            delay=float(pick.get("sensor_delay") or 0.0),
+            velocity_scale=float(pick.get("sensor_velocity_scale") or 1.0),
+            gyro_lag=float(pick.get("sensor_gyro_lowpass") or 0.0),
+            motor_shift=float(pick.get("sensor_time_shift") or 0.0),
+        )
+
+
+def _continuous(quaternion: np.ndarray) -> np.ndarray:
+    flips = np.sign(np.sum(quaternion[1:] * quaternion[:-1], axis=1))
+    return quaternion * np.concatenate([[1.0], np.cumprod(np.where(flips < 0, -1.0, 1.0))])[:, None]

@@ -1,0 +1,127 @@
+"""Which sensors are at fault, by comparing them with each other (`kinematics`), pooled over flights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.tracing.kinematics import Kinematics, compare_sensors
+
+SMALLEST = {"sensor_delay": 0.003, "sensor_gyro_lowpass": 0.0025, "sensor_velocity_scale": 0.01}
+"""Faults below this are left alone: every estimator and filter has some."""
+SURE = 5.0
+"""Standard deviations a fault must be away from nothing."""
+_BIAS_NOISE = 0.008
+"""Of an accelerometer bias found from one flight, m/s^2: biases that scatter no more are taken as one."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sensor fault."""
+
+    name: str
+    value: float
+    std: float
+
+    @property
+    def p_value(self) -> float:
+        """Two-sided, of no fault."""
+        healthy = 1.0 if self.name == "sensor_velocity_scale" else 0.0
+        return float(2 * norm.sf(abs(self.value - healthy) / self.std))
+
+
+@dataclass(frozen=True)
+class SensorCheck:
+    """What a campaign says about its sensors."""
+
+    faults: SensorFaults
+    findings: list[Finding]
+    measured: dict[str, tuple[float, float]]
+    """Every quantity looked at: value and standard deviation."""
+    gyro_bias: dict[str, np.ndarray]
+    accelerometer_bias: dict[str, np.ndarray]
+    """Per log name, rad/s and m/s^2."""
+
+    def corrected(self, log: FlightLog) -> FlightLog:
+        """A flight of this campaign with faults and biases taken out."""
+        log = self.faults.repaired(log)
+        return log.replace(
+            body_rate=log.body_rate - self.gyro_bias.get(log.name, 0.0),
+            specific_force=log.specific_force - self.accelerometer_bias.get(log.name, 0.0),
+        )
+
+
+def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
+    """Compare the sensors of a campaign's flights with each other.
+
+    Args:
+        logs: flights of one drone.
+        delay: declared age of pose and velocity, s.
+    """
+    kinematics = [compare_sensors(log, delay) for log in logs]
+    pooled = {
+        "attitude_lag": _pooled(kinematics, "attitude_lag", 0),
+        "velocity_lag": _pooled(kinematics, "velocity_lag", 1),
+        "velocity_scale": _pooled(kinematics, "velocity_scale", 2),
+    }
+    (turn, turn_std), (gain, gain_std), (scale, scale_std) = pooled.values()
+    # The accelerometer has its own clockwork beside the pose's; the gyro's lag is what is left between the two.
+    gyro = gain - turn, float(np.hypot(turn_std, gain_std))
+    looked = {
+        "sensor_delay": (gain, gain_std),
+        "sensor_gyro_lowpass": gyro,
+        "sensor_velocity_scale": (scale, scale_std),
+    }
+    findings = []
+    for name, (value, std) in looked.items():
+        away = abs(value - (1.0 if name == "sensor_velocity_scale" else 0.0))
+        # A gyro cannot be ahead of what it measures.
+        if away > SMALLEST[name] and away > SURE * std and not (name == "sensor_gyro_lowpass" and value < 0):
+            findings.append(Finding(name, value, std))
+    if any(f.name == "sensor_delay" for f in findings) and not any(f.name == "sensor_gyro_lowpass" for f in findings):
+        # With a healthy gyro both comparisons show the same delay; the turn tells it more exactly.
+        weight = np.array([1 / turn_std**2, 1 / gain_std**2])
+        value = float(weight @ [turn, gain] / weight.sum())
+        findings = [Finding(f.name, value, float(weight.sum() ** -0.5)) if f.name == "sensor_delay" else f for f in findings]
+    found = {f.name: f.value for f in findings}
+    faults = SensorFaults(
+        delay=found.get("sensor_delay", 0.0),
+        velocity_scale=found.get("sensor_velocity_scale", 1.0),
+        gyro_lag=found.get("sensor_gyro_lowpass", 0.0),
+    )
+    if not faults.healthy:
+        # Biases again, from repaired flights.
+        kinematics = [compare_sensors(faults.repaired(log), delay) for log in logs]
+    names = [log.name for log in logs]
+    return SensorCheck(
+        faults,
+        findings,
+        looked,
+        dict(zip(names, [k.gyro_bias for k in kinematics], strict=True)),
+        dict(zip(names, _shrunk(np.array([k.accelerometer_bias for k in kinematics])), strict=True)),
+    )
+
+
+def _pooled(kinematics: list[Kinematics], name: str, index: int) -> tuple[float, float]:
+    """Weighted mean over the flights, with a deviation that covers their scatter too."""
+    values = np.array([getattr(k, name) for k in kinematics])
+    weights = np.array([k.weight[index] for k in kinematics])
+    total = weights.sum()
+    if total <= 0:
+        return (1.0 if name == "velocity_scale" else 0.0), np.inf
+    mean = float(weights @ values / total)
+    used = weights > 0.01 * weights.max()
+    chi = float(np.sum(weights[used] * (values[used] - mean) ** 2) / max(used.sum() - 1, 1))
+    return mean, float(np.sqrt(max(chi, 1.0) / total))
+
+
+def _shrunk(biases: np.ndarray) -> np.ndarray:
+    """Biases of the flights drawn to their common value as far as their scatter is that of the method."""
+    common = np.median(biases, axis=0)
+    scatter = np.var(biases, axis=0)
+    share = np.maximum(0.0, 1 - _BIAS_NOISE**2 / np.maximum(scatter, 1e-12))
+    return common + share * (biases - common)

@@ -1,0 +1,178 @@
+"""Tracing: from a campaign of flights to the effects a model lacks, each tested on data it was not fitted on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model.effects import CATALOGUE
+from cfb_mjx.parameters import Parameters
+from cfb_mjx.sysid.evaluation import evaluate
+from cfb_mjx.sysid.tracing.columns import Column
+from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
+from cfb_mjx.sysid.tracing.search import Hypothesis, Linear, Search
+from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
+
+ALPHA = 1e-3
+"""An effect's p-value, times the number of effects tried, must be below this."""
+LEAST_GAIN = 5.0
+"""And it must gain so many nats of log-likelihood on blocks left out."""
+MATERIAL = 0.03
+"""And lower at least one prediction error (four quantities, two horizons) by this share."""
+CLOSE = 0.1
+"""A rival that gains all but this share of the winner's gain is named as confusable with it."""
+LARGEST = 6
+"""Effects at most."""
+ERRORS = tuple(
+    f"{q}@{h}s" for h in ("0.2", "0.5") for q in ("position_rmse_m", "velocity_rmse_mps", "attitude_rmse_deg", "rate_rmse_radps")
+)
+
+
+@dataclass
+class Found:
+    """One effect that is there."""
+
+    name: str
+    p_value: float
+    gain: float
+    """Nats on blocks left out."""
+    buys: float
+    """Largest share by which a prediction error of the fit flights grows without it."""
+    parameters: dict[str, float | list[float]]
+    uncertainty: dict[str, float | list[float]]
+    confusable: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Trace:
+    """Outcome of a search."""
+
+    hypothesis: Hypothesis
+    sensors: SensorCheck
+    found: list[Found]
+    tried: list[dict]
+    """What was looked at in every round, for the report."""
+
+
+def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
+    """`ERRORS` on the flights of the search."""
+    metrics = evaluate(hypothesis.model(search.parameters), search.logs).metrics("commands_in")
+    return np.array([metrics[key] for key in ERRORS])
+
+
+def trace(
+    logs: list[FlightLog],
+    parameters: Parameters,
+    delay: float = 0.008,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Trace:
+    """Search the catalogue for what a model lacks.
+
+    Args:
+        logs: flights to fit; run with x64 enabled.
+        parameters: the declared drone.
+        delay: declared age of pose and velocity in a row, s.
+        progress: told what happens.
+    """
+    progress("comparing the sensors with each other")
+    sensors = check_sensors(logs, delay)
+    search = Search.start(logs, parameters, delay, sensors)
+    hypothesis = search.nothing()
+    progress("replaying the declared model")
+    search.learn_levels(hypothesis)
+    hypothesis, linear = search.refine(hypothesis)
+    errors = prediction_errors(search, hypothesis)
+    tried, refused = [], set()
+    while len(hypothesis.present) < LARGEST:
+        ranking = rank(search, hypothesis, linear, refused)
+        tried.append({"present": list(hypothesis.present), "ranking": [_line(v, e) for e, v in ranking[:8]]})
+        passing = [(e, v) for e, v in ranking if significant(e, len(search.names))]
+        if not passing:
+            break
+        best, variant = passing[0]
+        name = variant[0].effect
+        progress(f"trying {name} beside {', '.join(hypothesis.present) or 'nothing'}")
+        richer, refined = search.refine(search.with_candidate(hypothesis, variant, best))
+        new = prediction_errors(search, richer)
+        drop = 1 - new / errors
+        tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, drop.tolist(), strict=True))}
+        if drop.max() < MATERIAL or np.log(new / errors).sum() > 0:
+            refused.add(name)
+            continue
+        hypothesis, linear, errors = richer, refined, new
+        hypothesis, linear, errors = re_examined(search, hypothesis, linear, errors, progress)
+    found = [_summary(search, hypothesis, linear, errors, name) for name in hypothesis.present]
+    found.sort(key=lambda f: -f.buys)
+    return Trace(hypothesis, sensors, found, tried)
+
+
+def rank(
+    search: Search, hypothesis: Hypothesis, linear: Linear, refused: set[str]
+) -> list[tuple[Evidence, list[Column]]]:
+    """Every absent effect at its best probe, the largest gain first."""
+    best: dict[str, tuple[Evidence, list[Column]]] = {}
+    for variant in search.candidates():
+        name = variant[0].effect
+        if name in hypothesis.present or name in refused:
+            continue
+        found = search.adding(hypothesis, linear, variant)
+        if found is not None and (name not in best or found.gain > best[name][0].gain):
+            best[name] = (found, variant)
+    return sorted(best.values(), key=lambda pair: -pair[0].gain)
+
+
+def significant(found: Evidence, tried: int) -> bool:
+    """Whether evidence stands after so many tries."""
+    return found.p_value * tried < ALPHA and found.gain > LEAST_GAIN
+
+
+def re_examined(search: Search, hypothesis: Hypothesis, linear: Linear, errors: np.ndarray, progress):
+    """Drop what the others explain as well by now, and swap what another effect explains better."""
+    for name in hypothesis.present[:-1]:
+        progress(f"looking at {name} again")
+        less, around = search.refine(hypothesis.without(name))
+        ranking = rank(search, less, around, set())
+        own = next((e for e, v in ranking if v[0].effect == name), None)
+        without = prediction_errors(search, less)
+        lost = 1 - errors / without
+        if own is None or not significant(own, len(search.names)) or lost.max() < MATERIAL:
+            hypothesis, linear, errors = less, around, without
+            continue
+        rival, variant = ranking[0]
+        if variant[0].effect != name and rival.gain > own.gain + LEAST_GAIN:
+            other, refined = search.refine(search.with_candidate(less, variant, rival))
+            new = prediction_errors(search, other)
+            if np.log(new / errors).sum() < 0:
+                hypothesis, linear, errors = other, refined, new
+    return hypothesis, linear, errors
+
+
+def _summary(search: Search, hypothesis: Hypothesis, linear: Linear, errors: np.ndarray, name: str) -> Found:
+    less, around = search.refine(hypothesis.without(name))
+    ranking = rank(search, less, around, set())
+    own, _ = next((pair for pair in ranking if pair[1][0].effect == name), (None, None))
+    buys = float(np.max(1 - errors / prediction_errors(search, less)))
+    columns = search.own_columns(hypothesis)
+    index = [1, *linear.index(columns)]
+    values = solve(linear.pooled.sum(0), index, linear.scale)
+    deviation = np.sqrt(np.diag(covariance(linear.pooled, index, linear.scale, values))) * linear.scale[index]
+    parameters, uncertainty = {}, {}
+    for column, std in zip(columns, deviation[1:], strict=True):
+        if column.effect != name:
+            continue
+        value = np.asarray(getattr(hypothesis.effect(name), column.field))
+        if column.index is None:
+            parameters[column.field], uncertainty[column.field] = float(value), float(std)
+        else:
+            parameters[column.field] = value.tolist()
+            uncertainty.setdefault(column.field, []).append(float(std))
+    gain = own.gain if own else 0.0
+    rivals = [v[0].effect for e, v in ranking if v[0].effect != name and e.gain > (1 - CLOSE) * gain]
+    return Found(name, own.p_value if own else 1.0, gain, buys, parameters, uncertainty, rivals)
+
+
+def _line(variant: list[Column], found: Evidence) -> dict:
+    return {"name": variant[0].effect, "gain": found.gain, "t": found.t, "p_value": found.p_value}
