@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
+from pathlib import Path
 
 import helpers
 import jax
@@ -113,7 +115,12 @@ def manoeuvre():
 
 def _alone(effect: Effect) -> tuple[Effect, ...]:
     """Every effect of the catalogue, all but this one neutral: whatever the effect, the same program flies it."""
-    return tuple(effect if kind is type(effect) else kind.neutral() for kind in CATALOGUE.values())
+    return tuple(effect if type(other) is type(effect) else other for other in _neutrals())
+
+
+@functools.cache
+def _neutrals() -> tuple[Effect, ...]:
+    return tuple(kind.neutral() for kind in CATALOGUE.values())
 
 
 @pytest.fixture(scope="module")
@@ -129,14 +136,12 @@ def studied(guards, manoeuvre):
         mine += [dataclasses.replace(neutral, **probe) for probe in kind.probes]
         rows[name] = slice(len(effects), len(effects) + len(mine))
         effects += [_alone(effect) for effect in mine]
-        nothing = jax.tree.map(jnp.zeros_like, _alone(neutral))
-        directions += [tuple(direction if type(x) is kind else x for x in nothing)] * len(mine)
-    batches = [jax.tree.map(lambda *x: jnp.stack(x), *each) for each in (effects, directions)]
+        still = jax.tree.map(np.zeros_like, _alone(neutral))
+        directions += [tuple(direction if type(x) is kind else x for x in still)] * len(mine)
+    batches = [jax.tree.map(lambda *x: np.stack(x), *each) for each in (effects, directions)]
     (value, flown), reverse, forward = _study(*batches, guards, *manoeuvre)
-    return {
-        name: jax.tree.map(lambda x, r=r: np.asarray(x[r]), (flown, value, reverse, forward))
-        for name, r in rows.items()
-    }
+    found = flown, value, reverse, forward
+    return {name: jax.tree.map(lambda x, r=r: np.asarray(x[r]), found) for name, r in rows.items()}
 
 
 @pytest.fixture(scope="module")
@@ -159,8 +164,7 @@ def test_neutral_effects_change_nothing(name, studied, without):
 
 @ONE_WORKER
 def test_all_neutral_effects_change_nothing_with_rk4(guards, manoeuvre, fly_fleet, without):
-    effects = tuple(kind.neutral() for kind in CATALOGUE.values())
-    flown = helpers.pack(fly_fleet(_one(Quadrotor(guards, effects, integrator="rk4")), *manoeuvre))[0]
+    flown = helpers.pack(fly_fleet(_one(Quadrotor(guards, _neutrals(), integrator="rk4")), *manoeuvre))[0]
     np.testing.assert_allclose(flown, without["rk4"], rtol=1e-12, atol=1e-12)
 
 
@@ -284,3 +288,29 @@ def test_unusable_mappings_are_refused_with_file_and_key(item, word):
     with pytest.raises(CfbError, match=r"drone\.yaml") as caught:
         effect_from_mapping(item, "drone.yaml")
     assert word in str(caught.value)
+
+
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "effects.md").read_text()
+
+
+def test_the_page_lists_the_catalogue_as_it_is():
+    """Names, units and ranges: every effect has one row, and every row an effect."""
+    rows = dict(re.findall(r"^\| `(\w+)` \| .* \| (.*?) \| .*? \|$", PAGE, flags=re.M))
+    rows = {name: row for name, row in rows.items() if " to " in row}
+    assert set(CATALOGUE) == set(rows)
+    for name, kind in CATALOGUE.items():
+        fields = dict(re.findall(r"(\**\w+\**)(?: \([^)]*\))?: ([^;]*)", rows[name]))
+        assert {field.strip("*") for field in fields} == set(kind.prior)
+        assert {field.strip("*") for field in fields if "*" in field} == set(kind.strengths)
+        for field, text in fields.items():
+            unit, span = re.fullmatch(r"(.*?)(?: per rotor)?, (.*)", text).groups()
+            assert unit == kind.units[field.strip("*")]
+            assert tuple(map(float, span.split(" to "))) == kind.prior[field.strip("*")]
+
+
+def test_the_python_on_the_page_runs():
+    scope = {}
+    for block in re.findall(r"```python\n(.*?)```", PAGE, flags=re.S):
+        exec(compile(block, "docs/effects.md", "exec", dont_inherit=True), scope)
+    pulled = step(scope["tethered"], State.at_rest((1.0, 0.0, 0.0)), jnp.zeros(4))
+    np.testing.assert_allclose(pulled.velocity, [-0.5 / 0.044 * 0.004, 0.0, -9.81 * 0.004], rtol=1e-12)

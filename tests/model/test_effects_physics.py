@@ -1,0 +1,419 @@
+"""Each effect against physics done apart from the library: closed forms, SciPy, conservation laws."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import helpers
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from cfb_mjx.model import Quadrotor, State, begin
+from cfb_mjx.model.effects import (
+    BatterySag,
+    BladeFlapping,
+    CogOffset,
+    CommandDelay,
+    EscRateLimit,
+    GroundEffect,
+    Gyroscopic,
+    Inertia,
+    InflowThrust,
+    MotorAsymmetry,
+    MotorGainMismatch,
+    Motors,
+    MotorSecondOrder,
+    MotorThermalDrift,
+    MotorTimeConstant,
+    ParasiticDrag,
+    Payload,
+    PayloadSwing,
+    Reading,
+    RotorDrag,
+    ThrustScale,
+    ThrustTilt,
+    TorqueScale,
+    Wind,
+)
+from cfb_mjx.model.vector import Vec
+
+# They share what one worker compiled.
+ONE_WORKER = pytest.mark.xdist_group("effects_physics")
+
+
+def _batch(models):
+    return jax.tree.map(lambda *x: jnp.stack(x), *models)
+
+
+# Forces and torques on the body: every effect alone, and all together, against an ODE written rotor by rotor.
+
+AIR = {
+    "inflow_thrust": InflowThrust(0.02),
+    "ground_effect": GroundEffect(0.4, 0.15),
+    "gyroscopic": Gyroscopic(2e-7),
+    "thrust_tilt": ThrustTilt([0.04, -0.03]),
+    "rotor_drag": RotorDrag(0.04),
+    "parasitic_drag": ParasiticDrag(0.0, 0.01),
+    "blade_flapping": BladeFlapping(8e-4, 0.3),
+    "wind": Wind([2.0, -1.0, 0.5], 0.03),
+}
+
+
+def _wrench(constants, y, on):
+    """Force and torque about the rotors' centre that the effects ``on`` add to the rotors', body axes."""
+    matrix, rate, speed = helpers.rotation_matrix(y[6:10]), y[10:13], y[13:17]
+    v = matrix.T @ y[3:6]
+    plain, _ = helpers.rotor_forces(constants, speed)
+    force, torque, lift = np.zeros(3), np.zeros(3), 0.0
+    for i in range(4):
+        arm = constants.rotor_spacing / 2 * np.array([helpers.ROTOR_X[i], helpers.ROTOR_Y[i], 0.0])
+        at_hub = v + np.cross(rate, arm)
+        thrust = plain[i]
+        if "inflow_thrust" in on:
+            thrust -= 0.02 * speed[i] / 1594 * at_hub[2]
+        if "ground_effect" in on:
+            height = y[2] + (matrix @ arm)[2]
+            thrust *= 1 + 0.4 / (1 + (height / 0.15) ** 2)
+        lift += thrust
+        here = np.array([0.0, 0.0, thrust - plain[i]])
+        if "rotor_drag" in on:
+            here[:2] -= 0.04 / 4 * speed[i] / 1594 * at_hub[:2]
+        force += here
+        torque += np.cross(arm, here)
+        if "gyroscopic" in on:
+            # A rotor that pushes the body about +z turns about -z.
+            torque -= np.cross(rate, [0.0, 0.0, -helpers.YAW[i] * 2e-7 * speed[i]])
+    if "thrust_tilt" in on:
+        force += lift * np.array([0.04, -0.03, 0.0])
+    if "parasitic_drag" in on:
+        force -= 0.01 * np.abs(v) * v
+    if "blade_flapping" in on:
+        torque += 8e-4 * speed.mean() / 1594 * (1 + 0.3 * v[2]) * np.cross([0.0, 0.0, 1.0], v)
+    if "wind" in on:
+        force += matrix.T @ (0.03 * np.array([2.0, -1.0, 0.5]))
+    return force, torque
+
+
+def _truth(constants, y, commands, on):
+    m, cx = constants.mass, helpers.cross_matrix(constants.center_of_gravity)
+    about_center = np.diag(constants.inertia) - m * cx @ cx
+    inverse = np.linalg.inv(np.block([[m * np.eye(3), -m * cx], [m * cx, about_center]]))
+    rows = []
+    for command in commands:
+        basic = helpers.ode(constants, command)
+
+        def rates(t, y, basic=basic):
+            added = inverse @ np.concatenate(_wrench(constants, y, on))
+            rate = basic(t, y)
+            rate[3:6] += helpers.rotation_matrix(y[6:10]) @ added[:3]
+            rate[10:13] += added[3:]
+            return rate
+
+        y = solve_ivp(rates, (0.0, 0.004), y, method="DOP853", rtol=1e-9, atol=1e-10, first_step=0.002).y[:, -1]
+        rows.append(y)
+    return np.array(rows)
+
+
+@pytest.fixture(scope="module")
+def low_flight():
+    y, commands = helpers.aggressive_manoeuvre(0.08, seed=2)
+    y[2] = 0.2
+    return y, commands
+
+
+@pytest.fixture(scope="module")
+def in_air(off_center, low_flight, fly_fleet):
+    """Flown with no effect, every effect alone, and all of them, by name; the centre of gravity is off centre."""
+    y, commands = low_flight
+    cases = {"none": (), **{name: (name,) for name in AIR}, "all": tuple(AIR)}
+    models = []
+    for on in cases.values():
+        effects = tuple(effect if name in on else type(effect).neutral() for name, effect in AIR.items())
+        models.append(Quadrotor(off_center, effects, integrator="rk4"))
+    flown = helpers.pack(fly_fleet(_batch(models), helpers.state_of(y), jnp.asarray(commands)))
+    return {name: (on, rows) for (name, on), rows in zip(cases.items(), flown, strict=True)}
+
+
+@ONE_WORKER
+@pytest.mark.parametrize("name", [*AIR, "all"])
+def test_wrench_follows_the_ode(name, in_air, off_center, low_flight):
+    on, flown = in_air[name]
+    truth = _truth(helpers.constants_of(off_center), *low_flight, on)
+    for part, tolerance in (("position", 1e-6), ("velocity", 1e-4), ("body_rate", 1e-3)):
+        assert np.abs(helpers.part(flown - truth, part)).max() < tolerance, part
+    seen = np.abs(flown - in_air["none"][1])
+    assert helpers.part(seen, "position").max() > 1e-5 or helpers.part(seen, "body_rate").max() > 1e-2
+
+
+def test_inflow_damps_roll_at_its_closed_form(guards, fly_fleet):
+    """Hub i moves with p y_i, so the torque is -c l^2 p at hover and p dies exponentially."""
+    coefficient = 0.02
+    model = Quadrotor(guards, (InflowThrust(coefficient),), integrator="rk4")
+    state = dataclasses.replace(model.hover_state(), body_rate=jnp.array([2.0, 0.0, 0.0]))
+    flown = fly_fleet(_batch([model]), state, jnp.tile(model.hover_command(), (50, 1)))
+    hover = float(state.rotor_speed[0]) / 1594
+    rate = coefficient * hover * float(guards.rotor_spacing) ** 2 / float(guards.inertia[0])
+    t = 0.004 * np.arange(1, 51)
+    np.testing.assert_allclose(flown.body_rate[0, :, 0], 2.0 * np.exp(-rate * t), rtol=1e-7)
+    np.testing.assert_allclose(flown.body_rate[0, :, 1:], 0, atol=1e-12)
+
+
+def test_gyroscopic_torque_does_no_work(guards, fly_fleet):
+    """A body in free rotation with rotors of unequal speed: its energy and the total angular momentum stay."""
+    nothing = jnp.zeros(3)
+    free = eqx.tree_at(
+        lambda p: (p.gravity, p.thrust_polynomial, p.torque_polynomial), guards, (jnp.zeros(()), nothing, nothing)
+    )
+    model = Quadrotor(free, (Gyroscopic(2e-7),), integrator="rk4", dt=0.002)
+    speed = np.array([1000.0, 2000.0, 500.0, 2500.0])
+    y = np.zeros(17)
+    y[6], y[10:13], y[13:] = 1.0, [8.0, -5.0, 3.0], speed
+    flown = helpers.pack(fly_fleet(_batch([model]), helpers.state_of(y), jnp.tile(speed / 2900, (250, 1))))[0]
+    rate, inertia = helpers.part(flown, "body_rate"), np.asarray(guards.inertia)
+    np.testing.assert_allclose((rate**2) @ inertia, (y[10:13] ** 2) @ inertia, rtol=1e-6)
+    own = 2e-7 * np.array([0.0, 0.0, 1.0]) * np.sum([1, -1, 1, -1] * speed)
+    total = [helpers.rotation_matrix(q) @ (inertia * w + own) for q, w in zip(flown[:, 6:10], rate, strict=True)]
+    np.testing.assert_allclose(total, np.tile(inertia * y[10:13] + own, (250, 1)), rtol=1e-5, atol=1e-9)
+    # What the body alone has of it does not stay: the rotors take part.
+    assert np.ptp(np.linalg.norm(inertia * rate, axis=1)) > 0.02 * np.linalg.norm(inertia * y[10:13])
+
+
+# The drone itself.
+
+
+def test_effects_on_parameters_are_those_written_by_hand(guards):
+    cases = [
+        (ThrustScale(0.1), "thrust_scale", np.full(4, 1.1)),
+        (TorqueScale(-0.2), "torque_scale", np.full(4, 0.8)),
+        (Inertia([0.1, -0.1, 0.2]), "inertia", np.asarray(guards.inertia) * [1.1, 0.9, 1.2]),
+        (CogOffset([0.01, -0.02]), "center_of_gravity", [0.01, -0.02, 0.0]),
+        (MotorGainMismatch([0.1, 0.0, -0.1, 0.05]), "motor_gain", 2900 * np.array([1.1, 1.0, 0.9, 1.05])),
+        (MotorTimeConstant(0.5), "motor_time_constant", np.full(4, 0.075)),
+    ]
+    for effect, name, wanted in cases:
+        changed = Quadrotor(guards, (effect,)).changed_parameters()
+        np.testing.assert_allclose(getattr(changed, name), wanted, rtol=1e-14)
+        back = eqx.tree_at(lambda p, n=name: getattr(p, n), changed, getattr(guards, name))
+        jax.tree.map(np.testing.assert_array_equal, back, guards)
+
+
+def test_payload_is_two_bodies_in_one(guards):
+    """Mass, centre and inertia of the sum, taken about the rotors' centre and brought to the common centre."""
+    base = eqx.tree_at(lambda p: p.center_of_gravity, guards, jnp.array([0.0, 0.0, 0.004]))
+    changed = Quadrotor(base, (Payload(0.012, -0.03),)).changed_parameters()
+    m, extra = 0.044, 0.012
+    assert float(changed.mass) == pytest.approx(m + extra, rel=1e-14)
+    center = (m * 0.004 - extra * 0.03) / (m + extra)
+    np.testing.assert_allclose(changed.center_of_gravity, [0, 0, center], rtol=1e-12)
+    about_rotors = np.asarray(guards.inertia)[:2] + m * 0.004**2 + extra * 0.03**2
+    np.testing.assert_allclose(changed.inertia[:2], about_rotors - (m + extra) * center**2, rtol=1e-12)
+    np.testing.assert_allclose(changed.inertia[2], guards.inertia[2], rtol=1e-14)
+
+
+# Commands and motors.
+
+
+@functools.partial(jax.jit, compiler_options=helpers.QUICK_COMPILE)
+def _received(effect, parameters, speed, steps, commands):
+    """What the motors get of ``commands`` held for ``steps``, one motor map for all."""
+    model = Quadrotor(parameters, (effect,))
+    memory = begin(model, State.at_rest(rotor_speed=speed)).memory[0]
+
+    def one(memory, row):
+        dt, command = row
+        memory = jax.tree.map(Vec.unstack, memory)
+        command, memory = effect.command(Vec.unstack(command), memory, dt, parameters)
+        return jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec)), command.stack()
+
+    return jax.lax.scan(one, memory, (steps, commands))[1]
+
+
+@pytest.fixture(scope="module")
+def uneven():
+    """Commands held for uneven times, some of them none; before the first: 0.5 for ever."""
+    random = np.random.default_rng(5)
+    steps = random.uniform(0.002, 0.006, 60)
+    steps[::7] = 0.0
+    return steps, random.uniform(0.0, 1.0, (60, 4))
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.003, 0.004, 0.0101])
+def test_delayed_commands_are_exact_means(delay, uneven, guards):
+    """Mean of u(t - delay) over a step = difference of the integral of u at its delayed ends."""
+    steps, commands = uneven
+    got = _received(CommandDelay(delay), guards, jnp.full(4, 1450.0), steps, commands)
+    t = np.concatenate([[-1.0, 0.0], np.cumsum(steps)])
+    integral = np.concatenate([[np.full(4, -0.5)], np.zeros((1, 4)), np.cumsum(commands * steps[:, None], axis=0)])
+    begins = np.concatenate([[0.0], np.cumsum(steps)[:-1]]) - delay
+    for motor in range(4):
+        area = np.interp(begins + steps, t, integral[:, motor]) - np.interp(begins, t, integral[:, motor])
+        held = steps > 0
+        np.testing.assert_allclose(np.asarray(got)[held, motor], area[held] / steps[held], rtol=1e-9, atol=1e-12)
+
+
+def test_a_step_without_duration_shows_the_command_of_its_instant(guards):
+    steps = jnp.array([0.004, 0.004, 0.0, 0.0, 0.004])
+    commands = jnp.tile(jnp.array([0.1, 0.2, 0.3, 0.4, 0.6])[:, None], (1, 4))
+    got = _received(CommandDelay(0.006), guards, jnp.full(4, 1450.0), steps, commands)
+    # At 8 ms: what was given at 2 ms. What is given for no time acts for no time.
+    np.testing.assert_allclose(got[:, 0], [0.5, 0.3, 0.1, 0.1, 0.15], rtol=1e-12)
+
+
+def test_longest_delay_is_the_memory(guards):
+    commands = jnp.linspace(0.0, 1.0, 21)[:, None] * jnp.ones(4)
+    for delay in (8 * 0.004, 1.0):
+        got = _received(CommandDelay(delay), guards, jnp.full(4, 1450.0), jnp.full(21, 0.004), commands)
+        np.testing.assert_allclose(got, jnp.concatenate([jnp.full((8, 4), 0.5), commands[:13]]), rtol=1e-9)
+
+
+def test_delay_shifts_the_rotors_by_exactly_the_delay(guards, fly_fleet):
+    rows = (0, 3, 8)
+    models = [Quadrotor(guards, (CommandDelay(0.004 * n),)) for n in rows]
+    _, commands = helpers.aggressive_manoeuvre(0.1)
+    flown = fly_fleet(_batch(models), models[0].hover_state(), jnp.asarray(commands)).rotor_speed
+    for n, speed in zip(rows, flown, strict=True):
+        np.testing.assert_allclose(speed[n:], flown[0][: len(commands) - n], rtol=1e-9)
+        np.testing.assert_allclose(speed[:n], models[0].hover_state().rotor_speed[0], rtol=1e-9)
+
+
+def test_rate_limit_ramps(uneven, guards):
+    """A ramp of 1 / slowness that stops at the command: its mean over each step, from many small steps."""
+    steps, commands = uneven
+    got = np.asarray(_received(EscRateLimit(0.02), guards, jnp.full(4, 1450.0), steps, commands))
+    output, count, reached = np.full(4, 0.5), 2000, 0
+    for dt, command, mean in zip(steps, commands, got, strict=True):
+        begin_, path = output, []
+        for k in range(count):
+            limit = (k + 0.5) / count * dt / 0.02
+            path.append(begin_ + np.clip(command - begin_, -limit, limit))
+        output = begin_ + np.clip(command - begin_, -dt / 0.02, dt / 0.02)
+        reached += np.sum(output == command)
+        if dt > 0:
+            np.testing.assert_allclose(mean, np.mean(path, axis=0), atol=1e-6)
+    assert 0 < reached < commands.size
+
+
+def test_second_lag_follows_two_lags_in_series(guards, fly_fleet):
+    lags = (0.003, 0.012, 0.05)
+    dt, each = 0.001, 16
+    models = [Quadrotor(guards, (MotorSecondOrder(lag),), dt=dt) for lag in lags]
+    y = np.zeros(17)
+    y[6], y[13:] = 1.0, 1450.0
+    commands = np.random.default_rng(6).uniform(0.2, 1.0, (6, 4))
+    flown = helpers.pack(fly_fleet(_batch(models), helpers.state_of(y), jnp.asarray(np.repeat(commands, each, axis=0))))
+    for lag, rows in zip(lags, flown, strict=True):
+        x = np.full(8, 1450.0)
+        for k, command in enumerate(commands):
+
+            def rates(_, x, command=command, lag=lag):
+                return np.concatenate([(2900 * command - x[:4]) / lag, (x[:4] - x[4:]) / 0.05])
+
+            x = solve_ivp(rates, (0.0, each * dt), x, method="DOP853", rtol=1e-10, atol=1e-9).y[:, -1]
+            # Held at its mean over a step, the lagged target errs by second order in the step.
+            np.testing.assert_allclose(rows[each * (k + 1) - 1, 13:], x[4:], atol=0.2)
+    assert np.abs(flown[1, :, 13:] - flown[0, :, 13:]).max() > 50
+
+
+def _steered(effect, parameters, target, speed, memory=()):
+    motors = Motors(Vec.unstack(jnp.asarray(target)), Vec(*jnp.full(4, 0.05)))
+    return effect.motors(motors, Vec.unstack(jnp.asarray(speed)), memory, jnp.asarray(0.004), parameters)
+
+
+def test_asymmetry_is_a_time_constant_each_way(guards, fly_fleet):
+    motors, _ = _steered(MotorAsymmetry(0.3), guards, [2000.0, 1000.0, 1500.0, 1550.0], np.full(4, 1500.0))
+    wanted = [0.05 * 0.7, 0.05 * 1.3, 0.05, 0.05 * (1 - 0.3 * np.tanh(1.0))]
+    np.testing.assert_allclose(motors.time_constant.stack(), wanted, rtol=1e-6)
+    # And in flight: eq. 5 with the other lag, as long as the target is far.
+    model = Quadrotor(guards, (MotorAsymmetry(0.3),))
+    y = np.zeros(17)
+    y[6], y[13:] = 1.0, 1450.0
+    flown = fly_fleet(_batch([model]), helpers.state_of(y), jnp.tile(jnp.array([1.0, 0.0, 1.0, 0.0]), (5, 1)))
+    t = 0.004 * np.arange(1, 6)
+    np.testing.assert_allclose(flown.rotor_speed[0, :, 0], 2900 - 1450 * np.exp(-t / 0.035), rtol=1e-9)
+    np.testing.assert_allclose(flown.rotor_speed[0, :, 1], 1450 * np.exp(-t / 0.065), rtol=1e-9)
+
+
+def _reading(voltage, time):
+    return Reading(voltage=jnp.asarray(voltage), time=jnp.asarray(time))
+
+
+def test_battery_voltage_is_filtered_and_scales_the_target(guards):
+    effect = BatterySag(level=0.02, slope=0.8)
+    memory = effect.start(Vec(*jnp.full(4, 1594.0)), guards)
+    target = np.array([2000.0, 1500.0, 1000.0, 500.0])
+
+    def factor():
+        return np.asarray(_steered(effect, guards, target, target, memory)[0].target.stack()) / target
+
+    np.testing.assert_allclose(factor(), 1.02, rtol=1e-12)
+    memory = effect.sense(memory, _reading(np.nan, 0.0))
+    np.testing.assert_allclose(factor(), 1.02, rtol=1e-12)
+    # The first reading counts in full, later ones through a lag of 0.3 s whatever their spacing.
+    memory = effect.sense(memory, _reading(4.1, 0.5))
+    np.testing.assert_allclose(factor(), 1.02 + 0.8 * 0.4 / 3.7, rtol=1e-12)
+    for time, voltage in ((0.6, 3.8), (0.65, np.nan), (0.8, 3.8), (0.9, 3.8)):
+        memory = effect.sense(memory, _reading(voltage, time))
+    voltage = 3.8 + 0.3 * np.exp(-0.4 / 0.3)
+    np.testing.assert_allclose(factor(), 1.02 + 0.8 * (voltage - 3.7) / 3.7, rtol=1e-9)
+
+
+def test_warm_motors_turn_slower(guards, fly_fleet):
+    effect = MotorThermalDrift(drop=0.1, time_constant=2.0)
+    model = Quadrotor(guards, (effect,))
+    y = np.zeros(17)
+    y[6], y[13:] = 1.0, 1450.0
+    flown = fly_fleet(_batch([model]), helpers.state_of(y), jnp.full((1000, 4), 0.5))
+    t = 0.004 * np.arange(1, 1001)
+    np.testing.assert_allclose(flown.memory[0][0][0, :, 0], t, rtol=1e-9)
+    # The drop changes slowly beside the motors' lag of 50 ms: 1450 (1 - 0.1 (1 - exp(-t / 2))), 50 ms late.
+    late = 1450 * (1 - 0.1 * (1 - np.exp(-(t - 0.05) / 2)))
+    np.testing.assert_allclose(flown.rotor_speed[0, 200:, 0], late[200:], atol=0.2)
+    memory = effect.sense(effect.start(Vec(*jnp.full(4, 1450.0)), guards), _reading(np.nan, 30.0))
+    motors, _ = _steered(effect, guards, np.full(4, 1450.0), np.full(4, 1450.0), memory)
+    np.testing.assert_allclose(motors.target.stack(), 1450 * 0.9, rtol=1e-6)
+
+
+# The slung load.
+
+
+@pytest.fixture(scope="module")
+def swung(guards, fly_fleet):
+    """A tilted drone with its rotors off and a load let go 2 cm beside it: the horizontal motion is the pendulum's."""
+    model = Quadrotor(guards, (PayloadSwing(mass=0.01, length=0.12),))
+    y = np.zeros(17)
+    y[6:10], y[13:] = np.array([0.8, 0.4, -0.2, 0.4]), 0.0
+    state = begin(model, helpers.state_of(y))
+    state = dataclasses.replace(state, memory=((jnp.array([0.02, 0.0]), jnp.zeros(2)),))
+    flown = fly_fleet(_batch([model]), state, jnp.zeros((300, 4)))
+    return jax.tree.map(lambda x: np.asarray(x[0]), flown)
+
+
+@ONE_WORKER
+def test_slung_load_swings_as_a_pendulum_under_a_free_pivot(swung):
+    """r'' = -(g / L) (1 + M / m) r - damping r': both masses swing about their common centre."""
+    place, _ = swung.memory[0]
+    natural = np.sqrt(9.81 / 0.12)
+    damping = 0.05 * natural
+    frequency = np.sqrt(natural**2 * (1 + 0.01 / 0.044) - damping**2)
+    # A semi-implicit step reads like a clock that is half a step ahead.
+    t = 0.004 * (np.arange(1, 301) + 0.5)
+    swing = np.cos(frequency * t) + damping / frequency * np.sin(frequency * t)
+    np.testing.assert_allclose(place[:, 0], 0.02 * np.exp(-damping * t) * swing, atol=0.01 * 0.02)
+    np.testing.assert_allclose(place[:, 1], 0, atol=1e-15)
+
+
+@ONE_WORKER
+def test_slung_load_keeps_momentum_but_for_the_air(swung):
+    """The string pulls both ends; only the air's damping takes momentum, 2 zeta sqrt(g / L) M times the way of r."""
+    place, speed = swung.memory[0]
+    momentum = 0.044 * swung.velocity[:, 0] + 0.01 * (swung.velocity[:, 0] + speed[:, 0])
+    taken = 0.01 * 2 * 0.05 * np.sqrt(9.81 / 0.12) * (np.concatenate([[0.02], place[:-1, 0]]) - 0.02)
+    np.testing.assert_allclose(momentum + taken, 0, atol=1e-12)
+    np.testing.assert_allclose(swung.velocity[:, 2], -9.81 * (1 + 0.01 / 0.044) * 0.004 * np.arange(1, 301), rtol=1e-9)
+    # The string hangs from the rotors' centre: no torque about it.
+    np.testing.assert_allclose(swung.body_rate, 0, atol=1e-12)
