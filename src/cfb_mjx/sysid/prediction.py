@@ -92,7 +92,8 @@ def start_of_windows(model: Quadrotor, log: FlightLog, windows: Windows, delay: 
     flight = prepare_flight(log, delay)
     # Indexing in NumPy: the number of windows differs from log to log, and the program should not.
     speed, memory = jax.tree.map(lambda x: np.asarray(x)[windows.row], _remembered(model, flight))
-    since = windows.start - log.time[windows.row]
+    # A start that is a row's own time may fall a rounding before it.
+    since = np.maximum(windows.start - log.time[windows.row], 0.0)
     command = np.clip(log.command[windows.row], 0, 1)
     count = len(windows)
     blocks = WINDOWS_PER_BLOCK * -(-count // WINDOWS_PER_BLOCK)
