@@ -8,6 +8,7 @@ import numpy as np
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.rotation import tidy
+from cfb_mjx.model import State
 
 UNITS = {
     "sensor_delay": ("delay", "s"),
@@ -58,9 +59,8 @@ class SensorFaults:
         if self.gyro_lag:
             changes["body_rate"] = later(log.body_rate, self.gyro_lag)
         if self.motor_shift:
-            # Commands are held, so the row in force is taken, not a value between two.
-            at = np.searchsorted(time, time + self.motor_shift + 1e-9, side="right") - 1
-            changes["command"] = log.command[np.clip(at, 0, len(time) - 1)]
+            # Between rows a mean of the two commands, in the share of the interval each would hold.
+            changes["command"] = later(log.command, self.motor_shift)
             if log.rotor_speed is not None:
                 changes["rotor_speed"] = later(log.rotor_speed, self.motor_shift)
         low, high = min(0.0, self.motor_shift), max(self.delay, self.gyro_lag, self.motor_shift)
@@ -69,6 +69,29 @@ class SensorFaults:
         crossing |= (time[:, None] + low < end) & (time[:, None] >= end)
         keep = (time + high <= time[-1]) & (time + low >= time[0]) & ~crossing.any(axis=1)
         return log.replace(**changes).rows(keep)
+
+    def reached(self, horizons: tuple[float, ...]) -> tuple[float, ...]:
+        """Ascending times after a window's start at which a prediction is needed to say what is recorded later."""
+        return tuple(sorted({self._instant(h, lag) for h in horizons for lag in (0.0, self.delay, self.gyro_lag)}))
+
+    def as_recorded(self, predicted: State, horizons: tuple[float, ...]) -> State:
+        """What this chain records at the horizons, from predictions (W, H) at `reached` times."""
+        if self.healthy:
+            return predicted
+        times = self.reached(horizons)
+        pose = [times.index(self._instant(h, self.delay)) for h in horizons]
+        gyro = [times.index(self._instant(h, self.gyro_lag)) for h in horizons]
+        return State(
+            predicted.position[:, pose],
+            predicted.velocity[:, pose] * self.velocity_scale,
+            predicted.quaternion[:, pose],
+            predicted.body_rate[:, gyro],
+            predicted.rotor_speed[:, gyro],
+        )
+
+    @staticmethod
+    def _instant(horizon: float, lag: float) -> float:
+        return round(max(horizon - lag, 0.001), 9)
 
     def to_mappings(self) -> list[dict]:
         """As listed among the effects of a model file."""
@@ -92,6 +115,9 @@ class SensorFaults:
             gyro_lag=float(pick.get("sensor_gyro_lowpass") or 0.0),
             motor_shift=float(pick.get("sensor_time_shift") or 0.0),
         )
+
+
+HEALTHY = SensorFaults()
 
 
 def _continuous(quaternion: np.ndarray) -> np.ndarray:

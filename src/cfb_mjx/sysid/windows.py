@@ -72,15 +72,18 @@ def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float) -> np
     return starts[np.array(allowed, dtype=bool)]
 
 
-def find_windows(log: FlightLog, horizons: tuple[float, ...], delay: float) -> Windows:
+def find_windows(
+    log: FlightLog, horizons: tuple[float, ...], delay: float, starts: np.ndarray | None = None
+) -> Windows:
     """Cut a log into prediction windows.
 
     Args:
         log: the flight.
         horizons: prediction horizons, s, ascending.
         delay: age of pose and velocity in a row, s; gyro and commands are taken as current.
+        starts: window starts, s, in place of those of `find_starts`.
     """
-    starts = find_starts(log, horizons, delay)
+    starts = find_starts(log, horizons, delay) if starts is None else starts
     plans = [_plan(log.time, t0, horizons) for t0 in starts]
     width = max((len(edges) - 1 for edges, _, _ in plans), default=0)
     count, reach = len(starts), len(horizons)

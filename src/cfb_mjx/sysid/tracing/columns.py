@@ -13,6 +13,8 @@ from cfb_mjx.model.effects import CATALOGUE, Effect
 
 LEAD = "command_lead"
 """Nuisance: commands sent between two rows are not in the log. Always free, never reported as an effect."""
+SHIFT = "sensor_time_shift"
+"""Not an effect of the catalogue but a fault of the recording: command and rotor-speed columns late or early."""
 _COARSE = {"esc_rate_limit": 0.5, "command_delay": 0.2, "motor_second_order": 0.3}
 """Effects whose slope at zero says little are looked for at this share of their prior range."""
 
@@ -82,19 +84,40 @@ def moved(effect: Effect, column: Column, by: float, present: bool) -> Effect:
     return eqx.tree_at(lambda e: getattr(e, column.field), effect, new)
 
 
-def stacked(
-    effects: tuple[Effect, ...], columns: list[Column], present: set[str]
-) -> tuple[tuple[Effect, ...], np.ndarray]:
-    """The effects as they are and once for every column moved: leaves with a leading axis (1 + columns), and steps."""
+def shift_column() -> Column:
+    """The column of `SHIFT`, in units of 10 ms."""
+    return Column(SHIFT, "shift", None, (), 0.01)
+
+
+@dataclass(frozen=True)
+class Moves:
+    """One model as it is and once for every column moved, along a leading axis (1 + columns)."""
+
+    effects: tuple[Effect, ...]
+    lead: np.ndarray
+    shift: np.ndarray
+    """Of the motor columns, s, beyond what is taken out already."""
+    step: np.ndarray
+    """(columns,)."""
+
+
+def moves(effects: tuple[Effect, ...], lead: float, columns: list[Column], present: set[str]) -> Moves:
+    """Finite differences for some columns."""
     order = {type(effect).name: i for i, effect in enumerate(effects)}
-    every, steps = [effects], []
+    every, leads, shifts, steps = [effects], [lead], [0.0], []
     for column in columns:
+        own, by_lead, by_shift = effects, 0.0, 0.0
         if column.effect == LEAD:
-            every.append(effects)
-            steps.append(0.05)
-            continue
-        i, here = order[column.effect], column.effect in present
-        step = step_of(column, here)
-        every.append(tuple(moved(e, column, step, here) if j == i else e for j, e in enumerate(effects)))
+            step = by_lead = 0.05
+        elif column.effect == SHIFT:
+            step = by_shift = 0.002
+        else:
+            i, here = order[column.effect], column.effect in present
+            step = step_of(column, here)
+            own = tuple(moved(e, column, step, here) if j == i else e for j, e in enumerate(effects))
+        every.append(own)
+        leads.append(lead + by_lead)
+        shifts.append(by_shift)
         steps.append(step)
-    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *every), np.array(steps)
+    batch = jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *every)
+    return Moves(batch, np.array(leads), np.array(shifts), np.array(steps))

@@ -29,11 +29,21 @@ class Evidence:
     values: np.ndarray
 
 
-def solve(total: np.ndarray, columns: list[int], scale: np.ndarray) -> np.ndarray:
-    """Values of some columns (units of their scale) that explain the residual best; ``total`` is (c, c)."""
+def solve(
+    total: np.ndarray, columns: list[int], scale: np.ndarray, pull: tuple[int, float, float] | None = None
+) -> np.ndarray:
+    """Values of some columns (units of their scale) that explain the residual best; ``total`` is (c, c).
+
+    ``pull`` (position, value, precision) holds one of them near a value known beforehand.
+    """
     s = scale[columns]
     a = total[np.ix_(columns, columns)] * np.outer(s, s) + RIDGE * np.eye(len(columns))
-    return np.linalg.solve(a, total[columns, 0] * s)
+    b = total[columns, 0] * s
+    if pull is not None:
+        at, value, precision = pull
+        a[at, at] += precision
+        b[at] += precision * value
+    return np.linalg.solve(a, b)
 
 
 def covariance(blocks: np.ndarray, columns: list[int], scale: np.ndarray, values: np.ndarray) -> np.ndarray:

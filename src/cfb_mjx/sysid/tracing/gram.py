@@ -44,7 +44,7 @@ def residual_blocks(model: Quadrotor, flight: Flight, driven: Array, lead: Array
 
 @eqx.filter_jit
 def gram(
-    models: Quadrotor, flight: Flight, driven: Array, leads: Array, steps: Array, levels: Levels
+    models: Quadrotor, flight: Flight, driven: Array, leads: Array, shifts: Array, steps: Array, levels: Levels
 ) -> tuple[Float[Array, "b d c c"], Float[Array, "b d"]]:
     """Inner products of the whitened residual and its derivatives, per block and domain; and how many rows count.
 
@@ -53,16 +53,24 @@ def gram(
         flight: one flight.
         driven: `driven_by`.
         leads: (c,) command lead of each.
+        shifts: (c,) s by which the motor columns of each are taken to be late.
         steps: (c - 1,) size of the moves, in the units of the columns.
         levels: noise levels.
 
     Returns:
         Column 0 is the residual, the others are what the model would say more per unit of each number.
     """
-    one = lambda effects, lead: predicted(  # noqa: E731
-        eqx.tree_at(lambda m: m.effects, models, effects), flight, driven, lead
-    )
-    said = jax.vmap(one)(models.effects, leads)
+    time = flight.time
+    slope = jnp.gradient(driven, axis=0) / jnp.maximum(jnp.gradient(time), 1e-4)[:, None]
+    # Late commands and late rotor speeds agree with each other; only what the body does comes too early.
+    rows = jnp.sum(flight.interval) / jnp.maximum(jnp.sum(flight.interval > 0), 1)
+
+    def one(effects, lead, shift):
+        model = eqx.tree_at(lambda m: m.effects, models, effects)
+        more = (1 - flight.measured) * shift / rows
+        return predicted(model, flight, driven + flight.measured * shift * slope, lead + more)
+
+    said = jax.vmap(one)(models.effects, leads, shifts)
     seen = measured(flight)
 
     def side_by_side(m, s):

@@ -72,10 +72,14 @@ def compare_sensors(log: FlightLog, delay: float, gravity: float = 9.81) -> Kine
     turned = _turned(quaternion, short)
     gyro_sum = _integral(gyro - gyro_bias, step)
     attitude_lag, attitude_weight = _lag(lambda lag: turned - _span(gyro_sum, short, lag, step), ok)
-    world = world - rotate(quaternion, np.broadcast_to(accelerometer_bias, world.shape))
-    gained = velocity[short:] - velocity[:-short]
-    velocity_sum = _integral(world, step)
-    velocity_lag, velocity_weight = _lag(lambda lag: gained / scale - _span(velocity_sum, short, lag, step), ok)
+    gained = (velocity[short:] - velocity[:-short]) / scale
+
+    def unexplained(lag):
+        # Attitude and velocity come late together; only the accelerometer is moved to meet them.
+        force = at(log.specific_force, -lag) - accelerometer_bias
+        return gained - _span(_integral(rotate(quaternion, force) - [0, 0, gravity], step), short, 0.0, step)
+
+    velocity_lag, velocity_weight = _lag(unexplained, ok)
     return Kinematics(
         gyro_bias,
         accelerometer_bias,

@@ -13,6 +13,7 @@ from cfb_mjx.model.effects import CATALOGUE, Effect
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight, prepare_flight
+from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing import columns as cols
 from cfb_mjx.sysid.tracing.columns import LEAD, Column
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, evidence, solve
@@ -21,8 +22,11 @@ from cfb_mjx.sysid.tracing.noise import sensor_noise
 from cfb_mjx.sysid.tracing.sensors import SensorCheck
 from cfb_mjx.sysid.tracing.whitening import FIRST, Blocks, fit_levels, levels_from
 
-LEAD_RANGE = (0.0, 0.6)
-"""Share of the next command in the mean over an interval: half at most, if commands not logged came right behind."""
+LEAD_RANGE, LEAD_USUAL, LEAD_SPREAD = (0.0, 0.5), 0.25, 0.1
+"""Share of the next command in the mean over an interval: a quarter if every second command is logged, half at most.
+Beyond this a lead would be a time shift, so what is known of it beforehand has to decide between the two."""
+FILTERED_GYRO = 0.1
+"""Level given to a low-pass filtered gyro, rad/s: only what it shows slowly is believed."""
 PAD = 8
 """Columns are padded to a multiple of this with copies of the lead, so that one compiled program serves all rounds."""
 
@@ -33,7 +37,9 @@ class Hypothesis:
 
     effects: tuple[Effect, ...]
     present: tuple[str, ...] = ()
-    lead: float = 0.0
+    lead: float = LEAD_USUAL
+    shift: float = 0.0
+    """How late the motor columns are, s."""
 
     def effect(self, name: str) -> Effect:
         """The effect of that name."""
@@ -43,10 +49,16 @@ class Hypothesis:
         """The drone of this hypothesis, with every effect of the catalogue (most of them neutral)."""
         return Quadrotor(parameters, self.effects)
 
+    @property
+    def faults(self) -> SensorFaults:
+        """What is wrong with the recording beyond what the sensors say of each other."""
+        return SensorFaults(motor_shift=self.shift)
+
     def without(self, name: str) -> Hypothesis:
         """The same with one effect back at neutral."""
         effects = tuple(CATALOGUE[name].neutral() if type(e).name == name else e for e in self.effects)
-        return Hypothesis(effects, tuple(p for p in self.present if p != name), self.lead)
+        shift = 0.0 if name == cols.SHIFT else self.shift
+        return Hypothesis(effects, tuple(p for p in self.present if p != name), self.lead, shift)
 
 
 @dataclass
@@ -75,18 +87,28 @@ class Search:
     """One campaign under search."""
 
     parameters: Parameters
-    flights: list[Flight]
     logs: list[FlightLog]
+    """With what the sensors say of each other taken out."""
+    delay: float
     noise: dict[str, np.ndarray]
     names: tuple[str, ...]
     levels: np.ndarray = field(default_factory=lambda: FIRST.copy())
+    _flights: dict[float, list[Flight]] = field(default_factory=dict)
 
     @classmethod
     def start(cls, logs: list[FlightLog], parameters: Parameters, delay: float, sensors: SensorCheck) -> Search:
         """Prepare flights, with what is known of their sensors taken out, for a search over the whole catalogue."""
         logs = [sensors.corrected(log) for log in logs]
-        flights = [prepare_flight(log, delay) for log in logs]
-        return cls(parameters, flights, logs, sensor_noise(logs), tuple(CATALOGUE))
+        noise = sensor_noise(logs, FILTERED_GYRO if sensors.faults.gyro_lag else 1e-3)
+        return cls(parameters, logs, delay, noise, tuple(CATALOGUE))
+
+    def flights(self, hypothesis: Hypothesis) -> list[Flight]:
+        """The flights as a hypothesis reads them."""
+        key = round(hypothesis.shift, 5)
+        if key not in self._flights:
+            faults = SensorFaults(motor_shift=key)
+            self._flights[key] = [prepare_flight(faults.repaired(log), self.delay) for log in self.logs]
+        return self._flights[key]
 
     def nothing(self) -> Hypothesis:
         """The declared model."""
@@ -96,7 +118,7 @@ class Search:
         """Noise levels that fit what this hypothesis leaves."""
         model = hypothesis.model(self.parameters)
         pieces = []
-        for flight in self.flights:
+        for flight in self.flights(hypothesis):
             driven = driven_by(model, flight, hypothesis.lead)
             pieces.append(residual_blocks(model, flight, driven, jnp.asarray(hypothesis.lead)))
         blocks = Blocks(*(_joined([getattr(p, k) for p in pieces]) for k in ("signals", "interval", "valid")))
@@ -107,32 +129,32 @@ class Search:
         lead = Column(LEAD, LEAD, None, (), 0.25)
         columns = [lead, *wanted]
         padded = columns + [lead] * (-(len(columns) + 1) % PAD)
-        effects, steps = cols.stacked(hypothesis.effects, padded, set(hypothesis.present))
-        leads = hypothesis.lead + np.array(
-            [0.0] + [s if c.effect == LEAD else 0.0 for c, s in zip(padded, steps, strict=True)]
-        )
+        moves = cols.moves(hypothesis.effects, hypothesis.lead, padded, set(hypothesis.present))
         model = hypothesis.model(self.parameters)
-        models = eqx.tree_at(lambda m: m.effects, model, effects)
+        models = eqx.tree_at(lambda m: m.effects, model, moves.effects)
+        steps = [jnp.asarray(x) for x in (moves.lead, moves.shift, moves.step)]
         levels = levels_from(jnp.asarray(self.levels), self.noise)
         found = []
-        for flight in self.flights:
+        for flight in self.flights(hypothesis):
             driven = driven_by(model, flight, hypothesis.lead)
-            products, _ = gram(models, flight, driven, jnp.asarray(leads), jnp.asarray(steps), levels)
+            products, _ = gram(models, flight, driven, *steps, levels)
             found.append(np.asarray(products))
         scale = np.array([1.0] + [c.scale for c in padded])
         return Linear(hypothesis, columns, np.concatenate(found), scale)
-
 
     # -- one hypothesis -------------------------------------------------------------------------------------------
 
     def candidates(self) -> list[list[Column]]:
         """Columns of every effect and probe."""
-        return [variant for name in self.names for variant in cols.strengths(name)]
+        return [[cols.shift_column()]] + [variant for name in self.names for variant in cols.strengths(name)]
 
     def own_columns(self, hypothesis: Hypothesis) -> list[Column]:
         """Columns of what is there: strengths and shapes."""
         found = []
         for name in hypothesis.present:
+            if name == cols.SHIFT:
+                found.append(cols.shift_column())
+                continue
             found += cols.strengths(name)[0] + cols.shapes(hypothesis.effect(name))
         return [replace(c, probe=()) for c in found]
 
@@ -145,7 +167,14 @@ class Search:
             if attempt == rounds - 1:
                 break
             index = [1, *linear.index(own)]
-            values = solve(linear.pooled.sum(0), index, linear.scale)
+            lead = linear.scale[1]
+            pull = 0, (LEAD_USUAL - hypothesis.lead) / lead, (lead / LEAD_SPREAD) ** 2
+            values = solve(linear.pooled.sum(0), index, linear.scale, pull)
+            kept = np.clip(hypothesis.lead + values[0] * lead, *LEAD_RANGE)
+            if kept != hypothesis.lead + values[0] * lead:
+                # What the lead may not take the others have to explain.
+                fixed = 0, (kept - hypothesis.lead) / lead, 1e9
+                values = solve(linear.pooled.sum(0), index, linear.scale, fixed)
             deviation = np.sqrt(np.diag(covariance(linear.pooled, index, linear.scale, values)))
             if np.max(np.abs(values) / deviation) < 0.3:
                 break
@@ -156,7 +185,11 @@ class Search:
 
     def _moved(self, hypothesis: Hypothesis, own: list[Column], by: np.ndarray) -> Hypothesis:
         effects = {type(e).name: e for e in hypothesis.effects}
+        shift = hypothesis.shift
         for column, change in zip(own, by[1:], strict=True):
+            if column.effect == cols.SHIFT:
+                shift = float(np.clip(shift + change, -0.05, 0.05))
+                continue
             low, high = CATALOGUE[column.effect].prior[column.field]
             effect = cols.moved(effects[column.effect], column, float(change), True)
             value = np.asarray(getattr(effect, column.field))
@@ -164,41 +197,32 @@ class Search:
                 # A strength may exceed what is plausible (the report will say so), but not change a meaningless sign.
                 low, high = (0.0 if low >= 0 else 3 * low), 3 * high
             value = np.clip(value, low, high)
-            effects[column.effect] = eqx.tree_at(
-                lambda e, f=column.field: getattr(e, f), effect, jnp.asarray(value)
-            )
+            effects[column.effect] = eqx.tree_at(lambda e, f=column.field: getattr(e, f), effect, jnp.asarray(value))
         lead = float(np.clip(hypothesis.lead + by[0], *LEAD_RANGE))
-        return Hypothesis(tuple(effects[type(e).name] for e in hypothesis.effects), hypothesis.present, lead)
+        found = tuple(effects[type(e).name] for e in hypothesis.effects)
+        return Hypothesis(found, hypothesis.present, lead, shift)
 
     def adding(self, hypothesis: Hypothesis, linear: Linear, variant: list[Column]) -> Evidence | None:
         """Evidence for a candidate beside what is there; None where its sign makes no sense."""
-        base = [1, *linear.index(self.own_columns(hypothesis))]
+        # Not beside a free lead: late commands would look like one.
+        base = linear.index(self.own_columns(hypothesis))
         found = evidence(linear.pooled, base, linear.index(variant), linear.scale)
+        if variant[0].effect == cols.SHIFT:
+            return found
         low = CATALOGUE[variant[0].effect].prior[variant[0].field][0]
         return None if low >= 0 and np.any(found.values < 0) else found
 
     def with_candidate(self, hypothesis: Hypothesis, variant: list[Column], found: Evidence) -> Hypothesis:
         """The hypothesis with a candidate at the values the linear fit gives it."""
         name = variant[0].effect
+        if name == cols.SHIFT:
+            shift = hypothesis.shift + float(found.values[0]) * variant[0].scale
+            return Hypothesis(hypothesis.effects, (*hypothesis.present, name), hypothesis.lead, shift)
         effect = CATALOGUE[name].neutral()
         for column, value in zip(variant, found.values, strict=True):
             effect = cols.moved(effect, column, float(value) * column.scale, False)
         effects = tuple(effect if type(e).name == name else e for e in hypothesis.effects)
-        return Hypothesis(effects, (*hypothesis.present, name), hypothesis.lead)
-
-    def removing(self, hypothesis: Hypothesis, name: str) -> Evidence:
-        """Evidence for one effect that is there, beside the others."""
-        less = hypothesis.without(name)
-        own = self.own_columns(less)
-        variant = self._variant_of(hypothesis, name)
-        linear = self.linearise(less, own + variant)
-        return evidence(linear.pooled, [1, *linear.index(own)], linear.index(variant), linear.scale)
-
-    def _variant_of(self, hypothesis: Hypothesis, name: str) -> list[Column]:
-        """Columns of an effect's strengths at the shape it has."""
-        effect = hypothesis.effect(name)
-        probe = {c.field: float(np.asarray(getattr(effect, c.field))) for c in cols.shapes(effect)}
-        return cols.columns_of(name, CATALOGUE[name].strengths, probe)
+        return Hypothesis(effects, (*hypothesis.present, name), hypothesis.lead, hypothesis.shift)
 
 
 def _joined(parts):

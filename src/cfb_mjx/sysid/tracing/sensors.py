@@ -86,7 +86,9 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
         # With a healthy gyro both comparisons show the same delay; the turn tells it more exactly.
         weight = np.array([1 / turn_std**2, 1 / gain_std**2])
         value = float(weight @ [turn, gain] / weight.sum())
-        findings = [Finding(f.name, value, float(weight.sum() ** -0.5)) if f.name == "sensor_delay" else f for f in findings]
+        findings = [
+            Finding(f.name, value, float(weight.sum() ** -0.5)) if f.name == "sensor_delay" else f for f in findings
+        ]
     found = {f.name: f.value for f in findings}
     faults = SensorFaults(
         delay=found.get("sensor_delay", 0.0),

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import CATALOGUE
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.evaluation import evaluate
-from cfb_mjx.sysid.tracing.columns import Column
+from cfb_mjx.sysid.tracing.columns import SHIFT, Column
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
 from cfb_mjx.sysid.tracing.search import Hypothesis, Linear, Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
@@ -27,7 +26,9 @@ CLOSE = 0.1
 LARGEST = 6
 """Effects at most."""
 ERRORS = tuple(
-    f"{q}@{h}s" for h in ("0.2", "0.5") for q in ("position_rmse_m", "velocity_rmse_mps", "attitude_rmse_deg", "rate_rmse_radps")
+    f"{q}@{h}s"
+    for h in ("0.2", "0.5")
+    for q in ("position_rmse_m", "velocity_rmse_mps", "attitude_rmse_deg", "rate_rmse_radps")
 )
 
 
@@ -59,7 +60,9 @@ class Trace:
 
 def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
     """`ERRORS` on the flights of the search."""
-    metrics = evaluate(hypothesis.model(search.parameters), search.logs).metrics("commands_in")
+    metrics = evaluate(hypothesis.model(search.parameters), search.logs, faults=hypothesis.faults).metrics(
+        "commands_in"
+    )
     return np.array([metrics[key] for key in ERRORS])
 
 
@@ -163,7 +166,7 @@ def _summary(search: Search, hypothesis: Hypothesis, linear: Linear, errors: np.
     for column, std in zip(columns, deviation[1:], strict=True):
         if column.effect != name:
             continue
-        value = np.asarray(getattr(hypothesis.effect(name), column.field))
+        value = np.asarray(hypothesis.shift if name == SHIFT else getattr(hypothesis.effect(name), column.field))
         if column.index is None:
             parameters[column.field], uncertainty[column.field] = float(value), float(std)
         else:
