@@ -14,6 +14,7 @@ from cfb_mjx.errors import CfbError
 SUMMARY = {
     "import": "convert a flight log to MCAP",
     "evaluate": "measure how well a model predicts flights, open loop",
+    "benchmark-nanodrone": "judge a model by the rules of the IDSIA nano-drone benchmark",
     "fit": "refit the model to flights, with uncertainty",
     "fit-rotors": "fit motors and rotor maps, from flights or a bench",
     "excite": "design a manoeuvre that identifies the drone, and predict what a fit will know",

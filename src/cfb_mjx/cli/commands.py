@@ -49,6 +49,7 @@ def evaluate(
     set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
     json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
     figure: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    observer: bool = False,
 ) -> None:
     """Measure how well a model predicts flights, open loop, at 50, 100, 200 and 500 ms.
 
@@ -61,12 +62,34 @@ def evaluate(
         set: parameters to change, for instance mass=0.045.
         json: write the results here.
         figure: draw prediction against measurement here (.png, .svg, .pdf).
+        observer: add predictions with disturbances estimated from the data before each window starts.
     """
     if not logs:
         raise CfbError("evaluate needs at least one log; see 'cfb evaluate --help'.")
     from cfb_mjx.cli.evaluating import run_evaluate
 
-    run_evaluate(list(logs), model, list(set), json, figure)
+    run_evaluate(list(logs), model, list(set), json, figure, observer)
+
+
+def benchmark_nanodrone(
+    folder: tyro.conf.Positional[Path],
+    model: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None,
+    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    stride: int = 1,
+) -> None:
+    """Judge a model by the rules of the IDSIA nano-drone benchmark, beside the published results.
+
+    Predictions of 50 steps at 100 Hz from every row, rotor speeds in, and only those measured by then.
+
+    Args:
+        folder: holds the flights, raw 100 Hz merges (parquet or csv).
+        model: preset or model YAML; judged alone and with a disturbance observer.
+        json: write the results here.
+        stride: rows from one prediction's start to the next.
+    """
+    from cfb_mjx.cli.nanodrone import run_nanodrone
+
+    run_nanodrone(folder, model, json, stride)
 
 
 def fit(
@@ -263,6 +286,7 @@ def version() -> None:
 COMMANDS = {
     "import": import_log,
     "evaluate": evaluate,
+    "benchmark-nanodrone": benchmark_nanodrone,
     "fit": fit,
     "fit-rotors": fit_rotors,
     "excite": excite,

@@ -14,12 +14,20 @@ from cfb_mjx.logs import FlightLog, estimate_command_shift, read_log
 if TYPE_CHECKING:
     from cfb_mjx.parameters import ModelFile
 
-_LABELS = {"commands_in": "commands in", "rotor_speed_in": "rotor speed in", "hold": "hold"}
+_LABELS = {
+    "commands_in": "commands in",
+    "commands_in_observer": "  with observer",
+    "rotor_speed_in": "rotor speed in",
+    "rotor_speed_in_observer": "  with observer",
+    "hold": "hold",
+}
 _ROWS = (("position", "m"), ("velocity", "mps"), ("attitude", "deg"), ("rate", "radps"))
 _UNITS = {"m": "m", "mps": "m/s", "deg": "deg", "radps": "rad/s"}
 
 
-def run_evaluate(paths: list[Path], model: str, changes: list[str], json: Path | None, figure: Path | None) -> None:
+def run_evaluate(
+    paths: list[Path], model: str, changes: list[str], json: Path | None, figure: Path | None, observer: bool = False
+) -> None:
     """Evaluate, print a table, write what was asked for.
 
     Raises:
@@ -31,11 +39,15 @@ def run_evaluate(paths: list[Path], model: str, changes: list[str], json: Path |
     described = changed_model(model, changes)
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid import evaluate
+    from cfb_mjx.sysid.observer import Observer
 
-    evaluation = evaluate(Quadrotor.from_file(described), logs, progress=Progress("evaluating"))
+    settings = Observer() if observer else None
+    evaluation = evaluate(Quadrotor.from_file(described), logs, progress=Progress("evaluating"), observer=settings)
     alignment = {log.name: _alignment(log) for log in logs}
     result = evaluation.to_json()
     result |= {"model": described.name, "changes": changes, "alignment": alignment, "environment": environment()}
+    if settings is not None:
+        result["observer"] = vars(settings)
     for log in evaluation.logs:
         print(f"{log.log.name}: {len(log.windows)} windows; {describe_alignment(alignment[log.log.name])}")
     print_table(result)
@@ -80,7 +92,7 @@ def print_table(result: dict) -> None:
     print(f"{'':31}" + "".join(f"{float(h[:-1]) * 1e3:.0f} ms".ljust(26) for h in horizons).rstrip())
     for quantity, unit in _ROWS:
         for variant, label in _LABELS.items():
-            if result[variant] is None:
+            if result.get(variant) is None:
                 continue
             cells = []
             for horizon in horizons:

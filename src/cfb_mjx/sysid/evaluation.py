@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
@@ -12,11 +12,15 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.sysid import metrics
+from cfb_mjx.sysid.observer import Observer, at_starts, observe, observed_model
 from cfb_mjx.sysid.prediction import hold, predict, select, start_of_windows
+from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 from cfb_mjx.sysid.windows import Windows, find_windows
 
 HORIZONS = (0.05, 0.1, 0.2, 0.5)
 VARIANTS = ("commands_in", "rotor_speed_in", "hold")
+OBSERVED = ("commands_in_observer", "rotor_speed_in_observer")
+"""Two more where an observer helped."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,8 @@ class Evaluation:
 
     logs: tuple[LogEvaluation, ...]
     horizons: tuple[float, ...]
+    variants: tuple[str, ...] = VARIANTS
+    """The kinds of prediction that were made."""
 
     def metrics(self, variant: str) -> dict[str, float] | None:
         """Metrics of a variant over all windows of all logs; None where no log allows it."""
@@ -57,13 +63,13 @@ class Evaluation:
 
         def block(evaluation: Evaluation) -> dict:
             return {"windows": sum(len(log.windows) for log in evaluation.logs)} | {
-                variant: evaluation.metrics(variant) for variant in VARIANTS
+                variant: evaluation.metrics(variant) for variant in self.variants
             }
 
         return block(self) | {
             "rotor_speed_in_windows": int(sum(log.measured.sum() for log in self.logs)),
-            "intervals": {variant: self.intervals(variant) for variant in VARIANTS},
-            "logs": {log.log.name: block(Evaluation((log,), self.horizons)) for log in self.logs},
+            "intervals": {variant: self.intervals(variant) for variant in self.variants},
+            "logs": {log.log.name: block(replace(self, logs=(log,))) for log in self.logs},
         }
 
 
@@ -72,12 +78,18 @@ def evaluate(
     logs: Sequence[FlightLog],
     horizons: tuple[float, ...] = HORIZONS,
     progress: Callable[[int, int], None] | None = None,
+    observer: Observer | None = None,
+    faults: SensorFaults = HEALTHY,
 ) -> Evaluation:
     """Predict every window of every log, open loop, and compare with what was measured.
 
     Rotor speed at a window's start is estimated by the motor model driven with the commands since the log began.
     Integration is by RK4 on steps that end at every row, whatever the model's own integrator: its error is far
     below the sensors' noise. Run it with x64 enabled for full precision.
+
+    With an ``observer`` the variants `OBSERVED` are added: the same predictions with the disturbances it estimated
+    from data before each window's start. With sensor ``faults`` the model flies what a healthy chain would have
+    recorded, and its predictions are compared with what this one records.
 
     Raises:
         CfbError: two logs of one name, or no log allows a window.
@@ -89,32 +101,68 @@ def evaluate(
     precise = Quadrotor(model.parameters, model.effects, body=model.body, integrator="rk4", rotor_loads="instant")
     results = []
     for index, log in enumerate(logs):
-        results.append(_evaluate_log(precise, log, horizons))
+        results.append(_evaluate_log(precise, log, horizons, observer, faults))
         if progress is not None:
             progress(index + 1, len(logs))
     if not any(len(result.windows) for result in results):
         raise CfbError(
             f"{', '.join(names)}: no prediction window fits; a log must fly at least 1.2 s without a gap in its data."
         )
-    return Evaluation(tuple(results), tuple(horizons))
+    variants = VARIANTS if observer is None else VARIANTS + OBSERVED
+    return Evaluation(tuple(results), tuple(horizons), variants)
 
 
-def _evaluate_log(model: Quadrotor, log: FlightLog, horizons: tuple[float, ...]) -> LogEvaluation:
+def _evaluate_log(
+    model: Quadrotor, log: FlightLog, horizons: tuple[float, ...], observer: Observer | None, faults: SensorFaults
+) -> LogEvaluation:
     delay = log.metadata.get("observation_delay")
     delay = float(model.parameters.observation_delay) if delay is None else float(delay)
-    windows = find_windows(log, horizons, delay)
+    recorded = find_windows(log, horizons, delay)
+    reached = faults.reached(horizons)
+    log = faults.repaired(log)
+    windows = recorded if faults.healthy else find_windows(log, reached, delay, recorded.start)
     measured = np.isfinite(windows.rotor_speed).all(axis=(1, 2))
-    predictions: dict[str, State | None] = dict.fromkeys(VARIANTS)
-    errors: dict[str, dict[str, np.ndarray] | None] = dict.fromkeys(VARIANTS)
+    predictions: dict[str, State | None] = dict.fromkeys(VARIANTS + OBSERVED)
     if len(windows):
         start, memory = start_of_windows(model, log, windows, delay)
         predictions["commands_in"] = predict(model, windows, start, memory)
-        predictions["hold"] = hold(windows, horizons)
-        for variant in ("commands_in", "hold"):
-            errors[variant] = metrics.errors(windows, predictions[variant])
-        if measured.any():
-            chosen = select(windows, measured)
-            kept = jax.tree.map(lambda x: x[measured], memory)
-            predictions["rotor_speed_in"] = predict(model, chosen, memory=kept)
-            errors["rotor_speed_in"] = metrics.errors(chosen, predictions["rotor_speed_in"])
-    return LogEvaluation(log, delay, windows, measured, predictions, errors)
+        predictions["rotor_speed_in"] = _measured_in(model, windows, measured, memory)
+        predictions["hold"] = hold(recorded, horizons)
+        if observer is not None:
+            predictions |= _observed(model, log, delay, windows, measured, memory, observer)
+    predictions = {
+        variant: predicted if predicted is None or variant == "hold" else faults.as_recorded(predicted, horizons)
+        for variant, predicted in predictions.items()
+    }
+    errors = {
+        variant: None
+        if predicted is None
+        else metrics.errors(select(recorded, measured) if variant.startswith("rotor") else recorded, predicted)
+        for variant, predicted in predictions.items()
+    }
+    return LogEvaluation(log, delay, recorded, measured, predictions, errors)
+
+
+def _measured_in(model: Quadrotor, windows: Windows, measured: np.ndarray, memory: tuple) -> State | None:
+    """Predictions with measured rotor speeds in, of the windows where they were measured."""
+    if not measured.any():
+        return None
+    return predict(model, select(windows, measured), memory=jax.tree.map(lambda x: x[measured], memory))
+
+
+def _observed(
+    model: Quadrotor,
+    log: FlightLog,
+    delay: float,
+    windows: Windows,
+    measured: np.ndarray,
+    memory: tuple,
+    observer: Observer,
+) -> dict[str, State | None]:
+    """The two variants with what ``observer`` knows at the windows' starts."""
+    known = at_starts(observe(model, log, delay, observer), log, windows)
+    windows, model = replace(windows, body_rate=known.body_rate), observed_model(model, observer)
+    return {
+        "commands_in_observer": predict(model, windows, known.rotor_speed, (*memory, known.memory(rotors=True))),
+        "rotor_speed_in_observer": _measured_in(model, windows, measured, (*memory, known.memory(rotors=False))),
+    }

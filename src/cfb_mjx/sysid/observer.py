@@ -1,205 +1,125 @@
 """A disturbance observer: what a flight's own past says about the next half second.
 
-Real drones fly under torques and forces no model knows, and these change slowly. Along the log Kalman filters carry,
-per body axis, the body rate with a wandering angular acceleration, and a wandering specific force; per motor, where
-rotor speed was measured, the error of the modelled rotor speed with a wandering error of its steady value. What they
-know at a window's start is added to the prediction, fading with its own time constant (``docs/nanodrone.md``).
+Real drones fly under torques and forces no model knows, and these change slowly. Kalman filters walk along the log.
+Per body axis one holds the body rate with two wandering angular accelerations, a quick one and a slow one (trim), and
+one the wandering error of the specific force; per motor, where rotor speed was measured, one holds the error of the
+modelled rotor speed and of its steady value. The body's filters are driven by the model beside the flight (`replay`).
+What they know at a window's start is added to the prediction and fades with its own correlation time
+(``docs/nanodrone.md``).
 
-Causal: the estimate at a row rests on gyro, accelerometer, commands and rotor speeds up to that row. Attitude and
-velocity enter the model's effects only, read ``observation_delay`` late as a window's initial state is.
+Causal: an estimate rests on gyro, accelerometer, commands, voltage and rotor speeds up to its row. Attitude and
+velocity enter through the model's effects only, read ``observation_delay`` late as a window's initial state is.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Float
 
+from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects.base import Condition, Effect, Memory, Motors, Wrench
+from cfb_mjx.model.effects import Condition, Effect, Memory, Motors, Wrench
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight, prepare_flight
-from cfb_mjx.sysid.replay import replay
+from cfb_mjx.sysid.replay import Replay, replay
 from cfb_mjx.sysid.windows import Windows
 
+MEASURED_SHARE = 0.98
+"""Rotor speeds are used where every motor has at least this share of valid readings, as in `prepare_flight`."""
+RIDGE = 1e-3
+"""Weight of the prior that holds the logarithms of noise levels, per row of a fit: levels the data say nothing about
+stay where they were."""
 
-@dataclasses.dataclass(frozen=True)
-class Observer:
+
+class Observer(eqx.Module):
     """Noise levels of the filters: standard deviations and correlation times."""
 
     gyro: float = 0.02
     """White noise of a gyro row, rad/s."""
-    rate_walk: float = 0.3
+    rate_walk: float = 0.4
     """White angular acceleration, rad/s per square root of a second."""
-    torque: float = 6.0
+    torque: tuple[float, float, float] = (5.0, 5.0, 1.5)
     """Quickly wandering angular acceleration, rad/s^2."""
     torque_time: float = 0.3
     """Its correlation time, s."""
-    trim: float = 10.0
+    trim: tuple[float, float, float] = (2.0, 2.0, 1.0)
     """Slowly wandering angular acceleration, rad/s^2."""
     trim_time: float = 10.0
     """Its correlation time, s."""
-    accelerometer: float = 1.0
+    accelerometer: float = 0.3
     """White noise of an accelerometer row, m/s^2."""
-    force: float = 0.7
+    force: float = 0.5
     """Wandering specific force, m/s^2."""
-    force_time: float = 0.7
+    force_time: float = 0.8
     """Its correlation time, s."""
     rotor: float = 10.0
     """White noise of a rotor speed row, rad/s."""
-    rotor_walk: float = 30.0
+    rotor_walk: float = 110.0
     """White rotor acceleration, rad/s per square root of a second."""
-    rotor_offset: float = 30.0
+    rotor_offset: float = 25.0
     """Wandering error of the steady rotor speed, rad/s."""
-    rotor_offset_time: float = 1.0
+    rotor_offset_time: float = 0.3
     """Its correlation time, s."""
-    filtered_rate: bool = True
-    rotor_feedback: bool = True
 
 
 class Observed(eqx.Module):
-    """What the observer knows at each row of a log (or at each window's start), from that row and earlier ones."""
+    """What an observer knows at each row from that row and earlier ones; or at each window's start."""
 
     body_rate: Float[Array, "n 3"]
     """Filtered, rad/s."""
-    torque: Float[Array, "n 3"]
-    """Angular acceleration that fades with ``torque_time``, rad/s^2."""
-    trim: Float[Array, "n 3"]
-    """Angular acceleration that fades with ``trim_time``, rad/s^2."""
-    force: Float[Array, "n 3"]
-    """Specific force, body axes, m/s^2."""
-    rotor_speed: Float[Array, "n 4"]
-    """Of the model driven by the commands, corrected by what was measured, rad/s."""
-    rotor_offset: Float[Array, "n 4"]
-    """Error of the steady rotor speed, rad/s."""
     angular_acceleration: Float[Array, "n 3"]
-    innovation: Any = None
+    """Of the model with the disturbances, over the last interval, rad/s^2."""
+    torque: Float[Array, "n 3"]
+    """Unmodelled angular acceleration that fades with ``torque_time``, rad/s^2."""
+    trim: Float[Array, "n 3"]
+    """The same, fading with ``trim_time``."""
+    force: Float[Array, "n 3"]
+    """Unmodelled specific force, body axes, m/s^2."""
+    rotor_speed: Float[Array, "n 4"]
+    """From the commands, corrected by what was measured, rad/s."""
+    rotor_offset: Float[Array, "n 4"]
+    """Error of the steady rotor speed, rad/s; zero where rotor speed was not measured."""
 
-
-def _causal_rotor_speed(log: FlightLog, length: int) -> np.ndarray | None:
-    """Measured rotor speeds with holes filled from the past."""
-    if log.rotor_speed is None or (np.isfinite(log.rotor_speed).mean(axis=0) < 0.98).any():
-        return None
-    out = log.rotor_speed.copy()
-    for motor in range(4):
-        good = np.isfinite(out[:, motor])
-        last = np.maximum.accumulate(np.where(good, np.arange(len(out)), -1))
-        out[:, motor] = np.where(last >= 0, out[np.maximum(last, 0), motor], out[np.argmax(good), motor])
-    return np.concatenate([out, np.repeat(out[-1:], length - len(out), axis=0)])
-
-
-@eqx.filter_jit
-def _observe(model: Quadrotor, flight: Flight, driven, levels, use_measured: bool) -> Observed:
-    flight = eqx.tree_at(lambda f: f.measured, flight, jnp.asarray(1.0 if use_measured else 0.0))
-    said = replay(model, flight, driven, jnp.zeros(()))
-    lag = jnp.mean(model.changed_parameters().motor_time_constant)
-    o = levels
-
-    def body(carry, row):
-        w, a, b, f, p = carry
-        dt, alpha, force, gyro, acceleration, fresh = row
-        # state (w, a, b), covariance (3, 3), the same for the three axes
-        ka, kb = jnp.exp(-dt / o.torque_time), jnp.exp(-dt / o.trim_time)
-        step = jnp.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]).at[0, 1].set(o.torque_time * (1 - ka)).at[0, 2].set(dt)
-        step = step.at[1, 1].set(ka).at[2, 2].set(kb)
-        grown = step @ p @ step.T + jnp.diag(
-            jnp.stack([o.rate_walk**2 * dt, o.torque**2 * (1 - ka**2), o.trim**2 * (1 - kb**2)])
-        )
-        w, a, b = w + dt * (alpha + b) + o.torque_time * (1 - ka) * a, ka * a, kb * b
-        s = grown[0, 0] + o.gyro**2
-        gain = grown[:, 0] / s
-        e = gyro - w
-        w, a, b = w + gain[0] * e, a + gain[1] * e, b + gain[2] * e
-        p = grown - jnp.outer(gain, grown[0])
-        # after a gap
-        restart = jnp.diag(jnp.stack([o.gyro**2, o.torque**2, grown[2, 2]]))
-        w = jnp.where(fresh > 0, gyro, w)
-        a = jnp.where(fresh > 0, 0.0, a)
-        p = jnp.where(fresh > 0, restart, p)
-        kf = jnp.exp(-dt / o.force_time)
-        d, q = f
-        d, q = kf * d, kf**2 * q + o.force**2 * (1 - kf**2)
-        g = q / (q + o.accelerometer**2)
-        ef = acceleration - force - d
-        d, q = d + jnp.where(fresh > 0, 0.0, g) * ef, jnp.where(fresh > 0, q, (1 - g) * q)
-        return (w, a, b, (d, q), p), (w, a, b, d, e, s)
-
-    def rotor(carry, row):
-        x, b, pxx, pxb, pbb = carry
-        dt, error, fresh = row
-        keep, decay = jnp.exp(-dt / o.rotor_offset_time), jnp.exp(-dt / lag)
-        mix = 1 - decay
-        x, b = decay * x + mix * b, keep * b
-        pxx, pxb, pbb = (
-            decay**2 * pxx + 2 * decay * mix * pxb + mix**2 * pbb + o.rotor_walk**2 * dt,
-            keep * (decay * pxb + mix * pbb),
-            keep**2 * pbb + o.rotor_offset**2 * (1 - keep**2),
-        )
-        s, e = pxx + o.rotor**2, error - x
-        kx, kb = pxx / s, pxb / s
-        x, b = x + kx * e, b + kb * e
-        pxx, pxb, pbb = (1 - kx) * pxx, (1 - kx) * pxb, pbb - kb * pxb
-        return (x, b, pxx, pxb, pbb), (x, b)
-
-    zero = jnp.zeros(3)
-    first = (
-        flight.body_rate[0],
-        zero,
-        zero,
-        (zero, jnp.asarray(o.force**2)),
-        jnp.diag(jnp.stack([o.gyro**2, o.torque**2, o.trim**2])),
-    )
-    before = lambda x: jnp.concatenate([x[:1], x[:-1]])  # noqa: E731
-    interval = jnp.concatenate([jnp.zeros(1), flight.interval[:-1]])
-    rows = (
-        interval,
-        before(said.angular_acceleration),
-        before(said.specific_force),
-        flight.body_rate,
-        flight.specific_force,
-        flight.fresh,
-    )
-    _, (w, a, b, d, e, s) = jax.lax.scan(body, first, rows)
-    speed, offset = said.rotor_speed, jnp.zeros_like(said.rotor_speed)
-    if use_measured:
-        error = driven - said.rotor_speed
-        z = jnp.zeros(4)
-        start = (error[0], z, z + o.rotor**2, z, z + o.rotor_offset**2)
-        _, (x, offset) = jax.lax.scan(rotor, start, (interval, error, flight.fresh))
-        speed = said.rotor_speed + x
-    return Observed(w, a, b, d, speed, offset, before(said.angular_acceleration), (e, s))
+    def memory(self, rotors: bool) -> Memory:
+        """Of a `Disturbance`, with or without ``rotors``' offsets."""
+        return self.torque, self.trim, self.force, self.rotor_offset * rotors
 
 
 class Disturbance(Effect):
-    """Adds a fading angular acceleration, specific force and error of the steady rotor speed."""
+    """Adds what an `Observer` found to a model: no physical effect, so it is not in the catalogue.
+
+    Remembered are the quick and the slow angular acceleration, the specific force and the error of the steady rotor
+    speeds (`Observed.memory`); each fades with its own correlation time.
+    """
 
     name: ClassVar[str] = "observed_disturbance"
-    units: ClassVar[dict[str, str]] = {
-        "torque_time": "s",
-        "trim_time": "s",
-        "force_time": "s",
-        "rotor_offset_time": "s",
-    }
-    source: ClassVar[str] = ""
+    units: ClassVar[dict[str, str]] = {"times": "s"}
+    source: ClassVar[str] = "estimated from the flight itself (cfb_mjx.sysid.observer)"
     prior: ClassVar[dict[str, tuple[float, float]]] = {}
     strengths: ClassVar[tuple[str, ...]] = ()
 
-    torque_time: Array
-    trim_time: Array
-    force_time: Array
-    rotor_offset_time: Array
+    times: tuple[Array, Array, Array, Array]
+
+    @classmethod
+    def of(cls, observer: Observer) -> Disturbance:
+        """With the correlation times of ``observer``."""
+        o = observer
+        times = o.torque_time, o.trim_time, o.force_time, o.rotor_offset_time
+        return cls(tuple(jnp.asarray(t, jnp.result_type(float)) for t in times))
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
         zero = jnp.zeros_like(rotor_speed[0])
-        three = Vec(zero, zero, zero)
-        return three, three, three, Vec(zero, zero, zero, zero)
+        return (*(Vec(zero, zero, zero) for _ in range(3)), Vec(zero, zero, zero, zero))
 
     def motors(
         self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
@@ -208,13 +128,218 @@ class Disturbance(Effect):
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         torque, trim, force, _ = condition.memory
-        parameters = condition.parameters
-        pushed = force * parameters.mass
-        turning = parameters.inertia.map(lambda j, a: j * a, torque + trim)
-        return Wrench(
-            wrench.force + pushed, wrench.torque + turning + parameters.center_of_gravity.cross(pushed)
-        )
+        drone = condition.parameters
+        push = force * drone.mass
+        turn = drone.inertia.map(lambda inertia, a: inertia * a, torque + trim)
+        # The force was seen at the rotors' centre but must not turn the drone: the gyro has told what does.
+        return Wrench(wrench.force + push, wrench.torque + turn + drone.center_of_gravity.cross(push))
 
     def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
-        times = (self.torque_time, self.trim_time, self.force_time, self.rotor_offset_time)
-        return tuple(m * jnp.exp(-dt / t) for m, t in zip(condition.memory, times, strict=True))
+        return tuple(m * jnp.exp(-dt / time) for m, time in zip(condition.memory, self.times, strict=True))
+
+
+def observed_model(model: Quadrotor, observer: Observer) -> Quadrotor:
+    """The model with a `Disturbance` as its last effect."""
+    return eqx.tree_at(lambda m: m.effects, model, (*model.effects, Disturbance.of(observer)))
+
+
+def observe(model: Quadrotor, log: FlightLog, delay: float, observer: Observer, use_measured: bool = True) -> Observed:
+    """Run an observer along a log.
+
+    Args:
+        model: the drone.
+        log: the flight, n rows.
+        delay: age of pose and velocity in a row, s.
+        observer: noise levels.
+        use_measured: let measured rotor speeds, where the log has them, drive the body and correct the motors.
+
+    Returns:
+        NumPy arrays, one row per row of the log.
+    """
+    found, _ = _observe(model, *_inputs(log, delay, use_measured), _numbers(observer))
+    return jax.tree.map(lambda x: np.asarray(x)[: len(log)], found)
+
+
+def at_starts(found: Observed, log: FlightLog, windows: Windows) -> Observed:
+    """What is known at the starts of W windows, fields (W, ...): the row before, the body rate carried on to t0."""
+    here = jax.tree.map(lambda x: x[windows.row], found)
+    since = (windows.start - log.time[windows.row])[:, None]
+    return eqx.tree_at(lambda o: o.body_rate, here, here.body_rate + since * here.angular_acceleration)
+
+
+def fit_observer(model: Quadrotor, logs: Sequence[FlightLog], observer: Observer | None = None) -> Observer:
+    """Noise levels that make the innovations of the filters likeliest (maximum likelihood).
+
+    Args:
+        model: the drone, with the effects it will be used with.
+        logs: flights that will not be judged.
+        observer: where to start, and what to keep where the logs say nothing (rotors: logs without rotor speed).
+
+    Raises:
+        CfbError: no logs.
+    """
+    if not logs:
+        raise CfbError("fit_observer needs at least one log.")
+    first = _numbers(observer or Observer())
+    replays = []
+    for log in logs:
+        delay = log.observation_delay
+        flight, driven = _inputs(log, float(model.parameters.observation_delay) if delay is None else delay, True)
+        replays.append((model, flight, driven, _replay(model, flight, driven)))
+    leaves, structure = jax.tree.flatten(first)
+    sizes = [leaf.size for leaf in leaves]
+
+    def levels(vector):
+        parts = jnp.split(vector, np.cumsum(sizes)[:-1])
+        return jax.tree.unflatten(
+            structure, [leaf * jnp.exp(part.reshape(leaf.shape)) for leaf, part in zip(leaves, parts, strict=True)]
+        )
+
+    @eqx.filter_jit
+    def cost(vector, data):
+        total = sum(_surprise(*one, levels(vector)) for one in data)
+        rows = sum(jnp.sum(one[1].valid) for one in data)
+        return total / rows + RIDGE * jnp.sum(vector**2)
+
+    solver = optx.BFGS(rtol=1e-3, atol=1e-3)
+    start = jnp.zeros(sum(sizes), jnp.result_type(float))
+    best = optx.minimise(cost, solver, start, tuple(replays), max_steps=60, throw=False).value
+    found = levels(best)
+    values = {f.name: np.asarray(getattr(found, f.name)) for f in dataclasses.fields(found)}
+    return Observer(**{name: tuple(x.tolist()) if x.ndim else float(x) for name, x in values.items()})
+
+
+def _numbers(observer: Observer) -> Observer:
+    """The observer's numbers as arrays, those of the three axes as one."""
+    fields = {
+        f.name: jnp.asarray(getattr(observer, f.name), jnp.result_type(float)) for f in dataclasses.fields(observer)
+    }
+    return Observer(**fields)
+
+
+def _inputs(log: FlightLog, delay: float, use_measured: bool) -> tuple[Flight, Array]:
+    """The flight and the rotor speeds that drive the body; its ``measured`` says whether they do."""
+    flight = prepare_flight(log, delay)
+    driven = causal_rotor_speed(log) if use_measured else None
+    used = 1.0 if driven is not None else 0.0
+    driven = np.zeros((len(log), 4)) if driven is None else driven
+    driven = np.concatenate([driven, np.repeat(driven[-1:], len(flight.time) - len(log), axis=0)])
+    return eqx.tree_at(lambda f: f.measured, flight, np.array(used)), driven
+
+
+def causal_rotor_speed(log: FlightLog) -> np.ndarray | None:
+    """Measured rotor speeds, (n, 4) rad/s, invalid readings replaced by the last valid one; None if not measured."""
+    if log.rotor_speed is None or (np.isfinite(log.rotor_speed).mean(axis=0) < MEASURED_SHARE).any():
+        return None
+    out = log.rotor_speed.copy()
+    for motor in range(4):
+        good = np.isfinite(out[:, motor])
+        last = np.maximum.accumulate(np.where(good, np.arange(len(out)), -1))
+        out[:, motor] = out[np.where(last >= 0, last, np.argmax(good)), motor]
+    return out
+
+
+@eqx.filter_jit
+def _replay(model: Quadrotor, flight: Flight, driven: Array) -> Replay:
+    return replay(model, flight, driven, jnp.zeros(()))
+
+
+@eqx.filter_jit
+def _observe(model: Quadrotor, flight: Flight, driven: Array, observer: Observer):
+    said = replay(model, flight, driven, jnp.zeros(()))
+    body, body_errors = _body(flight, said, observer)
+    motors, motor_errors = _motors(model, flight, driven, said, observer)
+    return Observed(*body, *motors), (*body_errors, *motor_errors)
+
+
+def _surprise(model: Quadrotor, flight: Flight, driven: Array, said: Replay, observer: Observer) -> Array:
+    """Negative log-likelihood of all innovations, without the constant."""
+    _, errors = _body(flight, said, observer)
+    _, motor_errors = _motors(model, flight, driven, said, observer)
+
+    def of(error, variance, counts):
+        return 0.5 * jnp.sum(counts[:, None] * (jnp.log(variance) + error**2 / variance))
+
+    turning, pushing = errors
+    counts = flight.valid * (1 - flight.fresh)
+    return of(*turning, counts) + of(*pushing, counts) + of(*motor_errors[0], counts * flight.measured)
+
+
+def _before(x: Array) -> Array:
+    """What was given for the interval after each row, for the interval before it."""
+    return jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
+
+
+def _body(flight: Flight, said: Replay, o: Observer):
+    """Rate, angular acceleration, its unmodelled parts and the unmodelled force; innovations and variances."""
+
+    def axis(rate, model_rate, torque, trim):
+        def row(carry, inputs):
+            (w, a, b), p = carry
+            dt, alpha, gyro, fresh = inputs
+            quick, slow = jnp.exp(-dt / o.torque_time), jnp.exp(-dt / o.trim_time)
+            reach = o.torque_time * (1 - quick)
+            move = jnp.array([[1.0, reach, dt], [0.0, quick, 0.0], [0.0, 0.0, slow]])
+            noise = jnp.stack([o.rate_walk**2 * dt, torque**2 * (1 - quick**2), trim**2 * (1 - slow**2)])
+            x = move @ jnp.stack([w, a, b]) + jnp.stack([alpha * dt, 0.0, 0.0])
+            p = move @ p @ move.T + jnp.diag(noise)
+            variance, error = p[0, 0] + o.gyro**2, gyro - x[0]
+            gain = p[:, 0] / variance
+            kept = x + gain * error, p - jnp.outer(gain, p[0])
+            # Behind a gap only the trim is still known.
+            anew = jnp.stack([gyro, 0.0, x[2]]), jnp.diag(jnp.stack([o.gyro**2, torque**2, p[2, 2]]))
+            x, p = jax.tree.map(lambda new, old: jnp.where(fresh > 0, new, old), anew, kept)
+            total = alpha + jnp.where(fresh > 0, 0.0, x[1]) + x[2]
+            return (x, p), (x, total, error, variance)
+
+        start = jnp.stack([rate[0], 0.0, 0.0]), jnp.diag(jnp.stack([o.gyro**2, torque**2, trim**2]))
+        return jax.lax.scan(row, start, (interval, model_rate, rate, flight.fresh))[1]
+
+    def push(carry, inputs):
+        d, p = carry
+        dt, model_force, measured, fresh = inputs
+        keep = jnp.exp(-dt / o.force_time)
+        d, p = keep * d, keep**2 * p + o.force**2 * (1 - keep**2)
+        variance, error = p + o.accelerometer**2, measured - model_force - d
+        gain = jnp.where(fresh > 0, 0.0, p / variance)
+        return (d + gain * error, (1 - gain) * p), (d + gain * error, error, jnp.broadcast_to(variance, (3,)))
+
+    interval, alpha, force = _before(flight.interval), _before(said.angular_acceleration), _before(said.specific_force)
+    levels = flight.body_rate, alpha, o.torque, o.trim
+    state, total, error, variance = jax.vmap(axis, in_axes=(1, 1, 0, 0), out_axes=1)(*levels)
+    rows = interval, force, flight.specific_force, flight.fresh
+    _, (pushed, push_error, push_variance) = jax.lax.scan(push, (jnp.zeros(3), o.force**2), rows)
+    known = state[..., 0], total, state[..., 1], state[..., 2], pushed
+    return known, ((error, variance), (push_error, push_variance))
+
+
+def _motors(model: Quadrotor, flight: Flight, driven: Array, said: Replay, o: Observer):
+    """Rotor speed and the error of its steady value; innovations and variances.
+
+    The error e of the modelled speed follows that of its steady value b as the motors follow their commands:
+    T e' = b - e. So nothing has to be known of what effects do to the motors.
+    """
+    lag = jnp.mean(model.changed_parameters().motor_time_constant)
+    used = flight.measured
+
+    def row(carry, inputs):
+        x, b, pxx, pxb, pbb = carry
+        dt, measured = inputs
+        keep, decay = jnp.exp(-dt / o.rotor_offset_time), jnp.exp(-dt / lag)
+        mix = 1 - decay
+        x, b = decay * x + mix * b, keep * b
+        pxx, pxb, pbb = (
+            decay**2 * pxx + 2 * decay * mix * pxb + mix**2 * pbb + o.rotor_walk**2 * dt,
+            keep * (decay * pxb + mix * pbb),
+            keep**2 * pbb + o.rotor_offset**2 * (1 - keep**2),
+        )
+        variance, error = pxx + o.rotor**2, measured - x
+        kx, kb = used * pxx / variance, used * pxb / variance
+        x, b = x + kx * error, b + kb * error
+        pxx, pxb, pbb = (1 - kx) * pxx, (1 - kx) * pxb, pbb - kb * pxb
+        return (x, b, pxx, pxb, pbb), (x, b, error, jnp.broadcast_to(variance, (4,)))
+
+    gap = used * (driven - said.rotor_speed)
+    start = gap[0], jnp.zeros(4), o.rotor**2, jnp.zeros(()), o.rotor_offset**2
+    _, (x, b, error, variance) = jax.lax.scan(row, start, (_before(flight.interval), gap))
+    return (said.rotor_speed + x, b), ((error, variance),)

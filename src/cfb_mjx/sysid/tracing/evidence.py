@@ -46,11 +46,17 @@ def solve(
     return np.linalg.solve(a, b)
 
 
-def covariance(blocks: np.ndarray, columns: list[int], scale: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(k, k) covariance of `solve`'s values, from the scatter of the blocks' gradients where that is larger."""
+def covariance(
+    blocks: np.ndarray, columns: list[int], scale: np.ndarray, values: np.ndarray, precision: float = 0.0
+) -> np.ndarray:
+    """(k, k) covariance of `solve`'s values, from the scatter of the blocks' gradients where that is larger.
+
+    ``precision`` is what is known of the first column beforehand.
+    """
     s = scale[columns]
     total = blocks.sum(0)
     a = total[np.ix_(columns, columns)] * np.outer(s, s) + RIDGE * np.eye(len(columns))
+    a[0, 0] += precision
     inverse = np.linalg.inv(a)
     gradient = blocks[:, columns, 0] * s - np.einsum(
         "bij,j->bi", blocks[:, columns][:, :, columns] * np.outer(s, s), values

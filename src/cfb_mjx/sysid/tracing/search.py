@@ -110,6 +110,11 @@ class Search:
             self._flights[key] = [prepare_flight(faults.repaired(log), self.delay) for log in self.logs]
         return self._flights[key]
 
+    def beside(self, logs: list[FlightLog], sensors: SensorCheck) -> Search:
+        """The same search, with its noise levels, on other flights of the drone."""
+        here = replace(self, logs=[sensors.corrected(log) for log in logs], _flights={})
+        return here
+
     def nothing(self) -> Hypothesis:
         """The declared model."""
         return Hypothesis(cols.neutral_effects(self.names))
@@ -175,7 +180,7 @@ class Search:
                 # What the lead may not take the others have to explain.
                 fixed = 0, (kept - hypothesis.lead) / lead, 1e9
                 values = solve(linear.pooled.sum(0), index, linear.scale, fixed)
-            deviation = np.sqrt(np.diag(covariance(linear.pooled, index, linear.scale, values)))
+            deviation = np.sqrt(np.diag(covariance(linear.pooled, index, linear.scale, values, pull[2])))
             if np.max(np.abs(values) / deviation) < 0.3:
                 break
             hypothesis = self._moved(hypothesis, own, values * linear.scale[index])

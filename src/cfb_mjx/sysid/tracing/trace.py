@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.evaluation import evaluate
+from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.columns import SHIFT, Column
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
-from cfb_mjx.sysid.tracing.search import Hypothesis, Linear, Search
+from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Linear, Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
 
 ALPHA = 1e-3
@@ -23,6 +24,8 @@ MATERIAL = 0.03
 """And lower at least one prediction error (four quantities, two horizons) by this share."""
 CLOSE = 0.1
 """A rival that gains all but this share of the winner's gain is named as confusable with it."""
+SMALLEST_SHIFT = 0.0015
+"""Motor columns less late or early than this, s, are commands between rows rather than a fault."""
 LARGEST = 6
 """Effects at most."""
 ERRORS = tuple(
@@ -45,6 +48,8 @@ class Found:
     parameters: dict[str, float | list[float]]
     uncertainty: dict[str, float | list[float]]
     confusable: list[str] = field(default_factory=list)
+    without: Hypothesis | None = None
+    """The best model without this effect, for judging it on other flights."""
 
 
 @dataclass
@@ -56,6 +61,12 @@ class Trace:
     found: list[Found]
     tried: list[dict]
     """What was looked at in every round, for the report."""
+    search: Search
+
+    @property
+    def faults(self) -> SensorFaults:
+        """Everything wrong with the recording."""
+        return replace(self.sensors.faults, motor_shift=self.hypothesis.shift)
 
 
 def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
@@ -102,14 +113,15 @@ def trace(
         new = prediction_errors(search, richer)
         drop = 1 - new / errors
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, drop.tolist(), strict=True))}
-        if drop.max() < MATERIAL or np.log(new / errors).sum() > 0:
+        slight = name == SHIFT and abs(richer.shift) < SMALLEST_SHIFT
+        if slight or drop.max() < MATERIAL or np.log(new / errors).sum() > 0:
             refused.add(name)
             continue
         hypothesis, linear, errors = richer, refined, new
         hypothesis, linear, errors = re_examined(search, hypothesis, linear, errors, progress)
     found = [_summary(search, hypothesis, linear, errors, name) for name in hypothesis.present]
     found.sort(key=lambda f: -f.buys)
-    return Trace(hypothesis, sensors, found, tried)
+    return Trace(hypothesis, sensors, found, tried, search)
 
 
 def rank(
@@ -161,7 +173,9 @@ def _summary(search: Search, hypothesis: Hypothesis, linear: Linear, errors: np.
     columns = search.own_columns(hypothesis)
     index = [1, *linear.index(columns)]
     values = solve(linear.pooled.sum(0), index, linear.scale)
-    deviation = np.sqrt(np.diag(covariance(linear.pooled, index, linear.scale, values))) * linear.scale[index]
+    known = (linear.scale[1] / LEAD_SPREAD) ** 2
+    spread = covariance(linear.pooled, index, linear.scale, values, known)
+    deviation = np.sqrt(np.diag(spread)) * linear.scale[index]
     parameters, uncertainty = {}, {}
     for column, std in zip(columns, deviation[1:], strict=True):
         if column.effect != name:
@@ -174,7 +188,7 @@ def _summary(search: Search, hypothesis: Hypothesis, linear: Linear, errors: np.
             uncertainty.setdefault(column.field, []).append(float(std))
     gain = own.gain if own else 0.0
     rivals = [v[0].effect for e, v in ranking if v[0].effect != name and e.gain > (1 - CLOSE) * gain]
-    return Found(name, own.p_value if own else 1.0, gain, buys, parameters, uncertainty, rivals)
+    return Found(name, own.p_value if own else 1.0, gain, buys, parameters, uncertainty, rivals, less)
 
 
 def _line(variant: list[Column], found: Evidence) -> dict:

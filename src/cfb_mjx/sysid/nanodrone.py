@@ -1,0 +1,199 @@
+"""The rules of the IDSIA nano-drone benchmark, for this library's models.
+
+Busetto et al., "Nonlinear system identification for a nano-drone benchmark", Control Engineering Practice 172, 2026:
+from every row of a flight 50 steps at 100 Hz are predicted, with measured rotor speeds as input; errors are the mean
+norms of position, velocity, attitude (geodesic, rad) and body rate after h = 1, 10 and 50 steps, and their sums over
+h = 1 to 50. What is taken over and what differs is in ``docs/nanodrone.md``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.rotation import exponential, multiply
+from cfb_mjx.model.quadrotor import Quadrotor, integrate_measured, prepare
+from cfb_mjx.model.state import State, stack, unstack
+from cfb_mjx.model.vector import Vec
+from cfb_mjx.sysid.flight import prepare_flight
+from cfb_mjx.sysid.metrics import geodesic_deg
+from cfb_mjx.sysid.observer import Observer, causal_rotor_speed, observe, observed_model
+from cfb_mjx.sysid.replay import remembered
+
+STEPS = 50
+INTERVAL = 0.01
+"""Of the rows, s."""
+SHOWN = (1, 10, 50)
+"""Steps ahead that are reported one by one."""
+BLOCK = 1024
+"""Windows predicted together."""
+QUANTITIES = {"position": "m", "velocity": "mps", "attitude": "rad", "rate": "radps"}
+PUBLISHED: dict[str, tuple[float, float, float, float]] = {
+    "naive": (17.79, 38.92, 8.21, 29.09),
+    "physics": (2.322, 10.62, 5.101, 29.09),
+    "physics + residual": (2.363, 10.40, 6.15, 28.99),
+    "LSTM": (5.97, 16.72, 5.65, 35.84),
+}
+"""Sums over h of the errors of position [m], velocity [m/s], attitude [rad] and body rate [rad/s] in the paper, on its
+own test flights: another trajectory."""
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Windows of one flight: W starts, S = `STEPS` steps.
+
+    Attributes:
+        row: (W,) row each window starts from.
+        truth: position, velocity, quaternion and body rate of every row, (n, 3 or 4).
+        rotor_speed: (n, 4) rad/s, known by the row's time.
+    """
+
+    row: np.ndarray
+    truth: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+    rotor_speed: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def ahead(self) -> tuple[np.ndarray, ...]:
+        """What was measured 1 to S steps after each start, (W, S, 3 or 4)."""
+        index = self.row[:, None] + np.arange(1, STEPS + 1)
+        return tuple(x[index] for x in self.truth)
+
+
+def find_starts(log: FlightLog, stride: int = 1) -> Starts:
+    """Every ``stride``-th row with 50 rows after it, none of them missing.
+
+    Raises:
+        CfbError: the log is not sampled at 100 Hz or has no rotor speeds.
+    """
+    if abs(log.nominal_interval - INTERVAL) > 1e-3:
+        raise CfbError(f"{log.name}: sampled every {log.nominal_interval:g} s; the benchmark wants rows every 0.01 s.")
+    speed = causal_rotor_speed(log)
+    if speed is None:
+        raise CfbError(f"{log.name}: the benchmark needs rotor speeds of all motors throughout the flight.")
+    missing = np.append(0, np.cumsum(np.abs(np.diff(log.time) - INTERVAL) > INTERVAL / 2))
+    rows = np.arange(0, max(len(log) - STEPS, 0), stride)
+    rows = rows[missing[rows + STEPS] == missing[rows]]
+    return Starts(rows, (log.position, log.velocity, log.quaternion, log.body_rate), speed)
+
+
+def errors(starts: Starts, predicted: tuple[np.ndarray, ...]) -> dict[str, np.ndarray]:
+    """Norms of the errors of a prediction (position, velocity, quaternion, body rate; (W, S, .)), each (W, S)."""
+    true = starts.ahead()
+    norm = [np.linalg.norm(p - t, axis=-1) for p, t in zip(predicted, true, strict=True)]
+    norm[2] = np.radians(geodesic_deg(predicted[2], true[2]))
+    return dict(zip(QUANTITIES, norm, strict=True))
+
+
+def metrics(error: dict[str, np.ndarray]) -> dict[str, float]:
+    """``<quantity>_mean_<unit>@<h>`` and ``<quantity>_sum_<unit>`` of mean errors over all windows."""
+    found = {}
+    for quantity, unit in QUANTITIES.items():
+        mean = error[quantity].mean(axis=0)
+        found |= {f"{quantity}_mean_{unit}@{h}": float(mean[h - 1]) for h in SHOWN}
+        found[f"{quantity}_sum_{unit}"] = float(mean.sum())
+    return found
+
+
+def naive(starts: Starts) -> tuple[np.ndarray, ...]:
+    """Nothing changes."""
+    return tuple(np.repeat(x[starts.row][:, None], STEPS, axis=1) for x in starts.truth)
+
+
+def hold(starts: Starts) -> tuple[np.ndarray, ...]:
+    """Constant velocity and constant body rate."""
+    position, velocity, quaternion, rate = naive(starts)
+    time = (INTERVAL * np.arange(1, STEPS + 1))[:, None]
+    return position + velocity * time, velocity, multiply(quaternion, exponential(rate * time)), rate
+
+
+def predict(model: Quadrotor, log: FlightLog, starts: Starts, observer: Observer | None = None):
+    """A model's prediction: position, velocity, quaternion and body rate, (W, S, 3 or 4).
+
+    A window starts from its row as it is; in the step after row k the rotors turn as row k says. An observer adds the
+    disturbance and the filtered body rate it knows at that row.
+    """
+    position, velocity, quaternion, rate = (x[starts.row] for x in starts.truth)
+    memory = _memory(model, log, starts.row)
+    if observer is not None:
+        # Pose is read without its delay: to allow for it, rows later than a window's start would be needed.
+        known = jax.tree.map(lambda x: x[starts.row], observe(model, log, 0.0, observer))
+        rate, memory = known.body_rate, (*memory, known.memory(rotors=False))
+        model = observed_model(model, observer)
+    model = Quadrotor(model.parameters, model.effects, body=model.body, integrator="rk4", rotor_loads="instant")
+    inputs = starts.rotor_speed[starts.row[:, None] + np.arange(STEPS)]
+    state = State(position, velocity, quaternion, rate, inputs[:, 0], memory)
+    parts = []
+    for first in range(0, len(starts), BLOCK):
+        index = np.minimum(np.arange(first, first + BLOCK), len(starts) - 1)
+        flown = _fly(model, jax.tree.map(lambda x, i=index: x[i], state), inputs[index])
+        parts.append(jax.tree.map(lambda x, n=len(starts) - first: np.asarray(x)[:n], flown))
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+
+def _memory(model: Quadrotor, log: FlightLog, rows: np.ndarray) -> tuple:
+    if not model.effects:
+        return ()
+    _, memory = eqx.filter_jit(remembered)(model, prepare_flight(log, 0.0), jnp.zeros(()))
+    return jax.tree.map(lambda x: np.asarray(x)[rows], memory)
+
+
+@eqx.filter_jit
+def _fly(model: Quadrotor, state: State, inputs):
+    center = Vec.unstack(model.changed_parameters().center_of_gravity)
+    prepared = prepare(model, INTERVAL)
+
+    def one(state, inputs):
+        def step(components, speed):
+            components = dataclasses.replace(components, rotor_speed=speed)
+            components = integrate_measured(prepared, components, speed)
+            at = stack(components, center)
+            return components, (at.position, at.velocity, at.quaternion, at.body_rate)
+
+        return jax.lax.scan(step, unstack(state, center), Vec.unstack(inputs))[1]
+
+    return jax.vmap(one)(state, inputs)
+
+
+def benchmark(
+    logs: Sequence[FlightLog],
+    models: dict[str, tuple[Quadrotor, Observer | None]],
+    stride: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> dict:
+    """Judge ``models`` beside `naive` and `hold` on every flight.
+
+    Returns:
+        ``windows``; `metrics` over all windows of all flights under ``rows`` by name; ``flights`` with both of each.
+
+    Raises:
+        CfbError: a log that is not of the benchmark, or none long enough.
+    """
+    found: dict[str, dict[str, dict[str, np.ndarray]]] = {}
+    for index, log in enumerate(logs):
+        starts = find_starts(log, stride)
+        if len(starts):
+            found[log.name] = {"naive": errors(starts, naive(starts)), "hold": errors(starts, hold(starts))}
+            for name, (model, observer) in models.items():
+                found[log.name][name] = errors(starts, predict(model, log, starts, observer))
+        if progress is not None:
+            progress(index + 1, len(logs))
+    if not found:
+        raise CfbError(f"no flight has {STEPS + 1} rows without a gap; longer flights are needed.")
+
+    def judged(flights) -> dict:
+        rows = {
+            name: metrics({q: np.concatenate([f[name][q] for f in flights]) for q in QUANTITIES}) for name in flights[0]
+        }
+        return {"windows": sum(len(f["naive"]["position"]) for f in flights), "rows": rows}
+
+    return judged(list(found.values())) | {"flights": {name: judged([f]) for name, f in found.items()}}

@@ -1,0 +1,120 @@
+"""What closing the loop comes to: effects confirmed on held-out flights, errors before and after, the corrected model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model.effects import effect_to_mapping
+from cfb_mjx.parameters import ModelFile
+from cfb_mjx.sysid.evaluation import Evaluation, evaluate
+from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
+from cfb_mjx.sysid.tracing.search import Hypothesis
+from cfb_mjx.sysid.tracing.sensors import check_sensors
+from cfb_mjx.sysid.tracing.trace import Found, Trace, trace
+
+DOUBTFUL = 1.0
+"""An effect whose statistic on held-out flights is below this is not reported."""
+
+
+@dataclass
+class Reported:
+    """One effect or sensor fault as reported."""
+
+    name: str
+    p_value: float
+    """On held-out flights; for sensor faults, of the comparison of the sensors."""
+    parameters: dict
+    uncertainty: dict
+    found: Found | None = None
+    verdict: Verdict | None = None
+
+    def to_json(self) -> dict:
+        """The layout of ``report.json``."""
+        more = {} if self.found is None else {"buys": self.found.buys, "confusable_with": self.found.confusable}
+        if self.found is not None:
+            more |= {"p_value_cross_validated": self.found.p_value, "gain_nats": self.found.gain}
+        if self.verdict is not None:
+            more |= {"held_out_gain_nats": self.verdict.gain, "held_out_t": self.verdict.t}
+        return {
+            "name": self.name,
+            "p_value": self.p_value,
+            "parameters": self.parameters,
+            "uncertainty": self.uncertainty,
+        } | more
+
+
+@dataclass
+class Outcome:
+    """Everything a report says."""
+
+    trace: Trace
+    base: ModelFile
+    reported: list[Reported]
+    unconfirmed: list[Reported]
+    """Found on the fit flights, not borne out by the held-out ones."""
+    hypothesis: Hypothesis
+    faults: SensorFaults
+    before: Evaluation
+    after: Evaluation
+
+    def model_file(self, name: str, provenance: dict) -> ModelFile:
+        """The corrected model."""
+        effects = []
+        for item in self.reported:
+            if item.name in self.hypothesis.present and item.name in {type(e).name for e in self.hypothesis.effects}:
+                mapping = effect_to_mapping(self.hypothesis.effect(item.name))
+                effects.append(mapping | {"uncertainty": item.uncertainty, "p_value": item.p_value})
+        named = ", ".join(item.name for item in self.reported) or "nothing"
+        return replace(
+            self.base,
+            name=name,
+            description=f"{self.base.name} with what its flights lacked: {named}",
+            effects=(*self.base.effects, *effects, *self.faults.to_mappings()),
+            provenance=provenance,
+        )
+
+
+def close_loop(
+    fit: list[FlightLog],
+    held_out: list[FlightLog],
+    base: ModelFile,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Outcome:
+    """Trace what a model lacks on some flights, and judge it on others.
+
+    Args:
+        fit: flights to learn from.
+        held_out: flights of the same drone nothing is learned from.
+        base: the declared model.
+        progress: told what happens.
+    """
+    parameters = base.parameters()
+    delays = {log.observation_delay for log in fit} - {None}
+    delay = float(np.median(list(delays))) if delays else float(parameters.observation_delay)
+    found = trace(fit, parameters, delay, progress)
+    progress("judging on held-out flights")
+    nothing = found.search.nothing()
+    before = evaluate(nothing.model(parameters), held_out)
+    # Biases of the held-out sensors come from their own kinematics; no model is fitted.
+    check = check_sensors(held_out, delay)
+    judge = found.search.beside(held_out, replace(check, faults=found.sensors.faults))
+    hypothesis, reported, unconfirmed = found.hypothesis, [], []
+    for item in found.found:
+        verdict = confirm(judge, item.without, found.hypothesis)
+        entry = Reported(item.name, verdict.p_value, item.parameters, item.uncertainty, item, verdict)
+        if verdict.t < DOUBTFUL:
+            unconfirmed.append(entry)
+            hypothesis = hypothesis.without(item.name)
+        else:
+            reported.append(entry)
+    for fault in found.sensors.findings:
+        field = {"sensor_velocity_scale": "scale", "sensor_delay": "delay"}.get(fault.name, "lag")
+        reported.insert(0, Reported(fault.name, fault.p_value, {field: fault.value}, {field: fault.std}))
+    faults = replace(found.sensors.faults, motor_shift=hypothesis.shift)
+    after = evaluate(hypothesis.model(parameters), held_out, faults=faults)
+    return Outcome(found, base, reported, unconfirmed, hypothesis, faults, before, after)
