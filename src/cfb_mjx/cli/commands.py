@@ -240,6 +240,31 @@ def excite(
     )
 
 
+def close_loop(
+    output: Output,
+    fit: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG...")] = (),
+    held_out: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG...")] = (),
+    model: Model = "cfb-guards",
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+) -> None:
+    """Find which physical effect a model lacks, add it, and report the error before and after on other flights.
+
+    The sensors are compared with each other first; then effects of the catalogue are proposed, fitted together, and
+    accepted only if they improve data they were not fitted on beyond chance. Writes report.html, report.json,
+    residual.rrd and model.yaml. An interrupted run goes on where it was when started again.
+
+    Args:
+        output: folder to write to.
+        fit: flights to learn from, of one drone, with different manoeuvres.
+        held_out: other flights of it, to be judged on; nothing is fitted to them.
+        model: preset or model YAML the flights are compared with.
+        set: parameters to change, for instance mass=0.045.
+    """
+    from cfb_mjx.cli.closing import run_close_loop
+
+    run_close_loop(list(fit), list(held_out), output, model, list(set))
+
+
 def bench(
     drones: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N...")] = (1, 64, 1024, 8192, 65536),
     json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
@@ -290,6 +315,7 @@ COMMANDS = {
     "fit": fit,
     "fit-rotors": fit_rotors,
     "excite": excite,
+    "close-loop": close_loop,
     "bench": bench,
     "demo": demo,
     "version": version,

@@ -39,10 +39,14 @@ def run_evaluate(
     described = changed_model(model, changes)
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid import evaluate
+    from cfb_mjx.sysid.sensor_faults import SensorFaults
     from cfb_mjx.sysid.observer import Observer
 
     settings = Observer() if observer else None
-    evaluation = evaluate(Quadrotor.from_file(described), logs, progress=Progress("evaluating"), observer=settings)
+    faults = SensorFaults.from_mappings(described.effects)
+    evaluation = evaluate(
+        Quadrotor.from_file(described), logs, progress=Progress("evaluating"), observer=settings, faults=faults
+    )
     alignment = {log.name: _alignment(log) for log in logs}
     result = evaluation.to_json()
     result |= {"model": described.name, "changes": changes, "alignment": alignment, "environment": environment()}

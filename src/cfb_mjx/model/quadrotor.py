@@ -63,7 +63,9 @@ class Quadrotor(eqx.Module):
         """
         where = str(model) if not isinstance(model, ModelFile) else model.name
         model = model if isinstance(model, ModelFile) else load_model_file(model)
-        effects = tuple(effect_from_mapping(item, where) for item in model.effects)
+        # What a model file says of the sensors does not change how the drone flies.
+        physical = (item for item in model.effects if not str(item.get("name")).startswith("sensor_"))
+        effects = tuple(effect_from_mapping(item, where) for item in physical)
         return cls(parameters=model.parameters(), effects=effects, **choices)
 
     def changed_parameters(self) -> Parameters:

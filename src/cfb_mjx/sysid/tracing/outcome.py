@@ -1,4 +1,4 @@
-"""What closing the loop comes to: effects confirmed on held-out flights, errors before and after, the corrected model."""
+"""What closing the loop comes to: effects confirmed on other flights, errors before and after, the new model."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import effect_to_mapping
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
-from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.sensor_faults import UNITS, SensorFaults
+from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
 from cfb_mjx.sysid.tracing.search import Hypothesis
 from cfb_mjx.sysid.tracing.sensors import check_sensors
@@ -62,6 +64,32 @@ class Outcome:
     before: Evaluation
     after: Evaluation
 
+    def to_json(self) -> dict:
+        """The part of ``report.json`` that comes from the flights (DESIGN 6)."""
+        held_out = {
+            "before": self.before.metrics("commands_in"),
+            "after": self.after.metrics("commands_in"),
+            "hold": self.before.metrics("hold"),
+            "before_rotor_speed_in": self.before.metrics("rotor_speed_in"),
+            "after_rotor_speed_in": self.after.metrics("rotor_speed_in"),
+            "intervals": {"before": self.before.intervals("commands_in"), "after": self.after.intervals("commands_in")},
+            "logs": {
+                old.log.name: {"before": old_error, "after": new_error}
+                for old, old_error, new_error in zip(
+                    self.before.logs, _per_log(self.before), _per_log(self.after), strict=True
+                )
+            },
+        }
+        return {
+            "effects": [item.to_json() for item in self.reported],
+            "unexplained": False,
+            "unexplained_because": None,
+            "held_out": held_out,
+            "unconfirmed": [item.to_json() for item in self.unconfirmed],
+            "sensors": {name: {"value": v, "std": s} for name, (v, s) in self.trace.sensors.measured.items()},
+            "search": self.trace.tried,
+        }
+
     def model_file(self, name: str, provenance: dict) -> ModelFile:
         """The corrected model."""
         effects = []
@@ -69,12 +97,14 @@ class Outcome:
             if item.name in self.hypothesis.present and item.name in {type(e).name for e in self.hypothesis.effects}:
                 mapping = effect_to_mapping(self.hypothesis.effect(item.name))
                 effects.append(mapping | {"uncertainty": item.uncertainty, "p_value": item.p_value})
+        replaced = {item["name"] for item in effects} | set(UNITS)
+        kept = [item for item in self.base.effects if item["name"] not in replaced]
         named = ", ".join(item.name for item in self.reported) or "nothing"
         return replace(
             self.base,
             name=name,
             description=f"{self.base.name} with what its flights lacked: {named}",
-            effects=(*self.base.effects, *effects, *self.faults.to_mappings()),
+            effects=(*kept, *effects, *self.faults.to_mappings()),
             provenance=provenance,
         )
 
@@ -84,6 +114,7 @@ def close_loop(
     held_out: list[FlightLog],
     base: ModelFile,
     progress: Callable[[str], None] = lambda _: None,
+    checkpoint: Checkpoint | None = None,
 ) -> Outcome:
     """Trace what a model lacks on some flights, and judge it on others.
 
@@ -92,11 +123,13 @@ def close_loop(
         held_out: flights of the same drone nothing is learned from.
         base: the declared model.
         progress: told what happens.
+        checkpoint: where the search is kept while it runs.
     """
+    declared = Quadrotor.from_file(base).effects
     parameters = base.parameters()
     delays = {log.observation_delay for log in fit} - {None}
     delay = float(np.median(list(delays))) if delays else float(parameters.observation_delay)
-    found = trace(fit, parameters, delay, progress)
+    found = trace(fit, parameters, delay, progress, declared, checkpoint)
     progress("judging on held-out flights")
     nothing = found.search.nothing()
     before = evaluate(nothing.model(parameters), held_out)
@@ -118,3 +151,7 @@ def close_loop(
     faults = replace(found.sensors.faults, motor_shift=hypothesis.shift)
     after = evaluate(hypothesis.model(parameters), held_out, faults=faults)
     return Outcome(found, base, reported, unconfirmed, hypothesis, faults, before, after)
+
+
+def _per_log(evaluation: Evaluation) -> list[dict[str, float] | None]:
+    return [Evaluation((log,), evaluation.horizons).metrics("commands_in") for log in evaluation.logs]

@@ -40,6 +40,8 @@ class Hypothesis:
     lead: float = LEAD_USUAL
     shift: float = 0.0
     """How late the motor columns are, s."""
+    origin: tuple[Effect, ...] = ()
+    """The effects of the declared model: what an absent effect goes back to."""
 
     def effect(self, name: str) -> Effect:
         """The effect of that name."""
@@ -56,9 +58,10 @@ class Hypothesis:
 
     def without(self, name: str) -> Hypothesis:
         """The same with one effect back at neutral."""
-        effects = tuple(CATALOGUE[name].neutral() if type(e).name == name else e for e in self.effects)
+        pairs = zip(self.effects, self.origin, strict=True)
+        effects = tuple(declared if type(e).name == name else e for e, declared in pairs)
         shift = 0.0 if name == cols.SHIFT else self.shift
-        return Hypothesis(effects, tuple(p for p in self.present if p != name), self.lead, shift)
+        return replace(self, effects=effects, present=tuple(p for p in self.present if p != name), shift=shift)
 
 
 @dataclass
@@ -92,15 +95,24 @@ class Search:
     delay: float
     noise: dict[str, np.ndarray]
     names: tuple[str, ...]
+    declared: tuple[Effect, ...] = ()
+    """Effects the declared model has already."""
     levels: np.ndarray = field(default_factory=lambda: FIRST.copy())
     _flights: dict[float, list[Flight]] = field(default_factory=dict)
 
     @classmethod
-    def start(cls, logs: list[FlightLog], parameters: Parameters, delay: float, sensors: SensorCheck) -> Search:
+    def start(
+        cls,
+        logs: list[FlightLog],
+        parameters: Parameters,
+        delay: float,
+        sensors: SensorCheck,
+        declared: tuple[Effect, ...] = (),
+    ) -> Search:
         """Prepare flights, with what is known of their sensors taken out, for a search over the whole catalogue."""
         logs = [sensors.corrected(log) for log in logs]
         noise = sensor_noise(logs, FILTERED_GYRO if sensors.faults.gyro_lag else 1e-3)
-        return cls(parameters, logs, delay, noise, tuple(CATALOGUE))
+        return cls(parameters, logs, delay, noise, tuple(CATALOGUE), declared)
 
     def flights(self, hypothesis: Hypothesis) -> list[Flight]:
         """The flights as a hypothesis reads them."""
@@ -117,7 +129,9 @@ class Search:
 
     def nothing(self) -> Hypothesis:
         """The declared model."""
-        return Hypothesis(cols.neutral_effects(self.names))
+        given = {type(e).name: e for e in self.declared}
+        effects = tuple(given.get(type(e).name, e) for e in cols.neutral_effects(self.names))
+        return Hypothesis(effects, origin=effects)
 
     def learn_levels(self, hypothesis: Hypothesis) -> None:
         """Noise levels that fit what this hypothesis leaves."""
@@ -205,7 +219,7 @@ class Search:
             effects[column.effect] = eqx.tree_at(lambda e, f=column.field: getattr(e, f), effect, jnp.asarray(value))
         lead = float(np.clip(hypothesis.lead + by[0], *LEAD_RANGE))
         found = tuple(effects[type(e).name] for e in hypothesis.effects)
-        return Hypothesis(found, hypothesis.present, lead, shift)
+        return replace(hypothesis, effects=found, lead=lead, shift=shift)
 
     def adding(self, hypothesis: Hypothesis, linear: Linear, variant: list[Column]) -> Evidence | None:
         """Evidence for a candidate beside what is there; None where its sign makes no sense."""
@@ -222,12 +236,12 @@ class Search:
         name = variant[0].effect
         if name == cols.SHIFT:
             shift = hypothesis.shift + float(found.values[0]) * variant[0].scale
-            return Hypothesis(hypothesis.effects, (*hypothesis.present, name), hypothesis.lead, shift)
-        effect = CATALOGUE[name].neutral()
+            return replace(hypothesis, present=(*hypothesis.present, name), shift=shift)
+        effect = hypothesis.effect(name)
         for column, value in zip(variant, found.values, strict=True):
             effect = cols.moved(effect, column, float(value) * column.scale, False)
         effects = tuple(effect if type(e).name == name else e for e in hypothesis.effects)
-        return Hypothesis(effects, (*hypothesis.present, name), hypothesis.lead, hypothesis.shift)
+        return replace(hypothesis, effects=effects, present=(*hypothesis.present, name))
 
 
 def _joined(parts):

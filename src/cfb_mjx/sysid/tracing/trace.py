@@ -8,9 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.model.effects import Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.evaluation import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import SHIFT, Column
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
 from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Linear, Search
@@ -82,6 +84,8 @@ def trace(
     parameters: Parameters,
     delay: float = 0.008,
     progress: Callable[[str], None] = lambda _: None,
+    declared: tuple[Effect, ...] = (),
+    checkpoint: Checkpoint | None = None,
 ) -> Trace:
     """Search the catalogue for what a model lacks.
 
@@ -90,16 +94,23 @@ def trace(
         parameters: the declared drone.
         delay: declared age of pose and velocity in a row, s.
         progress: told what happens.
+        declared: effects the declared model has already.
+        checkpoint: where the search is kept while it runs, and taken up from.
     """
+    checkpoint = checkpoint or Checkpoint()
     progress("comparing the sensors with each other")
     sensors = check_sensors(logs, delay)
-    search = Search.start(logs, parameters, delay, sensors)
-    hypothesis = search.nothing()
-    progress("replaying the declared model")
-    search.learn_levels(hypothesis)
+    search = Search.start(logs, parameters, delay, sensors, declared)
+    hypothesis, tried, refused = search.nothing(), [], set()
+    saved = checkpoint.restore(hypothesis)
+    if saved is None:
+        progress("replaying the declared model")
+        search.learn_levels(hypothesis)
+    else:
+        hypothesis, search.levels, refused, tried = saved
+        progress(f"going on with {', '.join(hypothesis.present) or 'no effect'} found before the interruption")
     hypothesis, linear = search.refine(hypothesis)
     errors = prediction_errors(search, hypothesis)
-    tried, refused = [], set()
     while len(hypothesis.present) < LARGEST:
         ranking = rank(search, hypothesis, linear, refused)
         tried.append({"present": list(hypothesis.present), "ranking": [_line(v, e) for e, v in ranking[:8]]})
@@ -116,9 +127,11 @@ def trace(
         slight = name == SHIFT and abs(richer.shift) < SMALLEST_SHIFT
         if slight or drop.max() < MATERIAL or np.log(new / errors).sum() > 0:
             refused.add(name)
+            checkpoint.save(hypothesis, search.levels, refused, tried)
             continue
         hypothesis, linear, errors = richer, refined, new
         hypothesis, linear, errors = re_examined(search, hypothesis, linear, errors, progress)
+        checkpoint.save(hypothesis, search.levels, refused, tried)
     found = [_summary(search, hypothesis, linear, errors, name) for name in hypothesis.present]
     found.sort(key=lambda f: -f.buys)
     return Trace(hypothesis, sensors, found, tried, search)

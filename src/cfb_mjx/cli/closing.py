@@ -1,0 +1,94 @@
+"""``cfb close-loop``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from cfb_mjx.cli.fitted_model import provenance
+from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import write_json
+from cfb_mjx.logs import FlightLog, read_log
+
+LEAST_SECONDS = 10.0
+"""Of flight to fit: below this nothing could be told from chance."""
+
+
+def run_close_loop(fit: list[Path], held_out: list[Path], output: Path, model: str, changes: list[str]) -> None:
+    """Trace, judge, write the report and the corrected model.
+
+    Raises:
+        CfbError: bad logs, a log on both sides, a bad model, or a folder that cannot be written.
+    """
+    logs, judged = _read(fit, held_out)
+    if output.exists() and not output.is_dir():
+        raise CfbError(f"{output}: this is a file; give the name of a folder for the report.")
+    if not output.absolute().parent.is_dir():
+        raise CfbError(f"{output}: the folder {output.absolute().parent} does not exist; create it first.")
+    configure_jax(x64=True)
+    from cfb_mjx.cli.evaluating import changed_model
+    from cfb_mjx.parameters import save_model_file
+    from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
+    from cfb_mjx.sysid.tracing.outcome import close_loop
+    from cfb_mjx.view.closing import write_report
+
+    base = changed_model(model, changes)
+    output.mkdir(exist_ok=True)
+    checkpoint = Checkpoint.open(output / "search.json", fit, base)
+    outcome = close_loop(logs, judged, base, _say, checkpoint)
+    story = provenance("close-loop", base.name, "fit_logs_sha256", fit, held_out=[path.name for path in held_out])
+    corrected = outcome.model_file(f"{base.name}-closed", story)
+    facts = environment()
+    report = {"case": output.resolve().name} | outcome.to_json() | {"model": base.name, "environment": facts}
+    _say("writing the report")
+    save_model_file(corrected, output / "model.yaml")
+    write_report(outcome, output, facts, logs, judged)
+    # Last, so that a report.json is always one of a whole report.
+    write_json(output / "report.json", report)
+    checkpoint.discard()
+    _print(report, output)
+
+
+def _read(fit: list[Path], held_out: list[Path]) -> tuple[list[FlightLog], list[FlightLog]]:
+    if not fit or not held_out:
+        raise CfbError("close-loop needs --fit LOG... to learn from and --held-out LOG... to be judged on.")
+    both = {path.resolve() for path in fit} & {path.resolve() for path in held_out}
+    if both:
+        names = ", ".join(sorted(path.name for path in both))
+        raise CfbError(f"{names}: given to --fit and to --held-out; nothing may be judged on what it was fitted to.")
+    logs, judged = [read_log(path) for path in fit], [read_log(path) for path in held_out]
+    for group in (logs, judged):
+        names = [log.name for log in group]
+        for name in names:
+            if names.count(name) > 1:
+                raise CfbError(f"{name}: two logs have this name; rename one file, results are listed by name.")
+    if sum(log.duration for log in logs) < LEAST_SECONDS:
+        raise CfbError(f"--fit: less than {LEAST_SECONDS:g} s of flight; give longer or more logs.")
+    return logs, judged
+
+
+def _say(text: str) -> None:
+    print(f"... {text}", file=sys.stderr, flush=True)
+
+
+def _print(report: dict, output: Path) -> None:
+    if not report["effects"]:
+        print("nothing is missing beyond chance")
+    for effect in report["effects"]:
+        values = []
+        for key, value in effect["parameters"].items():
+            std = effect["uncertainty"].get(key)
+            pairs = zip(value, std, strict=True) if isinstance(value, list) else [(value, std)]
+            values.append(f"{key} " + ", ".join(f"{v:.4g} +- {s:.2g}" for v, s in pairs))
+        print(f"{effect['name']}: {'; '.join(values)} (p = {effect['p_value']:.1g})")
+        if effect.get("confusable_with"):
+            print(f"  these flights hardly tell it from {', '.join(effect['confusable_with'])}")
+    if report["unexplained"]:
+        print(f"unexplained: {report['unexplained_because']}")
+    print(f"\n{'held-out RMS error':<28}{'before':>10}{'after':>10}{'hold':>10}")
+    held = report["held_out"]
+    for key, before in held["before"].items():
+        if "_rmse_" in key and key.endswith(("@0.2s", "@0.5s")):
+            print(f"{key:<28}{before:>10.4g}{held['after'][key]:>10.4g}{held['hold'][key]:>10.4g}")
+    print(f"report: {output / 'report.html'}\nmodel: {output / 'model.yaml'}")
