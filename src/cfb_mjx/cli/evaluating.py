@@ -39,8 +39,8 @@ def run_evaluate(
     described = changed_model(model, changes)
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid import evaluate
-    from cfb_mjx.sysid.sensor_faults import SensorFaults
     from cfb_mjx.sysid.observer import Observer
+    from cfb_mjx.sysid.sensor_faults import SensorFaults
 
     settings = Observer() if observer else None
     faults = SensorFaults.from_mappings(described.effects)

@@ -3,10 +3,11 @@
 from cfb_mjx.model.effects.base import Condition, Effect, Memory, Motors, Reading, Wrench, overrides
 from cfb_mjx.model.effects.battery_sag import BatterySag
 from cfb_mjx.model.effects.blade_flapping import BladeFlapping
-from cfb_mjx.model.effects.catalogue import CATALOGUE, effect_from_mapping, effect_to_mapping
+from cfb_mjx.model.effects.catalogue import CATALOGUE, KNOWN, effect_from_mapping, effect_to_mapping
 from cfb_mjx.model.effects.cog_offset import CogOffset
 from cfb_mjx.model.effects.command_delay import CommandDelay
 from cfb_mjx.model.effects.esc_rate_limit import EscRateLimit
+from cfb_mjx.model.effects.formula import ResidualFormula
 from cfb_mjx.model.effects.ground_effect import GroundEffect
 from cfb_mjx.model.effects.gyroscopic import Gyroscopic
 from cfb_mjx.model.effects.inertia import Inertia
@@ -27,6 +28,7 @@ from cfb_mjx.model.effects.wind import Wind
 
 __all__ = [
     "CATALOGUE",
+    "KNOWN",
     "BatterySag",
     "BladeFlapping",
     "CogOffset",
@@ -49,6 +51,7 @@ __all__ = [
     "Payload",
     "PayloadSwing",
     "Reading",
+    "ResidualFormula",
     "RotorDrag",
     "ThrustScale",
     "ThrustTilt",

@@ -15,6 +15,7 @@ from cfb_mjx.model.effects.blade_flapping import BladeFlapping
 from cfb_mjx.model.effects.cog_offset import CogOffset
 from cfb_mjx.model.effects.command_delay import CommandDelay
 from cfb_mjx.model.effects.esc_rate_limit import EscRateLimit
+from cfb_mjx.model.effects.formula import ResidualFormula
 from cfb_mjx.model.effects.ground_effect import GroundEffect
 from cfb_mjx.model.effects.gyroscopic import Gyroscopic
 from cfb_mjx.model.effects.inertia import Inertia
@@ -62,6 +63,10 @@ CATALOGUE: dict[str, type[Effect]] = {
 }
 
 
+KNOWN: dict[str, type[Effect]] = CATALOGUE | {ResidualFormula.name: ResidualFormula}
+"""What a model file may name: the catalogue, and formulas, which a search turns to only when the catalogue fails."""
+
+
 def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
     """Build an effect from ``{name, parameters}`` as written in a model YAML; what is left out is neutral.
 
@@ -69,9 +74,9 @@ def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
         CfbError: unknown effect, unknown parameter or a value that is not a number, named; ``where`` is the file.
     """
     name = item.get("name")
-    if not isinstance(name, str) or name not in CATALOGUE:
-        raise CfbError(f"{where}: unknown effect {name!r}; known are {', '.join(sorted(CATALOGUE))}.")
-    kind = CATALOGUE[name]
+    if not isinstance(name, str) or name not in KNOWN:
+        raise CfbError(f"{where}: unknown effect {name!r}; known are {', '.join(sorted(KNOWN))}.")
+    kind = KNOWN[name]
     fields = {field.name for field in dataclasses.fields(kind)}
     values = item.get("parameters") or {}
     if not isinstance(values, Mapping):
@@ -92,7 +97,7 @@ def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
             value = np.asarray(np.nan)
         shape = np.shape(arguments[key])
         if not np.all(np.isfinite(value)) or value.shape not in ((), shape):
-            count = shape[0] if shape else 1
+            count = int(np.prod(shape))
             raise CfbError(f"{where}: effects.{name}.parameters.{key} = {raw!r} must be {count} finite number(s).")
         arguments[key] = value
     return kind(**arguments)

@@ -9,12 +9,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.model.effects import CATALOGUE, Effect
+from cfb_mjx.model.effects import KNOWN, Effect
+from cfb_mjx.model.effects.formula import PLACES, TERMS
 
 LEAD = "command_lead"
 """Nuisance: commands sent between two rows are not in the log. Always free, never reported as an effect."""
 SHIFT = "sensor_time_shift"
 """Not an effect of the catalogue but a fault of the recording: command and rotor-speed columns late or early."""
+TORQUE_UNIT, FORCE_UNIT = 3e-5, 4e-3
+"""Coefficients of a formula are counted in these: about 1 rad/s^2 and 0.1 m/s^2 on this drone."""
 _COARSE = {"esc_rate_limit": 0.5, "command_delay": 0.2, "motor_second_order": 0.3}
 """Effects whose slope at zero says little are looked for at this share of their prior range."""
 
@@ -25,7 +28,7 @@ class Column:
 
     effect: str
     field: str
-    index: int | None
+    index: int | tuple[int, int] | None
     probe: tuple[tuple[str, float], ...] = ()
     scale: float = field(default=1.0, compare=False)
     """Half the prior range: the unit in which the search counts."""
@@ -38,12 +41,12 @@ class Column:
 
 def neutral_effects(names: tuple[str, ...]) -> tuple[Effect, ...]:
     """The named effects of the catalogue where they vanish."""
-    return tuple(CATALOGUE[name].neutral() for name in names)
+    return tuple(KNOWN[name].neutral() for name in names)
 
 
 def columns_of(name: str, fields: tuple[str, ...], probe: dict[str, float]) -> list[Column]:
     """Columns of some fields of an effect."""
-    kind = CATALOGUE[name]
+    kind = KNOWN[name]
     neutral = kind.neutral()
     found = []
     for item in fields:
@@ -56,7 +59,7 @@ def columns_of(name: str, fields: tuple[str, ...], probe: dict[str, float]) -> l
 
 def strengths(name: str) -> list[list[Column]]:
     """Columns of an effect's strengths, one list for each probe of its shape."""
-    kind = CATALOGUE[name]
+    kind = KNOWN[name]
     return [columns_of(name, kind.strengths, probe) for probe in kind.probes]
 
 
@@ -82,6 +85,18 @@ def moved(effect: Effect, column: Column, by: float, present: bool) -> Effect:
     old = getattr(effect, column.field)
     new = old + by if column.index is None else old.at[column.index].add(by)
     return eqx.tree_at(lambda e: getattr(e, column.field), effect, new)
+
+
+FORMULA = "residual_formula"
+
+
+def term_columns(axis: int) -> list[Column]:
+    """Every term of the library along one of the axes torque x, y, z, force x, y, z (0..5)."""
+    scale = TORQUE_UNIT if axis < 3 else FORCE_UNIT
+    found = [Column(FORMULA, "body_terms", (axis, j), (), scale) for j in range(len(TERMS))]
+    if axis >= 3:
+        found += [Column(FORMULA, "place", (axis - 3, j), (), FORCE_UNIT) for j in range(len(PLACES))]
+    return found
 
 
 def shift_column() -> Column:

@@ -40,6 +40,8 @@ class Hypothesis:
     lead: float = LEAD_USUAL
     shift: float = 0.0
     """How late the motor columns are, s."""
+    terms: tuple[Column, ...] = ()
+    """Of a formula, where the catalogue has failed."""
     origin: tuple[Effect, ...] = ()
     """The effects of the declared model: what an absent effect goes back to."""
 
@@ -143,11 +145,11 @@ class Search:
         blocks = Blocks(*(_joined([getattr(p, k) for p in pieces]) for k in ("signals", "interval", "valid")))
         self.levels = fit_levels(_padded(blocks), self.noise, self.levels)
 
-    def linearise(self, hypothesis: Hypothesis, wanted: list[Column]) -> Linear:
-        """Residual and derivatives by ``wanted`` at a hypothesis."""
+    def linearise(self, hypothesis: Hypothesis, wanted: list[Column], width: int = 0) -> Linear:
+        """Residual and derivatives by ``wanted`` at a hypothesis, padded to ``width`` columns at least."""
         lead = Column(LEAD, LEAD, None, (), 0.25)
         columns = [lead, *wanted]
-        padded = columns + [lead] * (-(len(columns) + 1) % PAD)
+        padded = columns + [lead] * max(-(len(columns) + 1) % PAD, width - 1 - len(columns))
         moves = cols.moves(hypothesis.effects, hypothesis.lead, padded, set(hypothesis.present))
         model = hypothesis.model(self.parameters)
         models = eqx.tree_at(lambda m: m.effects, model, moves.effects)
@@ -175,7 +177,7 @@ class Search:
                 found.append(cols.shift_column())
                 continue
             found += cols.strengths(name)[0] + cols.shapes(hypothesis.effect(name))
-        return [replace(c, probe=()) for c in found]
+        return [replace(c, probe=()) for c in found] + list(hypothesis.terms)
 
     def refine(self, hypothesis: Hypothesis, rounds: int = 5) -> tuple[Hypothesis, Linear]:
         """Fit everything that is there together; derivatives by the whole catalogue come with the result."""
@@ -197,17 +199,21 @@ class Search:
             deviation = np.sqrt(np.diag(covariance(linear.pooled, index, linear.scale, values, pull[2])))
             if np.max(np.abs(values) / deviation) < 0.3:
                 break
-            hypothesis = self._moved(hypothesis, own, values * linear.scale[index])
+            hypothesis = self.moved(hypothesis, own, values * linear.scale[index])
             if attempt == 0:
                 self.learn_levels(hypothesis)
         return hypothesis, linear
 
-    def _moved(self, hypothesis: Hypothesis, own: list[Column], by: np.ndarray) -> Hypothesis:
+    def moved(self, hypothesis: Hypothesis, own: list[Column], by: np.ndarray) -> Hypothesis:
+        """The hypothesis after a step: the lead's first, then one for each of its columns."""
         effects = {type(e).name: e for e in hypothesis.effects}
         shift = hypothesis.shift
         for column, change in zip(own, by[1:], strict=True):
             if column.effect == cols.SHIFT:
                 shift = float(np.clip(shift + change, -0.05, 0.05))
+                continue
+            if column.effect == cols.FORMULA:
+                effects[column.effect] = cols.moved(effects[column.effect], column, float(change), True)
                 continue
             low, high = CATALOGUE[column.effect].prior[column.field]
             effect = cols.moved(effects[column.effect], column, float(change), True)

@@ -1,0 +1,106 @@
+"""When the catalogue fails: a sparse formula for what is left, which must pass the same tests as any effect."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS, ResidualFormula
+from cfb_mjx.sysid.tracing.columns import FORMULA, Column, term_columns
+from cfb_mjx.sysid.tracing.evidence import covariance, evidence, solve
+from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Search
+
+PER_AXIS = 3
+"""Terms along one axis at most."""
+ALPHA, LEAST_GAIN = 1e-3, 8.0
+_WIDTH = 64
+
+
+@dataclass(frozen=True)
+class Term:
+    """One term of a formula."""
+
+    axis: str
+    signal: str
+    unit: str
+    value: float
+    std: float
+    gain: float
+    """Nats on blocks left out, when it was added."""
+
+    def __str__(self) -> str:
+        return f"{self.axis} = ({self.value:.3g} +- {self.std:.1g} {self.unit}) {self.signal}"
+
+
+def describe(column: Column) -> tuple[str, str, str]:
+    """Axis, signal and unit of the coefficient of a term."""
+    i, j = column.index
+    if column.field == "place":
+        signal, unit = list(PLACES.items())[j]
+        return f"world force_{'xyz'[i]}", signal, _per("N", unit)
+    signal, unit = list(TERMS.items())[j]
+    return AXES[i], signal, _per("N m" if i < 3 else "N", unit)
+
+
+def _per(unit: str, signal: str) -> str:
+    return unit if signal == "1" else f"{unit} / ({signal})"
+
+
+def with_library(search: Search, hypothesis: Hypothesis) -> tuple[Search, Hypothesis]:
+    """The same search and hypothesis with the (empty) formula among the effects."""
+    empty = ResidualFormula.neutral()
+    widened = replace(search, names=(*search.names, FORMULA), _flights=search._flights)
+    return widened, replace(hypothesis, effects=(*hypothesis.effects, empty), origin=(*hypothesis.origin, empty))
+
+
+def propose(
+    search: Search, hypothesis: Hypothesis, progress: Callable[[str], None] = lambda _: None
+) -> tuple[list[Column], dict[Column, float]]:
+    """Terms that improve blocks left out beyond chance beside everything found, by forward selection per axis."""
+    own = search.own_columns(hypothesis)
+    tried = sum(len(term_columns(axis)) for axis in range(6))
+    chosen, gains = [], {}
+    for axis in range(6):
+        progress(f"looking for structure in what is left: {AXES[axis]}")
+        library = term_columns(axis)
+        linear = search.linearise(hypothesis, own + library, _WIDTH)
+        base, picked = linear.index(own), []
+        for _ in range(PER_AXIS):
+            rest = [c for c in library if c not in picked]
+            found = [
+                (evidence(linear.pooled, base + linear.index(picked), linear.index([c]), linear.scale), c) for c in rest
+            ]
+            best, column = max(found, key=lambda pair: pair[0].gain)
+            if best.p_value * tried > ALPHA or best.gain < LEAST_GAIN:
+                break
+            picked.append(column)
+            gains[column] = best.gain
+        chosen += picked
+    return chosen, gains
+
+
+def fit_formula(search: Search, hypothesis: Hypothesis, terms: list[Column]) -> tuple[Hypothesis, np.ndarray]:
+    """Fit the terms together with everything found; the hypothesis and the terms' standard deviations."""
+    richer = replace(hypothesis, terms=tuple(terms))
+    for _ in range(2):
+        own = search.own_columns(richer)
+        linear = search.linearise(richer, own, _WIDTH)
+        index = linear.index(own)
+        values = solve(linear.pooled.sum(0), index, linear.scale)
+        richer = search.moved(richer, own, np.concatenate([[0.0], values * linear.scale[index]]))
+    spread = covariance(linear.pooled, [1, *index], linear.scale, np.concatenate([[0.0], values]), 1 / LEAD_SPREAD**2)
+    deviation = np.sqrt(np.diag(spread))[1:] * linear.scale[index]
+    return richer, deviation[len(own) - len(terms) :]
+
+
+def terms_of(hypothesis: Hypothesis, deviation: np.ndarray, gains: dict[Column, float]) -> list[Term]:
+    """The formula in words."""
+    effect = hypothesis.effect(FORMULA)
+    found = []
+    for column, std in zip(hypothesis.terms, deviation, strict=True):
+        axis, signal, unit = describe(column)
+        value = float(np.asarray(getattr(effect, column.field))[column.index])
+        found.append(Term(axis, signal, unit, value, float(std), gains[column]))
+    return sorted(found, key=lambda term: -term.gain)

@@ -1,0 +1,158 @@
+"""What a model misses along flights, in physical units and beside the signals that could drive it.
+
+Made to be looked at: the search itself works with whitened residuals (`whitening`). Measurement and model pass through
+the same zero-phase Gaussian, so neither lags the other, and the driving signals pass through it too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax.numpy as jnp
+import numpy as np
+
+from cfb_mjx.logs.rotation import to_body
+from cfb_mjx.sysid.flight import Flight
+from cfb_mjx.sysid.tracing.gram import driven_by, residual_blocks
+from cfb_mjx.sysid.tracing.search import Hypothesis, Search
+
+WIDTH = 0.02
+"""Standard deviation of the Gaussian, s: half of what moves at 6 Hz passes."""
+PATTERNS = {"mean": (1, 1, 1, 1), "roll": (-1, -1, 1, 1), "pitch": (-1, 1, 1, -1), "yaw": (-1, 1, -1, 1)}
+"""Combinations of the four rotors (M1 to M4), each divided by four: what lifts, rolls, pitches and yaws."""
+UNITS = {
+    **{f"velocity {axis}": "m/s" for axis in "xyz"},
+    **{f"rate {axis}": "rad/s" for axis in "xyz"},
+    **{f"rotor {name}": "rad/s" for name in PATTERNS},
+    **{f"rotor {name} slope": "rad/s^2" for name in PATTERNS},
+    "command slope": "1/s",
+    "height": "m",
+    "voltage": "V",
+    "time": "s",
+}
+"""The driving signals and their units: body axes; rotor speeds as they drive the model; slopes are time derivatives."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Of one flight of n rows: measured minus modelled.
+
+    Attributes:
+        name: of the log.
+        time: (n,) s.
+        angular_acceleration: (n, 3) body axes, rad/s^2: times the inertia, the torque the model misses.
+        specific_force: (n, 3) body axes, m/s^2: times the mass, the force it misses.
+        rotor_speed: (n, 4) measured minus modelled from commands alone, rad/s; None where not measured.
+        valid: (n,) rows where a residual means something.
+        drivers: signals (n,) that could drive it, named and in the units of `UNITS`; NaN where not measured.
+    """
+
+    name: str
+    time: np.ndarray
+    angular_acceleration: np.ndarray
+    specific_force: np.ndarray
+    rotor_speed: np.ndarray | None
+    valid: np.ndarray
+    drivers: dict[str, np.ndarray]
+
+    def axes(self) -> dict[str, tuple[np.ndarray, str]]:
+        """Every residual axis (n,) by name, with its unit."""
+        found = {f"torque {a}": (self.angular_acceleration[:, i], "rad/s^2") for i, a in enumerate("xyz")}
+        found |= {f"force {a}": (self.specific_force[:, i], "m/s^2") for i, a in enumerate("xyz")}
+        speed = np.full((len(self.time), 4), np.nan) if self.rotor_speed is None else self.rotor_speed
+        return found | {f"rotor M{i + 1}": (speed[:, i], "rad/s") for i in range(4)}
+
+    def rows(self, index: np.ndarray, valid: np.ndarray) -> Residuals:
+        """The rows ``index`` selects, of which ``valid`` count."""
+        fields = ("time", "angular_acceleration", "specific_force")
+        return replace(
+            self,
+            **{field: getattr(self, field)[index] for field in fields},
+            rotor_speed=None if self.rotor_speed is None else self.rotor_speed[index],
+            valid=valid,
+            drivers={key: values[index] for key, values in self.drivers.items()},
+        )
+
+
+def residual_rows(search: Search, hypothesis: Hypothesis) -> list[Residuals]:
+    """What a hypothesis misses along every flight of a search."""
+    return [
+        _one(search, hypothesis, flight, log.name)
+        for log, flight in zip(search.logs, search.flights(hypothesis), strict=True)
+    ]
+
+
+def _one(search: Search, hypothesis: Hypothesis, flight: Flight, name: str) -> Residuals:
+    model = hypothesis.model(search.parameters)
+    driven = driven_by(model, flight, hypothesis.lead)
+    blocks = residual_blocks(model, flight, driven, jnp.asarray(hypothesis.lead))
+    # Blocks and padding only serve the compiler: the flight again, in one piece.
+    n = int(np.sum(np.asarray(flight.interval) > 0)) + 1
+    quantity = np.asarray(blocks.signals.quantity).reshape(-1, 10)[:n]
+    world = np.asarray(blocks.signals.acceleration).reshape(-1, 3)[:n]
+    at = {key: np.asarray(getattr(flight, key))[:n] for key in ("time", "velocity", "quaternion", "body_rate")}
+    smooth = Smoother(at["time"], np.asarray(flight.valid)[:n] > 0)
+    speed = np.asarray(driven)[:n]
+    body = to_body(at["quaternion"], at["velocity"])
+    drivers = {f"velocity {axis}": smooth(body[:, i]) for i, axis in enumerate("xyz")}
+    drivers |= {f"rate {axis}": smooth(at["body_rate"][:, i]) for i, axis in enumerate("xyz")}
+    patterns = {key: speed @ np.array(signs) / 4 for key, signs in PATTERNS.items()}
+    drivers |= {f"rotor {key}": smooth(value) for key, value in patterns.items()}
+    drivers |= {f"rotor {key} slope": smooth(value, 1) for key, value in patterns.items()}
+    drivers["command slope"] = smooth(np.asarray(flight.command)[:n].mean(axis=1), 1)
+    drivers["height"] = smooth(np.asarray(flight.position)[:n, 2])
+    drivers["voltage"] = np.asarray(flight.voltage)[:n]
+    drivers["time"] = at["time"]
+    return Residuals(
+        name,
+        at["time"],
+        smooth(quantity[:, :3], 1),
+        smooth(to_body(at["quaternion"], world)),
+        smooth(quantity[:, 6:]) if float(flight.measured) else None,
+        smooth.inside,
+        drivers,
+    )
+
+
+class Smoother:
+    """The Gaussian along one flight, which never reaches across a gap.
+
+    Attributes:
+        inside: (n,) rows far enough from both ends of their stretch for the Gaussian to be whole.
+    """
+
+    def __init__(self, time: np.ndarray, valid: np.ndarray, width: float = WIDTH):
+        self.time, self.width = time, width
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], valid.astype(int), [0]])))
+        # Shorter stretches have nothing in their middle.
+        self.stretches = [slice(a, b) for a, b in edges.reshape(-1, 2) if time[b - 1] - time[a] > 6 * width]
+        self.inside = np.zeros(len(time), dtype=bool)
+        for stretch in self.stretches:
+            t = time[stretch]
+            self.inside[stretch] = (t >= t[0] + 2 * width) & (t <= t[-1] - 2 * width)
+
+    def __call__(self, values: np.ndarray, order: int = 0) -> np.ndarray:
+        """Smoothed (n, ...) values, or with ``order`` 1 their slope per second; NaN outside the stretches."""
+        from scipy.ndimage import gaussian_filter1d
+
+        out = np.full(values.shape, np.nan)
+        for stretch in self.stretches:
+            t = self.time[stretch]
+            step = float(np.median(np.diff(t)))
+            grid = np.arange(t[0], t[-1] + 0.5 * step, step)
+            columns = values[stretch].reshape(len(t), -1)
+            even = np.stack([np.interp(grid, t, column) for column in columns.T], axis=1)
+            found = gaussian_filter1d(even, self.width / step, axis=0, order=order, mode="nearest") / step**order
+            back = np.stack([np.interp(t, grid, column) for column in found.T], axis=1)
+            out[stretch] = back.reshape(values[stretch].shape)
+        return out
+
+
+def aligned(a: list[Residuals], b: list[Residuals]) -> tuple[list[Residuals], list[Residuals]]:
+    """The same flights twice, cut to the rows both have: taking a fault out of a recording costs rows at its ends."""
+    pairs = []
+    for one, two in zip(a, b, strict=True):
+        _, i, j = np.intersect1d(one.time, two.time, assume_unique=True, return_indices=True)
+        both = one.valid[i] & two.valid[j]
+        pairs.append((one.rows(i, both), two.rows(j, both)))
+    return [p[0] for p in pairs], [p[1] for p in pairs]

@@ -1,0 +1,208 @@
+"""How much of a residual follows a signal: binned means with honest errors, and shares explained on data left out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfb_mjx.logs.rotation import to_body
+from cfb_mjx.sysid.evaluation import Evaluation
+from cfb_mjx.sysid.tracing.residuals import Residuals
+
+BLOCK = 2.0
+"""Seconds that stay together: neighbouring rows are not independent."""
+BINS, FOLDS = 8, 5
+OFFSET = "offset"
+"""In the place of a signal: the residual's mean."""
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """Rows of several flights one after the other.
+
+    Attributes:
+        axes: residual axes (N,) by name; NaN where there is none.
+        units: of the axes.
+        drivers: signals (N,) by name; NaN where not measured.
+        block: (N,) number of the stretch of `BLOCK` seconds a row belongs to.
+    """
+
+    axes: dict[str, np.ndarray]
+    units: dict[str, str]
+    drivers: dict[str, np.ndarray]
+    block: np.ndarray
+
+
+def pool(rows: list[Residuals]) -> Pooled:
+    """The valid rows of all flights."""
+    parts, first = [], 0
+    for flight in rows:
+        own = np.floor((flight.time - flight.time[0]) / BLOCK).astype(int)
+        parts.append(first + own[flight.valid])
+        first += own[-1] + 1
+    named = [flight.axes() for flight in rows]
+    units = {key: unit for key, (_, unit) in named[0].items()}
+    axes = {key: np.concatenate([n[key][0][f.valid] for n, f in zip(named, rows, strict=True)]) for key in units}
+    drivers = {key: np.concatenate([f.drivers[key][f.valid] for f in rows]) for key in rows[0].drivers}
+    return Pooled(axes, units, drivers, np.concatenate(parts))
+
+
+@dataclass(frozen=True)
+class Binned:
+    """Means in bins of a signal; arrays (bins,).
+
+    Attributes:
+        center: mean of the signal.
+        mean: of the residual.
+        error: standard error of that mean, from the scatter between blocks.
+    """
+
+    center: np.ndarray
+    mean: np.ndarray
+    error: np.ndarray
+
+
+def edges_of(signal: np.ndarray, bins: int = BINS) -> np.ndarray:
+    """Edges of bins that hold equally many rows, (bins + 1,) or fewer where values repeat."""
+    return np.unique(np.nanquantile(signal, np.linspace(0, 1, bins + 1)))
+
+
+def binned(residual: np.ndarray, signal: np.ndarray, block: np.ndarray, edges: np.ndarray) -> Binned:
+    """Means of a residual (n,) in bins of a signal (n,); bins with data from fewer than three blocks are left out."""
+    good = np.isfinite(residual) & np.isfinite(signal)
+    residual, signal, block = residual[good], signal[good], block[good]
+    which = np.clip(np.searchsorted(edges, signal, side="right") - 1, 0, len(edges) - 2)
+    out = []
+    for index in range(len(edges) - 1):
+        here = which == index
+        _, where = np.unique(block[here], return_inverse=True)
+        count, total = np.bincount(where), np.bincount(where, residual[here])
+        if len(count) < 3:
+            continue
+        mean = total.sum() / count.sum()
+        # Of a ratio of sums over blocks, which differ in how much they hold.
+        error = np.sqrt(np.sum((total - mean * count) ** 2) * len(count) / (len(count) - 1)) / count.sum()
+        out.append((signal[here].mean(), mean, error))
+    return Binned(*np.array(out).reshape(-1, 3).T)
+
+
+def explained(
+    residual: np.ndarray, signal: np.ndarray | None, block: np.ndarray, bins: int = BINS
+) -> tuple[float, float]:
+    """Share of a residual's mean square that bins of a signal explain beyond its mean, on blocks left out.
+
+    Args:
+        residual: (n,).
+        signal: (n,); None asks for what the mean alone explains.
+        block: (n,) number of the block of each row.
+        bins: how finely the signal is cut.
+
+    Returns:
+        The share, about zero or below where the signal says nothing, and how many standard errors it is above zero
+        (from the scatter between blocks).
+    """
+    good = np.isfinite(residual) & (True if signal is None else np.isfinite(signal))
+    y, block = residual[good], block[good]
+    numbers, block = np.unique(block, return_inverse=True)
+    if len(numbers) < 2 * FOLDS or not np.any(y):
+        return 0.0, 0.0
+    which, count = np.zeros(len(y), dtype=int), 1
+    if signal is not None:
+        edges = edges_of(signal[good], bins)
+        count = len(edges) - 1
+        if count < 2:
+            return 0.0, 0.0
+        which = np.clip(np.searchsorted(edges, signal[good], side="right") - 1, 0, count - 1)
+    fold = block % FOLDS
+    cell = fold * count + which
+    size = np.bincount(cell, minlength=FOLDS * count).reshape(FOLDS, count)
+    total = np.bincount(cell, y, FOLDS * count).reshape(FOLDS, count)
+    size, total = size.sum(0) - size, total.sum(0) - total
+    mean = (total.sum(1) / np.maximum(size.sum(1), 1))[:, None]
+    said = np.where(size > 0, total / np.maximum(size, 1), mean)[fold, which]
+    plain = mean[fold, 0] if signal is not None else 0.0
+    gain = np.bincount(block, (y - plain) ** 2 - (y - said) ** 2)
+    error = np.sqrt(np.sum((gain - gain.mean()) ** 2) * len(gain) / (len(gain) - 1))
+    return float(gain.sum() / np.sum(y**2)), float(gain.sum() / max(error, 1e-300))
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Which residual follows which signal.
+
+    Attributes:
+        axes: names of the residual axes (a).
+        signals: names of the signals (s), `OFFSET` first.
+        share: (a, s) `explained` shares of each axis's own mean square; NaN where a column was not measured.
+        sigma: (a, s) standard errors above zero.
+        rms: (a,) size of each axis in its unit.
+    """
+
+    axes: list[str]
+    signals: list[str]
+    share: np.ndarray
+    sigma: np.ndarray
+    rms: np.ndarray
+
+    def strongest(self, count: int, least_share: float = 0.05, least_sigma: float = 3.0) -> list[tuple[int, int]]:
+        """Axis and signal of what follows a signal most, at most one signal per axis, the largest share first."""
+        sure = np.where((self.sigma > least_sigma) & (self.share > least_share), self.share, 0.0)
+        best = np.nanargmax(np.nan_to_num(sure), axis=1)
+        pairs = [(axis, int(signal)) for axis, signal in enumerate(best) if sure[axis, signal] > 0]
+        return sorted(pairs, key=lambda pair: -sure[pair])[:count]
+
+
+def structure(pooled: Pooled, bins: int = BINS) -> Structure:
+    """Shares of every axis by every signal."""
+    axes, signals = list(pooled.axes), [OFFSET, *pooled.drivers]
+    share, sigma = np.full((2, len(axes), len(signals)), np.nan)
+    for i, axis in enumerate(axes):
+        y = pooled.axes[axis]
+        if not np.isfinite(y).any():
+            continue
+        for j, name in enumerate(signals):
+            signal = pooled.drivers.get(name)
+            if signal is None or np.isfinite(signal).any():
+                share[i, j], sigma[i, j] = explained(y, signal, pooled.block, bins)
+    rms = [np.sqrt(np.nanmean(y**2)) if np.isfinite(y).any() else np.nan for y in pooled.axes.values()]
+    return Structure(axes, signals, share, sigma, np.array(rms))
+
+
+def pool_predictions(evaluation: Evaluation, rows: list[Residuals], horizon: float = 0.2) -> Pooled:
+    """Prediction errors in the place of residuals: measured minus predicted, one row per window.
+
+    Velocity in body axes of the window's start and body rate, against the mean of every signal over the window.
+
+    Args:
+        evaluation: of some flights.
+        rows: `residual_rows` of the same flights, in the same order.
+        horizon: one of the evaluation's, s.
+    """
+    index = evaluation.horizons.index(horizon)
+    found, drivers, blocks, first = [], [], [], 0
+    for log, flight in zip(evaluation.logs, rows, strict=True):
+        if not len(log.windows):
+            continue
+        windows, said = log.windows, log.predictions["commands_in"]
+        velocity = to_body(windows.quaternion, windows.true_velocity[:, index] - np.asarray(said.velocity)[:, index])
+        rate = windows.true_body_rate[:, index] - np.asarray(said.body_rate)[:, index]
+        found.append(np.concatenate([velocity, rate], axis=1))
+        begin, end = (np.searchsorted(flight.time, windows.start + t) for t in (0.0, horizon))
+        drivers.append({key: _means(x, begin, end) for key, x in flight.drivers.items()})
+        blocks.append(first + np.floor((windows.start - windows.start[0]) / BLOCK).astype(int))
+        first = blocks[-1][-1] + 1
+    errors = np.concatenate(found)
+    names = [f"{horizon:g} s velocity {a}" for a in "xyz"] + [f"{horizon:g} s rate {a}" for a in "xyz"]
+    units = dict(zip(names, ["m/s"] * 3 + ["rad/s"] * 3, strict=True))
+    signals = {key: np.concatenate([d[key] for d in drivers]) for key in drivers[0]}
+    return Pooled(dict(zip(names, errors.T, strict=True)), units, signals, np.concatenate(blocks))
+
+
+def _means(values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Means over [begin, end) of what is known there; NaN where nothing is."""
+    known = np.isfinite(values)
+    total = np.concatenate([[0.0], np.cumsum(np.where(known, values, 0.0))])
+    count = np.concatenate([[0], np.cumsum(known)])
+    size = count[end] - count[begin]
+    return np.where(size > 0, (total[end] - total[begin]) / np.maximum(size, 1), np.nan)

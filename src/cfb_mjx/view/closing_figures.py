@@ -1,0 +1,192 @@
+"""Figures of the closed loop: held-out errors, what residuals follow before and after, and their spectra."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.sysid.metrics import QUANTITIES
+from cfb_mjx.sysid.tracing.residuals import UNITS
+from cfb_mjx.sysid.tracing.structure import Pooled, Structure, binned, edges_of
+from cfb_mjx.view import style
+
+BEFORE, AFTER = style.COLOURS["rotor_speed_in"], style.COLOURS["commands_in"]
+RANDOM = "#009E73"
+_TITLES = {"position": "position, m", "velocity": "velocity, m/s", "attitude": "attitude, deg", "rate": "rate, rad/s"}
+
+
+def errors_figure(before, after, floor: dict[str, float], random: dict[str, float], path: Path) -> None:
+    """Held-out RMS error against horizon, one panel per quantity.
+
+    Args:
+        before: `Evaluation` of the declared model.
+        after: of the corrected one.
+        floor: `noise_floor` of the sensors alone.
+        random: of the sensors and random disturbances.
+        path: file to write.
+    """
+    series = (
+        ("before", before, "commands_in", BEFORE, "s"),
+        ("after", after, "commands_in", AFTER, "o"),
+        ("hold", before, "hold", style.COLOURS["hold"], "^"),
+    )
+    horizons = 1e3 * np.array(before.horizons)
+    with style.context():
+        figure = style.new_figure(13.6, 3.9)
+        panels = figure.subplots(1, 4)
+        for panel, (quantity, unit) in zip(panels, QUANTITIES.items(), strict=True):
+            keys = [f"{quantity}_rmse_{unit}@{h:g}s" for h in before.horizons]
+            bottom = np.array([floor[key] for key in keys])
+            for order, (label, evaluation, variant, colour, marker) in enumerate(series):
+                values, spans = evaluation.metrics(variant), evaluation.intervals(variant)
+                middle, ends = np.array([values[k] for k in keys]), np.array([spans[k] for k in keys]).T
+                # Side by side, or equal errors would hide each other.
+                panel.errorbar(
+                    horizons * (1 + 0.035 * (order - 1)),
+                    middle,
+                    np.abs(ends - middle),
+                    color=colour,
+                    marker=marker,
+                    markersize=4.5,
+                    capsize=2.5,
+                    linewidth=1.4,
+                    label=label,
+                )
+            panel.plot(horizons, [random[k] for k in keys], ":", color=RANDOM, lw=1.6, label="noise and disturbances")
+            panel.plot(horizons, bottom, "--", color=style.MEASURED, lw=1.2, label="noise floor")
+            panel.set_xscale("log")
+            panel.set_yscale("log")
+            low = 0.6 * bottom.min()
+            panel.set_ylim(bottom=low)
+            panel.fill_between(horizons, low, bottom, color="#dddddd", zorder=0)
+            panel.set_xticks(horizons, [f"{h:.0f}" for h in horizons])
+            panel.xaxis.minorticks_off()
+            panel.set_xlabel("prediction, ms")
+            panel.set_title(_TITLES[quantity])
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9.5)
+        figure.subplots_adjust(left=0.045, right=0.995, top=0.92, bottom=0.24, wspace=0.24)
+        style.save(figure, path)
+
+
+def binned_figure(
+    before: Pooled, after: Pooled, pairs: Sequence[tuple[str, str]], labels: tuple[str, str], path: Path
+) -> None:
+    """Means of residuals in bins of a signal, with 95 % intervals, before and after; a panel for each of ``pairs``.
+
+    Args:
+        before: pooled rows.
+        after: pooled rows of the other model on the same flights.
+        pairs: residual axis and signal of each panel.
+        labels: of the two models.
+        path: file to write.
+    """
+    with style.context():
+        figure = style.new_figure(4.6 * len(pairs), 3.7)
+        panels = figure.subplots(1, len(pairs), squeeze=False)[0]
+        for panel, (axis, signal) in zip(panels, pairs, strict=True):
+            edges = edges_of(before.drivers[signal], 12)
+            for pooled, colour, marker, label in (
+                (before, BEFORE, "s", labels[0]),
+                (after, AFTER, "o", labels[1]),
+            ):
+                found = binned(pooled.axes[axis], pooled.drivers[signal], pooled.block, edges)
+                panel.errorbar(
+                    found.center,
+                    found.mean,
+                    1.96 * found.error,
+                    color=colour,
+                    marker=marker,
+                    markersize=4.5,
+                    capsize=2.5,
+                    linewidth=1.2,
+                    label=label,
+                )
+            panel.axhline(0, color=style.MEASURED, linewidth=0.8)
+            panel.set_xlabel(f"{signal}, {UNITS[signal]}")
+            panel.set_ylabel(f"{axis}, {before.units[axis]}")
+        handles, names = panels[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="upper center", ncols=2)
+        width = 4.6 * len(pairs)
+        figure.subplots_adjust(left=0.75 / width, right=1 - 0.15 / width, top=0.9, bottom=0.15, wspace=0.3)
+        style.save(figure, path)
+
+
+def matrix_figure(before: Structure, after: Structure, path: Path) -> None:
+    """Share of each residual's mean square that follows each signal, before and after, both of the mean square before.
+
+    Args:
+        before: structure of the declared model's residuals; rows that were not measured are left out.
+        after: of the corrected model's.
+        path: file to write.
+    """
+    shown = [i for i, size in enumerate(before.rms) if np.isfinite(size)]
+    columns = [j for j in range(len(before.signals)) if np.isfinite(before.share[shown, j]).any()]
+    scale = (after.rms / before.rms)[:, None] ** 2
+    with style.context():
+        height = 0.27 * len(shown) + 1.75
+        figure = style.new_figure(13.6, height)
+        panels = figure.subplots(1, 2, sharey=True)
+        for panel, share, title in (
+            (panels[0], before.share, "before"),
+            (panels[1], after.share * scale, "after"),
+        ):
+            values = 100 * np.clip(share[np.ix_(shown, columns)], 0, 1)
+            image = panel.imshow(values, vmin=0, vmax=100, cmap="Oranges", aspect="auto")
+            panel.grid(False)
+            panel.set_xticks(range(len(columns)), [before.signals[j] for j in columns], rotation=55, ha="right")
+            panel.set_yticks(range(len(shown)), [before.axes[i] for i in shown])
+            for y, x in zip(*np.nonzero(np.nan_to_num(values) >= 3), strict=True):
+                colour = "white" if values[y, x] > 60 else style.MEASURED
+                panel.text(x, y, f"{values[y, x]:.0f}", ha="center", va="center", fontsize=7, color=colour)
+            panel.set_title(title)
+        figure.subplots_adjust(left=0.085, right=0.92, top=1 - 0.3 / height, bottom=1.3 / height, wspace=0.03)
+        bar = figure.add_axes((0.935, 1.3 / height, 0.012, 1 - 1.6 / height))
+        figure.colorbar(image, cax=bar, label="% of the mean square before")
+        style.save(figure, path)
+
+
+def spectra_figure(
+    before: dict[str, tuple], after: dict[str, tuple], noise: dict[str, np.ndarray], units: dict[str, str], path: Path
+) -> None:
+    """Power spectral density of every residual axis.
+
+    Args:
+        before: frequency (Hz) and density by axis.
+        after: the same of the corrected model.
+        noise: density the sensors' white noise would leave, at the same frequencies.
+        units: of the axes.
+        path: file to write.
+    """
+    axes = list(before)
+    rows = -(-len(axes) // 3)
+    with style.context():
+        figure = style.new_figure(13.6, 2.75 * rows + 0.45)
+        panels = figure.subplots(rows, 3, squeeze=False, sharex=True).ravel()
+        for panel, axis in zip(panels, axes, strict=False):
+            for (frequency, density), colour, label in (
+                (before[axis], BEFORE, "before"),
+                (after[axis], AFTER, "after"),
+            ):
+                panel.plot(frequency, density, color=colour, linewidth=1.4, label=label)
+            if axis in noise:
+                panel.plot(frequency, noise[axis], "--", color=style.MEASURED, lw=1.1, label="sensor noise")
+            panel.set_xscale("log")
+            panel.set_yscale("log")
+            # Far below everything else the filter alone is seen.
+            panel.set_ylim(bottom=0.3 * min(before[axis][1].min(), after[axis][1].min()))
+            panel.set_title(f"{axis}, ({units[axis]})²/Hz")
+        for panel in panels[len(axes) :]:
+            panel.set_visible(False)
+        for panel in panels[max(0, len(axes) - 3) : len(axes)]:
+            panel.set_xlabel("frequency, Hz")
+            panel.tick_params(labelbottom=True)
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="upper right", ncols=3)
+        height = 2.75 * rows + 0.45
+        figure.subplots_adjust(
+            left=0.05, right=0.99, top=1 - 0.55 / height, bottom=0.5 / height, hspace=0.25, wspace=0.17
+        )
+        style.save(figure, path)

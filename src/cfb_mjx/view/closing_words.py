@@ -1,0 +1,173 @@
+"""What the report of a closed loop says in words: verdicts, numbers with units, and flights that would tell more."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from cfb_mjx.model.effects import CATALOGUE
+from cfb_mjx.sysid.sensor_faults import UNITS as FAULT_UNITS
+from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
+
+MEANING = {
+    "thrust_scale": "all rotors lift more or less than the declared thrust curve says",
+    "torque_scale": "the rotors' reaction torque differs from the declared torque curve",
+    "inertia": "the moments of inertia differ from the declared ones",
+    "cog_offset": "the centre of gravity does not lie in the middle of the rotors",
+    "payload": "the drone carries mass that was not declared",
+    "motor_gain_mismatch": "single motors turn faster or slower than their command says",
+    "motor_time_constant": "the motors answer slower or faster than declared",
+    "motor_asymmetry": "the motors spin up and down at different speed",
+    "motor_second_order": "the motors answer with a second lag",
+    "motor_thermal_drift": "the motors slow down as they warm up",
+    "battery_sag": "rotor speed follows the battery's voltage",
+    "command_delay": "commands reach the motors late",
+    "esc_rate_limit": "the motor controllers limit how fast a command may change",
+    "inflow_thrust": "thrust falls in climb and grows in descent",
+    "ground_effect": "thrust grows near the ground",
+    "gyroscopic": "the spinning rotors resist being turned",
+    "thrust_tilt": "the thrust does not point along the body's z axis",
+    "rotor_drag": "the rotors drag against sideways motion, in proportion to speed",
+    "parasitic_drag": "the body drags against motion, with the square of speed",
+    "blade_flapping": "sideways motion tilts the rotor discs and turns the body",
+    "wind": "the air moves",
+    "payload_swing": "a load swings below the drone",
+    "sensor_delay": "pose and velocity are older than the log declares",
+    "sensor_velocity_scale": "logged velocity is not in scale with logged position",
+    "sensor_gyro_lowpass": "the gyro is filtered and lags",
+    "sensor_time_shift": "command and rotor-speed columns are late or early against all others",
+}
+MOTORS = "`cfb excite single-motor`: steps of one motor at a time, rotor speed logged"
+TURNS = "`cfb excite roll-pitch`: doublets about roll and pitch, and yaw turns both ways"
+PASSES = "straight passes at constant speed, 0.5 to 3 m/s, forth and back and in both body axes"
+HOVERS = "long hovers with the heading turned by 90 degrees in between"
+EXPERIMENTS = {
+    "thrust_scale": "weigh the drone, then hover: mass and thrust cannot be told apart in flight",
+    "torque_scale": "yaw turns and stops at constant height (`cfb excite single-motor`)",
+    "inertia": TURNS,
+    "cog_offset": HOVERS,
+    "payload": "weigh the drone, then hover and `cfb excite roll-pitch`",
+    "motor_gain_mismatch": MOTORS,
+    "motor_time_constant": MOTORS,
+    "motor_asymmetry": "large command steps up and down, rotor speed logged (`cfb excite single-motor`)",
+    "motor_second_order": MOTORS,
+    "motor_thermal_drift": "hover for a minute from cold, twice: on a full and on a half-empty battery",
+    "battery_sag": "hover from a full battery to an empty one with the voltage logged",
+    "command_delay": "sharp command steps, rotor speed and every command logged (`cfb excite single-motor`)",
+    "esc_rate_limit": "command steps of several sizes, rotor speed logged: a limit shows in the large ones only",
+    "inflow_thrust": "climbs and dives at 0.5 to 2 m/s",
+    "ground_effect": "hover for five seconds each at 0.1, 0.15, 0.25, 0.5 and 1 m",
+    "gyroscopic": "fast roll and pitch while climbing hard: rates at high rotor speed",
+    "thrust_tilt": HOVERS,
+    "rotor_drag": PASSES,
+    "parasitic_drag": PASSES + ", the fastest as fast as there is room for",
+    "blade_flapping": PASSES + ", repeated while climbing",
+    "wind": "hover with the heading turned through 360 degrees: wind stays in the world, trim turns with the body",
+    "payload_swing": "a sharp stop followed by a hover of five seconds: a load swings on",
+    "sensor_delay": "fast turns in yaw and hard stops: delay shows where signals change quickly",
+    "sensor_velocity_scale": "long straight passes",
+    "sensor_gyro_lowpass": "`cfb excite roll-pitch`: fast rates show a filter",
+    "sensor_time_shift": "sharp command steps with rotor speed logged",
+}
+FOLLOWS = {
+    "velocity": PASSES,
+    "rate": TURNS,
+    "rotor mean": "climbs, dives and hovers at several thrusts, rotor speed logged",
+    "rotor": MOTORS,
+    "command": MOTORS,
+    "height": "hover at several heights, and the same heights over another floor",
+    "voltage": "hover from a full battery to an empty one",
+    "time": "hover for a minute from cold, twice",
+    "offset": HOVERS,
+}
+_COMPONENTS = {2: ("x", "y"), 3: ("x", "y", "z"), 4: ("M1", "M2", "M3", "M4")}
+
+
+def is_fault(name: str) -> bool:
+    """Whether a name is one of the recording's faults and not physics."""
+    return name in FAULT_UNITS
+
+
+def unit_of(name: str, field: str) -> str:
+    """Unit of a parameter of an effect or fault; empty for plain ratios."""
+    unit = FAULT_UNITS[name][1] if is_fault(name) else CATALOGUE[name].units.get(field, "1")
+    return "" if unit == "1" else unit
+
+
+def values(item: Reported) -> Iterator[tuple[str, float, float, str]]:
+    """Label, value, standard deviation and unit of every number of an effect."""
+    for field, value in item.parameters.items():
+        unit, deviation = unit_of(item.name, field), item.uncertainty.get(field, np.nan)
+        if not isinstance(value, list):
+            yield field, float(value), float(deviation), unit
+            continue
+        labels = _COMPONENTS.get(len(value), tuple(str(i) for i in range(len(value))))
+        for label, v, s in zip(labels, value, np.broadcast_to(deviation, len(value)), strict=True):
+            yield f"{field} {label}", float(v), float(s), unit
+
+
+def with_error(value: float, std: float, unit: str = "") -> str:
+    """``value ± std unit`` with as many digits as the deviation allows."""
+    unit = f" {unit}" if unit else ""
+    if not np.isfinite(std) or std <= 0:
+        return f"{value:.3g}{unit}"
+    power = int(np.floor(np.log10(max(abs(value), std))))
+    scale = power if power < -3 or power > 4 else 0
+    digits = max(0, 1 - int(np.floor(np.log10(std))) + scale)
+    a, b = value / 10.0**scale, std / 10.0**scale
+    return f"({a:.{digits}f} ± {b:.{digits}f})e{scale}{unit}" if scale else f"{a:.{digits}f} ± {b:.{digits}f}{unit}"
+
+
+def probability(p: float) -> str:
+    """A p-value as printed."""
+    return f"{p:.1g}" if p > 1e-300 else "< 1e-300"
+
+
+def strength(item: Reported) -> str:
+    """All numbers of an effect in one phrase."""
+    return ", ".join(f"{label} {with_error(v, s, unit)}" for label, v, s, unit in values(item))
+
+
+def change(before: float, after: float) -> str:
+    """A relative change as printed."""
+    return f"{100 * (after / before - 1):+.0f} %"
+
+
+def verdict(outcome: Outcome) -> str:
+    """What was found, in a sentence or two."""
+    physics = [item for item in outcome.reported if not is_fault(item.name)]
+    faults = [item for item in outcome.reported if is_fault(item.name)]
+    parts = []
+    if len(physics) == 1:
+        (item,) = physics
+        parts.append(f"The drone flies with {item.name} the model lacks ({MEANING[item.name]}): {strength(item)}.")
+    elif physics:
+        named = "; ".join(f"{item.name} ({strength(item)})" for item in physics)
+        parts.append(f"The drone flies with {len(physics)} effects the model lacks: {named}.")
+    if faults:
+        named = "; ".join(f"{item.name}, {MEANING[item.name]}: {strength(item)}" for item in faults)
+        parts.append(f"The recording is at fault, not the physics: {named}.")
+        if not physics:
+            parts.append("Of the physics nothing is missing beyond chance.")
+    if not outcome.reported:
+        parts.append("Nothing is missing beyond chance.")
+    if getattr(outcome, "unexplained", None):
+        parts.append("Something is left that no effect of the catalogue accounts for; see below.")
+    if outcome.reported:
+        parts.append(_bought(outcome))
+    return " ".join(parts)
+
+
+def _bought(outcome: Outcome) -> str:
+    """The largest drop of a held-out error at the longest horizon."""
+    before, after = outcome.before.metrics("commands_in"), outcome.after.metrics("commands_in")
+    horizon = f"@{max(outcome.before.horizons):g}s"
+    keys = [key for key in before if "_rmse_" in key and key.endswith(horizon)]
+    key = min(keys, key=lambda k: after[k] / before[k])
+    quantity, _, unit = key.partition("@")[0].split("_")
+    unit = {"mps": "m/s", "radps": "rad/s"}.get(unit, unit)
+    return (
+        f"On flights it was not fitted to, the {quantity} error {horizon[1:-1]} s ahead goes from {before[key]:.3g} to "
+        f"{after[key]:.3g} {unit} ({change(before[key], after[key])})."
+    )
