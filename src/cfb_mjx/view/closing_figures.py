@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -71,47 +72,61 @@ def errors_figure(before, after, floor: dict[str, float], random: dict[str, floa
         style.save(figure, path)
 
 
-def binned_figure(
-    before: Pooled, after: Pooled, pairs: Sequence[tuple[str, str]], labels: tuple[str, str], path: Path
-) -> None:
-    """Means of residuals in bins of a signal, with 95 % intervals, before and after; a panel for each of ``pairs``.
+@dataclass(frozen=True)
+class Panel:
+    """One residual axis against one signal, of two models on the same flights."""
+
+    axis: str
+    signal: str
+    before: Pooled
+    after: Pooled
+
+
+def binned_figure(panels: Sequence[Panel], labels: tuple[str, str], path: Path) -> None:
+    """Means of residuals in bins of a signal, with 95 % intervals, before and after.
 
     Args:
-        before: pooled rows.
-        after: pooled rows of the other model on the same flights.
-        pairs: residual axis and signal of each panel.
+        panels: what to draw, side by side.
         labels: of the two models.
         path: file to write.
     """
     with style.context():
-        figure = style.new_figure(4.6 * len(pairs), 3.7)
-        panels = figure.subplots(1, len(pairs), squeeze=False)[0]
-        for panel, (axis, signal) in zip(panels, pairs, strict=True):
-            edges = edges_of(before.drivers[signal], 12)
-            for pooled, colour, marker, label in (
-                (before, BEFORE, "s", labels[0]),
-                (after, AFTER, "o", labels[1]),
-            ):
-                found = binned(pooled.axes[axis], pooled.drivers[signal], pooled.block, edges)
-                panel.errorbar(
-                    found.center,
-                    found.mean,
-                    1.96 * found.error,
-                    color=colour,
-                    marker=marker,
-                    markersize=4.5,
-                    capsize=2.5,
-                    linewidth=1.2,
-                    label=label,
-                )
-            panel.axhline(0, color=style.MEASURED, linewidth=0.8)
-            panel.set_xlabel(f"{signal}, {UNITS[signal]}")
-            panel.set_ylabel(f"{axis}, {before.units[axis]}")
-        handles, names = panels[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="upper center", ncols=2)
-        width = 4.6 * len(pairs)
-        figure.subplots_adjust(left=0.75 / width, right=1 - 0.15 / width, top=0.9, bottom=0.15, wspace=0.3)
+        # Single panels would be blown up to the width of the page.
+        width = 4.5 * max(len(panels), 3)
+        figure = style.new_figure(width, 3.6)
+        axes = figure.subplots(1, max(len(panels), 3), squeeze=False)[0]
+        for panel, drawn in zip(panels, axes, strict=False):
+            _binned(drawn, panel, labels)
+        for empty in axes[len(panels) :]:
+            empty.set_visible(False)
+        handles, names = axes[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="upper left", bbox_to_anchor=(0.045, 1.0), ncols=2)
+        figure.subplots_adjust(left=0.06, right=0.99, top=0.88, bottom=0.15, wspace=0.27)
         style.save(figure, path)
+
+
+def _binned(drawn, panel: Panel, labels: tuple[str, str]) -> None:
+    one_per_window = len(panel.before.block) < 2000
+    edges = edges_of(panel.before.drivers[panel.signal], 6 if one_per_window else 12)
+    for pooled, colour, marker, label in (
+        (panel.before, BEFORE, "s", labels[0]),
+        (panel.after, AFTER, "o", labels[1]),
+    ):
+        found = binned(pooled.axes[panel.axis], pooled.drivers[panel.signal], pooled.block, edges)
+        drawn.errorbar(
+            found.center,
+            found.mean,
+            1.96 * found.error,
+            color=colour,
+            marker=marker,
+            markersize=4.5,
+            capsize=2.5,
+            linewidth=1.2,
+            label=label,
+        )
+    drawn.axhline(0, color=style.MEASURED, linewidth=0.8)
+    drawn.set_xlabel(f"{panel.signal}, {UNITS[panel.signal]}")
+    drawn.set_ylabel(f"{panel.axis}, {panel.before.units[panel.axis]}")
 
 
 def matrix_figure(before: Structure, after: Structure, path: Path) -> None:

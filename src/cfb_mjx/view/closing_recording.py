@@ -13,8 +13,8 @@ from cfb_mjx.sysid.tracing.residuals import UNITS, Residuals
 from cfb_mjx.view.closing_figures import AFTER, BEFORE
 from cfb_mjx.view.style import MEASURED
 
-RATE = 40.0
-"""Rows per second kept: residuals are smoothed, nothing faster is in them."""
+RATE, ROWS = 40.0, 2000
+"""Rows per second kept, and rows of all flights together at most: residuals are smoothed, and the file stays small."""
 FLIGHTS = 6
 """Flights recorded at most."""
 _ARM = 0.05
@@ -44,11 +44,18 @@ def write_recording(
     with replacing(path) as temporary:
         stream = rr.RecordingStream("cfb_close_loop", make_default=False)
         stream.save(temporary, default_blueprint=_blueprint([row.name for row in rows[0][:FLIGHTS]]))
+        seconds = sum(log.log.duration for log in before.logs[:FLIGHTS])
+        rate = min(RATE, ROWS / max(seconds, 1e-3))
         for index, (old, new) in enumerate(list(zip(*rows, strict=True))[:FLIGHTS]):
-            _residuals(rr, stream, old, new)
-            _flight(rr, stream, before.logs[index], after.logs[index])
+            _residuals(rr, stream, old, new, rate)
+            _flight(rr, stream, before.logs[index], after.logs[index], rate)
         stream.flush()
         stream.disconnect()
+
+
+def _plain(name: str) -> str:
+    """A name as part of an entity's path."""
+    return name.replace(" ", "_")
 
 
 def _colour(text: str) -> list[int]:
@@ -56,48 +63,51 @@ def _colour(text: str) -> list[int]:
 
 
 def _blueprint(names: list[str]):
+    import rerun as rr
     import rerun.blueprint as rrb
 
-    def plots(name: str, what: str):
-        return rrb.TimeSeriesView(name=what, contents=[f"+ /{name}/residual/{what} {a}/**" for a in ("x", "y", "z")])
+    def plots(root: str, what: str):
+        return rrb.TimeSeriesView(name=what, contents=[f"+ /{root}/residual/{what}_{a}/**" for a in "xyz"])
 
+    roots = {name: rr.escape_entity_path_part(name) for name in names}
     tabs = [
         rrb.Horizontal(
-            rrb.Spatial3DView(name="flight", origin=f"/{name}/world"),
+            rrb.Spatial3DView(name="flight", origin=f"/{root}/world"),
             rrb.Vertical(
-                plots(name, "torque"),
-                plots(name, "force"),
-                rrb.TimeSeriesView(name="signals", contents=[f"+ /{name}/signal/velocity*/**"]),
+                plots(root, "torque"),
+                plots(root, "force"),
+                rrb.TimeSeriesView(name="signals", contents=[f"+ /{root}/signal/velocity_{a}" for a in "xyz"]),
             ),
             name=name,
         )
-        for name in names
+        for name, root in roots.items()
     ]
     return rrb.Blueprint(rrb.Tabs(*tabs), collapse_panels=True)
 
 
-def _residuals(rr, stream, before: Residuals, after: Residuals) -> None:
-    step = max(1, round(1 / (RATE * float(np.median(np.diff(before.time))))))
+def _residuals(rr, stream, before: Residuals, after: Residuals, rate: float) -> None:
+    root = rr.escape_entity_path_part(before.name)
+    step = max(1, round(1 / (rate * float(np.median(np.diff(before.time))))))
     keep = np.flatnonzero(before.valid)[::step]
     time = [rr.TimeColumn("flight_time", duration=before.time[keep])]
     for label, flight, colour in (("before", before, BEFORE), ("after", after, AFTER)):
         for axis, (values, unit) in flight.axes().items():
             if not np.isfinite(values[keep]).any():
                 continue
-            path = f"{flight.name}/residual/{axis}/{label}"
+            path = f"{root}/residual/{_plain(axis)}/{label}"
             line = rr.SeriesLines(colors=_colour(colour), names=f"{axis} {label}, {unit}")
             stream.log(path, line, static=True)
             stream.send_columns(path, time, rr.Scalars.columns(scalars=values[keep]))
     for name, values in before.drivers.items():
         if np.isfinite(values[keep]).any():
-            path = f"{before.name}/signal/{name}"
+            path = f"{root}/signal/{_plain(name)}"
             stream.log(path, rr.SeriesLines(names=f"{name}, {UNITS[name]}"), static=True)
             stream.send_columns(path, time, rr.Scalars.columns(scalars=values[keep]))
 
 
-def _flight(rr, stream, before: LogEvaluation, after: LogEvaluation) -> None:
-    log, world = before.log, f"{before.log.name}/world"
-    step = max(1, round(1 / (RATE * max(log.nominal_interval, 1e-4))))
+def _flight(rr, stream, before: LogEvaluation, after: LogEvaluation, rate: float) -> None:
+    log, world = before.log, f"{rr.escape_entity_path_part(before.log.name)}/world"
+    step = max(1, round(1 / (rate * max(log.nominal_interval, 1e-4))))
     # Pose rows are late by the delay; the recording shows them when they were true.
     time = [rr.TimeColumn("flight_time", duration=log.time[::step] - before.delay)]
     stream.log(world, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)

@@ -63,7 +63,7 @@ def _squares(evaluated: LogEvaluation, horizons: tuple[float, ...], levels: Leve
             late = _averaging(log.time, starts + evaluated.delay + horizon)
             seen = late * np.array([noise["position"][axis], noise["velocity"][axis], noise["angle"]]) ** 2
             rate = _averaging(log.time, starts + horizon) * noise["gyro"][turn] ** 2
-            out[:, k] += (moved + [*seen, rate]) * [1, 1, np.degrees(1.0) ** 2, 1]
+            out[:, k] += (moved + np.array([*seen, rate])) * [1, 1, np.degrees(1.0) ** 2, 1]
     return out
 
 

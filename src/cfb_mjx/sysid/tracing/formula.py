@@ -104,3 +104,71 @@ def terms_of(hypothesis: Hypothesis, deviation: np.ndarray, gains: dict[Column, 
         value = float(np.asarray(getattr(effect, column.field))[column.index])
         found.append(Term(axis, signal, unit, value, float(std), gains[column]))
     return sorted(found, key=lambda term: -term.gain)
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Structure that no effect of the catalogue accounts for, and a formula that describes it.
+
+    Attributes:
+        terms: the formula, the largest gain first.
+        buys: largest share by which it lowers a prediction error of the fit flights.
+        hypothesis: with the formula, and without effects that only stood in for it.
+        without: the same without the formula.
+    """
+
+    terms: list[Term]
+    buys: float
+    hypothesis: Hypothesis
+    without: Hypothesis
+
+    @property
+    def formulas(self) -> list[str]:
+        """One line per term."""
+        return [str(term) for term in self.terms]
+
+    @property
+    def where(self) -> str:
+        """Axes and signals in words."""
+        axes = list(dict.fromkeys(term.axis for term in self.terms))
+        return "; ".join(f"{a} follows {', '.join(t.signal for t in self.terms if t.axis == a)}" for a in axes)
+
+
+def explain(
+    search: Search,
+    hypothesis: Hypothesis,
+    errors: Callable[[Search, Hypothesis], np.ndarray],
+    material: float,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[Search, Unexplained | None]:
+    """Look for a formula beside what was found, keep it if it is material, and drop effects it makes needless.
+
+    Args:
+        search: over the fit flights.
+        hypothesis: what the catalogue explains.
+        errors: prediction errors of a hypothesis on the flights of a search.
+        material: least share by which it must lower one of them.
+        progress: told what happens.
+    """
+    widened, base = with_library(search, hypothesis)
+    terms, gains = propose(widened, base, progress)
+    if not terms:
+        return search, None
+    richer, deviation = fit_formula(widened, base, terms)
+    old, new = errors(widened, base), errors(widened, richer)
+    if np.max(1 - new / old) < material or np.log(new / old).sum() > 0:
+        return search, None
+    for name in hypothesis.present:
+        # An effect may have stood in for what the formula says better.
+        progress(f"looking at {name} again, beside the formula")
+        less, spread = fit_formula(widened, richer.without(name), terms)
+        without = errors(widened, less)
+        if np.max(1 - new / without) < material:
+            richer, deviation, new = less, spread, without
+    kept = [name for name in hypothesis.present if name in richer.present]
+    plain = base
+    for name in hypothesis.present:
+        plain = plain if name in kept else plain.without(name)
+    plain, _ = widened.refine(plain)
+    buys = float(np.max(1 - new / errors(widened, plain)))
+    return widened, Unexplained(terms_of(richer, deviation, gains), buys, richer, plain)

@@ -14,11 +14,17 @@ from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
 from cfb_mjx.sysid.sensor_faults import UNITS, SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
+from cfb_mjx.sysid.tracing.columns import FORMULA
 from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
-from cfb_mjx.sysid.tracing.search import Hypothesis
+from cfb_mjx.sysid.tracing.formula import Unexplained, explain
+from cfb_mjx.sysid.tracing.search import Hypothesis, Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
-from cfb_mjx.sysid.tracing.trace import Found, Trace, trace
+from cfb_mjx.sysid.tracing.trace import Found, Trace, prediction_errors, trace
 
+STRUCTURE = 0.06
+"""A formula counts when it lowers at least one prediction error by this share."""
+SURE = 3.0
+"""And when its statistic on held-out flights is above this."""
 DOUBTFUL = 1.0
 """An effect whose statistic on held-out flights is below this is not reported."""
 
@@ -63,6 +69,7 @@ class Outcome:
     faults: SensorFaults
     before: Evaluation
     after: Evaluation
+    unexplained: Unexplained | None = None
 
     def to_json(self) -> dict:
         """The part of ``report.json`` that comes from the flights (DESIGN 6)."""
@@ -82,8 +89,9 @@ class Outcome:
         }
         return {
             "effects": [item.to_json() for item in self.reported],
-            "unexplained": False,
-            "unexplained_because": None,
+            "unexplained": self.unexplained is not None,
+            "unexplained_because": self.unexplained and self.unexplained.where,
+            "formula": self.unexplained and self.unexplained.formulas,
             "held_out": held_out,
             "unconfirmed": [item.to_json() for item in self.unconfirmed],
             "sensors": {name: {"value": v, "std": s} for name, (v, s) in self.trace.sensors.measured.items()},
@@ -97,6 +105,8 @@ class Outcome:
             if item.name in self.hypothesis.present and item.name in {type(e).name for e in self.hypothesis.effects}:
                 mapping = effect_to_mapping(self.hypothesis.effect(item.name))
                 effects.append(mapping | {"uncertainty": item.uncertainty, "p_value": item.p_value})
+        if self.unexplained is not None:
+            effects.append(effect_to_mapping(self.hypothesis.effect(FORMULA)))
         replaced = {item["name"] for item in effects} | set(UNITS)
         kept = [item for item in self.base.effects if item["name"] not in replaced]
         named = ", ".join(item.name for item in self.reported) or "nothing"
@@ -130,28 +140,43 @@ def close_loop(
     delays = {log.observation_delay for log in fit} - {None}
     delay = float(np.median(list(delays))) if delays else float(parameters.observation_delay)
     found = trace(fit, parameters, delay, progress, declared, checkpoint)
+    search, unexplained = explain(found.search, found.hypothesis, prediction_errors, STRUCTURE, progress)
     progress("judging on held-out flights")
     nothing = found.search.nothing()
     before = evaluate(nothing.model(parameters), held_out)
     # Biases of the held-out sensors come from their own kinematics; no model is fitted.
-    check = check_sensors(held_out, delay)
-    judge = found.search.beside(held_out, replace(check, faults=found.sensors.faults))
+    check = replace(check_sensors(held_out, delay), faults=found.sensors.faults)
+    judge = found.search.beside(held_out, check)
     hypothesis, reported, unconfirmed = found.hypothesis, [], []
     for item in found.found:
         verdict = confirm(judge, item.without, found.hypothesis)
         entry = Reported(item.name, verdict.p_value, item.parameters, item.uncertainty, item, verdict)
-        if verdict.t < DOUBTFUL:
+        kept = unexplained is None or item.name in unexplained.hypothesis.present
+        worse = _change(judge, item.without, found.hypothesis) > 0
+        if not kept or verdict.t < DOUBTFUL or worse:
             unconfirmed.append(entry)
             hypothesis = hypothesis.without(item.name)
         else:
             reported.append(entry)
+    if unexplained is not None:
+        wide = search.beside(held_out, check)
+        verdict = confirm(wide, unexplained.without, unexplained.hypothesis)
+        if verdict.t < SURE or _change(wide, unexplained.without, unexplained.hypothesis) > 0:
+            unexplained = None
+        else:
+            hypothesis = unexplained.hypothesis
     for fault in found.sensors.findings:
         field = {"sensor_velocity_scale": "scale", "sensor_delay": "delay"}.get(fault.name, "lag")
         reported.insert(0, Reported(fault.name, fault.p_value, {field: fault.value}, {field: fault.std}))
     faults = replace(found.sensors.faults, motor_shift=hypothesis.shift)
     after = evaluate(hypothesis.model(parameters), held_out, faults=faults)
-    return Outcome(found, base, reported, unconfirmed, hypothesis, faults, before, after)
+    return Outcome(found, base, reported, unconfirmed, hypothesis, faults, before, after, unexplained)
 
 
 def _per_log(evaluation: Evaluation) -> list[dict[str, float] | None]:
     return [Evaluation((log,), evaluation.horizons).metrics("commands_in") for log in evaluation.logs]
+
+
+def _change(judge: Search, poorer: Hypothesis, richer: Hypothesis) -> float:
+    """Sum of the logarithms by which the richer hypothesis changes the prediction errors."""
+    return float(np.log(prediction_errors(judge, richer) / prediction_errors(judge, poorer)).sum())

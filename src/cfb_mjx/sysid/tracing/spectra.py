@@ -43,9 +43,7 @@ def spectra(rows: list[Residuals]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     }
 
 
-def sensor_spectra(
-    frequency: np.ndarray, noise: dict[str, np.ndarray], interval: float
-) -> dict[str, np.ndarray]:
+def sensor_spectra(frequency: np.ndarray, noise: dict[str, np.ndarray], interval: float) -> dict[str, np.ndarray]:
     """Densities (f,) that white noise of the sensors leaves behind the Gaussian, by residual axis.
 
     Args:

@@ -1,0 +1,113 @@
+"""Which figures the report of a closed loop has, and what each of them shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
+from cfb_mjx.sysid.tracing.residuals import aligned, residual_rows
+from cfb_mjx.sysid.tracing.search import Hypothesis, Search
+from cfb_mjx.sysid.tracing.spectra import sensor_spectra, spectra
+from cfb_mjx.sysid.tracing.structure import Pooled, explained, pool
+from cfb_mjx.view.closing_figures import Panel, binned_figure, errors_figure, matrix_figure, spectra_figure
+from cfb_mjx.view.closing_look import Looked, beside
+from cfb_mjx.view.closing_words import is_fault
+
+PANELS = 3
+"""Of one figure at most."""
+Figures = dict[str, list[tuple[Path, str]]]
+
+
+def draw(outcome: Outcome, looked: Looked, logs_fit: list[FlightLog], folder: Path) -> Figures:
+    """Figures as files with alternative texts, under ``errors``, ``residuals``, ``left`` and the name of each effect.
+
+    Args:
+        outcome: of the closed loop.
+        looked: `look`.
+        logs_fit: flights that were learned from, as read.
+        folder: to write into.
+    """
+    figures: Figures = {"errors": [(folder / "errors.svg", "held-out error against horizon, before and after")]}
+    errors_figure(outcome.before, outcome.after, looked.floor, looked.random, figures["errors"][0][0])
+    for item in outcome.reported:
+        panels, labels = _effect(outcome, looked, item, logs_fit)
+        if panels:
+            path = folder / f"{item.name}.svg"
+            binned_figure(panels, labels, path)
+            what = ", ".join(f"{p.axis} against {p.signal}" for p in panels)
+            figures[item.name] = [(path, f"{item.name}: {what}, {labels[0]} and {labels[1]}")]
+    matrix_figure(*looked.structure, folder / "matrix.svg")
+    figures["residuals"] = [
+        (folder / "matrix.svg", "share of each residual that follows each signal, before and after")
+    ]
+    figures["residuals"] += _spectra(looked, folder / "spectra.svg")
+    after = looked.structure[1]
+    left = [(after.axes[i], after.signals[j]) for i, j in after.strongest(PANELS)]
+    # A mean has no signal to be drawn against; over time it shows as well as over any other.
+    panels = [
+        Panel(axis, name if name in looked.pair(axis)[0].drivers else "time", *looked.pair(axis)) for axis, name in left
+    ]
+    if panels:
+        binned_figure(panels, ("before", "after"), folder / "left.svg")
+        figures["left"] = [(folder / "left.svg", "the strongest structure left in the residuals")]
+    return figures
+
+
+def _spectra(looked: Looked, path: Path) -> list[tuple[Path, str]]:
+    before, after = spectra(looked.rows[0]), spectra(looked.rows[1])
+    if not before:
+        return []
+    frequency = next(iter(before.values()))[0]
+    interval = float(np.median([log.nominal_interval for log in looked.judge.logs]))
+    noise = sensor_spectra(frequency, looked.judge.noise, interval)
+    units = {axis: looked.pooled[0].units.get(axis, "rad/s") for axis in before}
+    spectra_figure(before, after, noise, units, path)
+    return [(path, "spectra of the residuals before and after")]
+
+
+def _effect(
+    outcome: Outcome, looked: Looked, item: Reported, logs_fit: list[FlightLog]
+) -> tuple[list[Panel], tuple[str, str]]:
+    """Where an effect shows: residuals of all flights without and with it, against the signal it follows."""
+    hypothesis, search = outcome.hypothesis, outcome.trace.search
+    richer = [(search, hypothesis), (looked.judge, hypothesis)]
+    if item.found is not None and item.found.without is not None:
+        poorer = [(search, item.found.without), (looked.judge, item.found.without)]
+        labels = (f"best model without {item.name}", "corrected model")
+    elif is_fault(item.name):
+        poorer = [(beside(outcome, logs_fit, False), hypothesis), (looked.raw, hypothesis)]
+        labels = "recording as it is", "with the fault taken out"
+    else:
+        return [], ("", "")
+    without, corrected = aligned(_all(poorer), _all(richer))
+    less, more = pool(without), pool(corrected)
+    return [Panel(axis, signal, less, more) for axis, signal in where_it_shows(less, more)], labels
+
+
+def _all(searches: list[tuple[Search, Hypothesis]]) -> list:
+    rows = [residual_rows(search, hypothesis) for search, hypothesis in searches]
+    # A fit flight and a held-out one may have the same name.
+    return [replace(row, name=f"{i} {row.name}") for i, part in enumerate(rows) for row in part]
+
+
+def where_it_shows(less: Pooled, more: Pooled, count: int = PANELS) -> list[tuple[str, str]]:
+    """Residual axes in which two models differ most, with the signal the difference follows best."""
+    sizes = {}
+    for axis, after in more.axes.items():
+        difference = less.axes[axis] - after
+        good = np.isfinite(difference)
+        if good.any() and np.any(difference[good]):
+            sizes[axis] = float(np.mean(difference[good] ** 2) / np.mean(after[good] ** 2))
+    ranked = sorted(sizes, key=lambda axis: -sizes[axis])[:count]
+    found = []
+    for axis in ranked:
+        if sizes[axis] < 0.1 * sizes[ranked[0]]:
+            continue
+        difference = less.axes[axis] - more.axes[axis]
+        shares = {name: explained(difference, signal, less.block)[0] for name, signal in less.drivers.items()}
+        found.append((axis, max(shares, key=shares.get)))
+    return found

@@ -1,0 +1,228 @@
+"""The sections of the report of a closed loop."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model.effects import CATALOGUE
+from cfb_mjx.sysid.evaluation import Evaluation
+from cfb_mjx.sysid.metrics import QUANTITIES
+from cfb_mjx.sysid.tracing.floor import noise_floor
+from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
+from cfb_mjx.view.closing_drawing import Figures
+from cfb_mjx.view.closing_look import Looked
+from cfb_mjx.view.closing_next import next_flights, refused_rows, what_is_left
+from cfb_mjx.view.closing_words import MEANING, change, is_fault, probability, strength, values, with_error
+from cfb_mjx.view.page import Section
+
+Table = tuple[str, list[str], list[list[str]]]
+UNIT = {"m": "m", "mps": "m/s", "deg": "deg", "radps": "rad/s"}
+
+
+def sections(
+    outcome: Outcome, looked: Looked, figures: Figures, logs_fit: list[FlightLog], logs_held_out: list[FlightLog]
+) -> list[Section]:
+    """All of them, in the order they are read."""
+    found = [_missing(outcome, figures), _errors(outcome, looked, figures)]
+    unexplained = getattr(outcome, "unexplained", None)
+    if unexplained:
+        found.append(_unexplained(unexplained))
+    found += [
+        Section("What is left", what_is_left(outcome, looked), figures=figures.get("left", [])),
+        Section("What to fly next", tables=[next_flights(outcome, looked)]),
+        _residuals(looked, figures),
+        _measured(outcome, logs_fit, logs_held_out),
+        _refused(outcome),
+        _per_log(outcome),
+    ]
+    return found
+
+
+def _missing(outcome: Outcome, figures: Figures) -> Section:
+    if not outcome.reported:
+        count = len(outcome.trace.search.names)
+        text = f"None of the {count} effects of the catalogue and no sensor fault was both significant and material."
+        return Section("What is missing", [text])
+    paragraphs, rows = [], []
+    for item in outcome.reported:
+        paragraphs.append(_sentence(item))
+        for label, value, std, unit in values(item):
+            low, high = value - 1.96 * std, value + 1.96 * std
+            rows.append(
+                [
+                    item.name,
+                    label,
+                    with_error(value, std, unit),
+                    f"{low:.4g} to {high:.4g}",
+                    _prior(item.name, label.split()[0]),
+                    probability(item.p_value),
+                ]
+            )
+    caption = (
+        "Value ± standard deviation. p: probability of this much evidence by chance, on the held-out flights "
+        "(of a sensor fault: from comparing the sensors with each other, without any model)."
+    )
+    head = ["effect", "parameter", "value", "95 % interval", "plausible", "p"]
+    shown = [figure for item in outcome.reported for figure in figures.get(item.name, [])]
+    if shown:
+        paragraphs.append(
+            "Figures, one row per effect: mean residual (measured minus modelled) in bins of the signal it follows, "
+            "all flights together, with 95 % intervals. Zero is a perfect model."
+        )
+    return Section("What is missing", paragraphs, [(caption, head, rows)], shown)
+
+
+def _sentence(item: Reported) -> str:
+    text = f"{item.name}: {MEANING.get(item.name, '')}; {strength(item)}."
+    if is_fault(item.name):
+        text += " A fault of the recording, not of the drone: it is taken out before the physics is judged."
+    else:
+        formula = " ".join((CATALOGUE[item.name].__doc__ or "").split("\n\n")[0].split())
+        text += f" In the model: {formula}"
+    if item.found is not None:
+        text += f" Without it one prediction error of the fit flights grows by {_grows(item.found.buys)}."
+        if item.found.confusable:
+            names = ", ".join([item.name, *item.found.confusable])
+            text += f" These flights cannot tell which of this set it is: {names}."
+    return text
+
+
+def _grows(buys: float) -> str:
+    """A share of the error without an effect, as growth of the error with it."""
+    growth = 1 / max(1 - buys, 1e-9) - 1
+    return f"{100 * growth:.0f} %" if growth < 2 else f"a factor of {1 + growth:.1f}"
+
+
+def _prior(name: str, field: str) -> str:
+    low_high = None if is_fault(name) else CATALOGUE[name].prior.get(field)
+    return "" if low_high is None else f"{low_high[0]:g} to {low_high[1]:g}"
+
+
+def _errors(outcome: Outcome, looked: Looked, figures: Figures) -> Section:
+    text = (
+        "Open-loop predictions of flights nothing was fitted to, commands in. Bars are 95 % bootstrap intervals over "
+        "windows. Hold: constant velocity and body rate. Noise floor (dashed): what a perfect model would score, "
+        "because its start and the truth are measured; white noise of each column carried forward to first order "
+        "(gyro noise times horizon adds to attitude, a wrong attitude tilts the thrust, and so on). Dotted: the same "
+        "with random forces and torques of the size these flights show, which no model predicts."
+    )
+    windows = sum(len(log.windows) for log in outcome.before.logs)
+    caption = f"RMS errors over {windows} windows of {len(outcome.before.logs)} held-out flights, with 95 % intervals"
+    rows = _rows(outcome.before, outcome.after, looked.floor, looked.random)
+    head = ["error of", "ahead", "before", "after", "change", "hold", "noise floor", "noise and disturbances"]
+    tables = [(caption, head, rows)]
+    speed = outcome.before.metrics("rotor_speed_in"), outcome.after.metrics("rotor_speed_in")
+    if all(speed):
+        tables.append(_speed_in(*speed))
+    return Section("Error on held-out flights", [text], tables, figures["errors"])
+
+
+def _rows(before: Evaluation, after: Evaluation, floor: dict, random: dict | None) -> list[list[str]]:
+    found = []
+    spans = {name: e.intervals(v) for name, e, v in _kinds(before, after)}
+    middle = {name: e.metrics(v) for name, e, v in _kinds(before, after)}
+    for quantity, unit in QUANTITIES.items():
+        for horizon in before.horizons:
+            key = f"{quantity}_rmse_{unit}@{horizon:g}s"
+            cell = {name: f"{middle[name][key]:.3g} [{_span(spans[name][key])}]" for name in middle}
+            row = [f"{quantity}, {UNIT[unit]}", f"{1e3 * horizon:.0f} ms", cell["before"], cell["after"]]
+            row += [change(middle["before"][key], middle["after"][key]), cell["hold"], f"{floor[key]:.3g}"]
+            found.append(row if random is None else [*row, f"{random[key]:.3g}"])
+    return found
+
+
+def _kinds(before: Evaluation, after: Evaluation):
+    return ("before", before, "commands_in"), ("after", after, "commands_in"), ("hold", before, "hold")
+
+
+def _span(ends: list[float]) -> str:
+    return f"{ends[0]:.3g}, {ends[1]:.3g}"
+
+
+def _speed_in(before: dict, after: dict) -> Table:
+    keys = [key for key in before if "_rmse_" in key and key.endswith(("@0.2s", "@0.5s"))]
+    rows = []
+    for key in keys:
+        quantity, _, unit = key.partition("@")[0].split("_")
+        cells = [f"{before[key]:.3g}", f"{after[key]:.3g}", change(before[key], after[key])]
+        rows.append([f"{quantity}, {UNIT[unit]}", f"{1e3 * float(key.partition('@')[2][:-1]):.0f} ms", *cells])
+    caption = "The same with measured rotor speed in instead of commands: motors and their controllers play no part"
+    return caption, ["error of", "ahead", "before", "after", "change"], rows
+
+
+def _unexplained(found) -> Section:
+    lead = (
+        "A structured residual remains that no effect of the catalogue accounts for. Terms that describe it, fitted "
+        "blindly: a description of the data, not physics."
+    )
+    rows = [[str(text)] for text in getattr(found, "formulas", None) or []]
+    tables = [("Terms", ["term"], rows)] if rows else []
+    return Section("Unexplained", [lead, str(getattr(found, "where", "") or "")], tables)
+
+
+def _residuals(looked: Looked, figures: Figures) -> Section:
+    paragraphs = [
+        "Residuals of the held-out flights are measured minus modelled, given where the drone really was: torque (as "
+        "angular acceleration, from the gyro), force (specific force, from the accelerometer; body axes), rotor speed "
+        "(where measured) and the prediction 0.2 s ahead. Both sides pass through one zero-phase Gaussian of 20 ms.",
+        "First figure: how much of each residual's mean square a signal explains on stretches left out, in % of the "
+        "mean square before; blanks are below 3 %. Offset: its mean. A column that stays dark on the right is "
+        "something not accounted for. Second figure: spectra, with what white noise of the sensors leaves.",
+    ]
+    before, after = looked.structure
+    units = looked.pooled[0].units | looked.predictions[0].units
+    rows = [
+        [axis, units[axis], f"{a:.3g}", f"{b:.3g}", change(a, b)]
+        for axis, a, b in zip(before.axes, before.rms, after.rms, strict=True)
+        if np.isfinite(a)
+    ]
+    tables = [("Size of the residuals, RMS", ["residual", "unit", "before", "after", "change"], rows)]
+    return Section("Residuals and what they follow", paragraphs, tables, figures["residuals"])
+
+
+def _measured(outcome: Outcome, logs_fit: list[FlightLog], logs_held_out: list[FlightLog]) -> Section:
+    rows = []
+    for use, logs in (("fit", logs_fit), ("held out", logs_held_out)):
+        for log in logs:
+            speed, turn = (np.linalg.norm(x, axis=1).max() for x in (log.velocity, log.body_rate))
+            height = f"{log.position[:, 2].min():.2f} to {log.position[:, 2].max():.2f}"
+            rows.append([log.name, use, f"{log.duration:.1f}", f"{1 / log.nominal_interval:.0f}", f"{speed:.1f}"])
+            rows[-1] += [f"{turn:.1f}", height, _yes(log.rotor_speed), _yes(log.battery_voltage), str(len(log.gaps()))]
+    head = ["flight", "use", "s", "rows/s", "top m/s", "top rad/s", "height, m", "rotor speed", "voltage", "gaps"]
+    looked = [
+        [name, with_error(*pair, "" if name.endswith("scale") else "s")]
+        for name, pair in outcome.trace.sensors.measured.items()
+    ]
+    delay = 1e3 * outcome.trace.search.delay
+    text = f"Pose and velocity rows are taken to be {delay:.0f} ms late, as declared; the rest is compared below."
+    sensors = ("Sensors compared with each other, no model involved", ["fault", "found"], looked)
+    return Section("What was measured", [text], [("Flights", head, rows), sensors])
+
+
+def _yes(column) -> str:
+    return "no" if column is None else "yes"
+
+
+def _refused(outcome: Outcome) -> Section:
+    text = (
+        "Every effect of the catalogue was tried in every round, on blocks of the fit flights left out. To be reported "
+        "it must be significant there, lower a prediction error, and stand on the held-out flights."
+    )
+    head = ["effect", "gain, nats", "p", "why not"]
+    caption = "Effects not reported, at their last try (gain in log-likelihood on blocks left out)"
+    return Section("Tried and refused", [text], [(caption, head, refused_rows(outcome))])
+
+
+def _per_log(outcome: Outcome) -> Section:
+    tables = []
+    head = ["error of", "ahead", "before", "after", "change", "hold", "noise floor"]
+    for old, new in zip(outcome.before.logs, outcome.after.logs, strict=True):
+        if not len(old.windows):
+            continue
+        before, after = replace(outcome.before, logs=(old,)), replace(outcome.after, logs=(new,))
+        rows = _rows(before, after, noise_floor(after), None)
+        tables.append((f"{old.log.name}, {len(old.windows)} windows", head, rows))
+    return Section("Every held-out flight", ["RMS errors with 95 % intervals."], tables)
