@@ -325,11 +325,11 @@ def _steered(effect, parameters, target, speed, memory=()):
 
 
 def test_asymmetry_is_a_time_constant_each_way(guards, fly_fleet):
-    motors, _ = _steered(MotorAsymmetry(0.3), guards, [2000.0, 1000.0, 1500.0, 1550.0], np.full(4, 1500.0))
+    motors, _ = _steered(MotorAsymmetry(-0.3, 0.3, 50.0), guards, [2000.0, 1000.0, 1500.0, 1550.0], np.full(4, 1500.0))
     wanted = [0.05 * 0.7, 0.05 * 1.3, 0.05, 0.05 * (1 - 0.3 * np.tanh(1.0))]
     np.testing.assert_allclose(motors.time_constant.stack(), wanted, rtol=1e-6)
     # And in flight: eq. 5 with the other lag, as long as the target is far.
-    model = Quadrotor(guards, (MotorAsymmetry(0.3),))
+    model = Quadrotor(guards, (MotorAsymmetry(-0.3, 0.3),))
     y = np.zeros(17)
     y[6], y[13:] = 1.0, 1450.0
     flown = fly_fleet(_batch([model]), helpers.state_of(y), jnp.tile(jnp.array([1.0, 0.0, 1.0, 0.0]), (5, 1)))

@@ -39,7 +39,7 @@ def write_report(
     folder = Path(folder)
     looked = look(outcome, logs_held_out)
     with tempfile.TemporaryDirectory() as scratch:
-        figures = draw(outcome, looked, logs_fit, Path(scratch))
+        figures = draw(outcome, looked, Path(scratch))
         found = sections(outcome, looked, figures, logs_fit, logs_held_out)
         page = html_page(f"Closing the loop on {outcome.base.name}", verdict(outcome), found, facts)
     write_recording(folder / "residual.rrd", looked.rows, outcome.before, outcome.after)

@@ -2,44 +2,47 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from cfb_mjx.logs import FlightLog
 from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
 from cfb_mjx.sysid.tracing.residuals import aligned, residual_rows
-from cfb_mjx.sysid.tracing.search import Hypothesis, Search
+from cfb_mjx.sysid.tracing.search import Hypothesis
 from cfb_mjx.sysid.tracing.spectra import sensor_spectra, spectra
-from cfb_mjx.sysid.tracing.structure import Pooled, explained, pool
+from cfb_mjx.sysid.tracing.structure import BINS, Pooled, explained, pool
 from cfb_mjx.view.closing_figures import Panel, binned_figure, errors_figure, matrix_figure, spectra_figure
-from cfb_mjx.view.closing_look import Looked, beside
-from cfb_mjx.view.closing_words import is_fault
+from cfb_mjx.view.closing_look import PREDICTION_BINS, Looked
 
 PANELS = 3
 """Of one figure at most."""
 Figures = dict[str, list[tuple[Path, str]]]
 
 
-def draw(outcome: Outcome, looked: Looked, logs_fit: list[FlightLog], folder: Path) -> Figures:
-    """Figures as files with alternative texts, under ``errors``, ``residuals``, ``left`` and the name of each effect.
+def draw(outcome: Outcome, looked: Looked, folder: Path) -> Figures:
+    """Figures as files with alternative texts.
+
+    Under ``errors``, ``residuals``, ``left``, ``unexplained`` (the last two if there is anything) and effects' names.
 
     Args:
         outcome: of the closed loop.
         looked: `look`.
-        logs_fit: flights that were learned from, as read.
         folder: to write into.
     """
     figures: Figures = {"errors": [(folder / "errors.svg", "held-out error against horizon, before and after")]}
     errors_figure(outcome.before, outcome.after, looked.floor, looked.random, figures["errors"][0][0])
     for item in outcome.reported:
-        panels, labels = _effect(outcome, looked, item, logs_fit)
+        panels, labels = _effect(outcome, looked, item)
         if panels:
             path = folder / f"{item.name}.svg"
             binned_figure(panels, labels, path)
             what = ", ".join(f"{p.axis} against {p.signal}" for p in panels)
             figures[item.name] = [(path, f"{item.name}: {what}, {labels[0]} and {labels[1]}")]
+    without = getattr(getattr(outcome, "unexplained", None), "without", None)
+    panels = _compared(outcome, looked, without) if without is not None else []
+    if panels:
+        binned_figure(panels, ("without the terms", "with them"), folder / "unexplained.svg")
+        figures["unexplained"] = [(folder / "unexplained.svg", "residuals without and with the terms found")]
     matrix_figure(*looked.structure, folder / "matrix.svg")
     figures["residuals"] = [
         (folder / "matrix.svg", "share of each residual that follows each signal, before and after")
@@ -52,7 +55,8 @@ def draw(outcome: Outcome, looked: Looked, logs_fit: list[FlightLog], folder: Pa
         Panel(axis, name if name in looked.pair(axis)[0].drivers else "time", *looked.pair(axis)) for axis, name in left
     ]
     if panels:
-        binned_figure(panels, ("before", "after"), folder / "left.svg")
+        # Beside what was there before, little of it would be seen.
+        binned_figure(panels, ("", "after"), folder / "left.svg")
         figures["left"] = [(folder / "left.svg", "the strongest structure left in the residuals")]
     return figures
 
@@ -69,32 +73,35 @@ def _spectra(looked: Looked, path: Path) -> list[tuple[Path, str]]:
     return [(path, "spectra of the residuals before and after")]
 
 
-def _effect(
-    outcome: Outcome, looked: Looked, item: Reported, logs_fit: list[FlightLog]
-) -> tuple[list[Panel], tuple[str, str]]:
+def _effect(outcome: Outcome, looked: Looked, item: Reported) -> tuple[list[Panel], tuple[str, str]]:
     """Where an effect shows: residuals of all flights without and with it, against the signal it follows."""
-    hypothesis, search = outcome.hypothesis, outcome.trace.search
-    richer = [(search, hypothesis), (looked.judge, hypothesis)]
-    if item.found is not None and item.found.without is not None:
-        poorer = [(search, item.found.without), (looked.judge, item.found.without)]
-        labels = (f"best model without {item.name}", "corrected model")
-    elif is_fault(item.name):
-        poorer = [(beside(outcome, logs_fit, False), hypothesis), (looked.raw, hypothesis)]
-        labels = "recording as it is", "with the fault taken out"
-    else:
-        return [], ("", "")
-    without, corrected = aligned(_all(poorer), _all(richer))
-    less, more = pool(without), pool(corrected)
-    return [Panel(axis, signal, less, more) for axis, signal in where_it_shows(less, more)], labels
+    if item.found is None or item.found.without is None:
+        # A fault of pose or gyro hardly touches forces and torques; it spoils predictions.
+        less, more = looked.predictions
+        return _panels(less, more, PREDICTION_BINS), ("before", "after")
+    without = item.found.without
+    if getattr(outcome, "unexplained", None):
+        # That was fitted before the formula; beside it only this effect may go.
+        without = outcome.hypothesis.without(item.name)
+    return _compared(outcome, looked, without), (f"best model without {item.name}", "corrected model")
 
 
-def _all(searches: list[tuple[Search, Hypothesis]]) -> list:
-    rows = [residual_rows(search, hypothesis) for search, hypothesis in searches]
-    # A fit flight and a held-out one may have the same name.
-    return [replace(row, name=f"{i} {row.name}") for i, part in enumerate(rows) for row in part]
+def _compared(outcome: Outcome, looked: Looked, without: Hypothesis) -> list[Panel]:
+    """Panels of a poorer hypothesis beside the corrected model, on all flights."""
+    searches = outcome.trace.search, looked.judge
+    less, more = (
+        [row for search in searches for row in residual_rows(search, hypothesis)]
+        for hypothesis in (without, outcome.hypothesis)
+    )
+    less, more = aligned(less, more)
+    return _panels(pool(less), pool(more))
 
 
-def where_it_shows(less: Pooled, more: Pooled, count: int = PANELS) -> list[tuple[str, str]]:
+def _panels(less: Pooled, more: Pooled, bins: int = BINS) -> list[Panel]:
+    return [Panel(axis, signal, less, more) for axis, signal in where_it_shows(less, more, bins)]
+
+
+def where_it_shows(less: Pooled, more: Pooled, bins: int = BINS, count: int = PANELS) -> list[tuple[str, str]]:
     """Residual axes in which two models differ most, with the signal the difference follows best."""
     sizes = {}
     for axis, after in more.axes.items():
@@ -108,6 +115,6 @@ def where_it_shows(less: Pooled, more: Pooled, count: int = PANELS) -> list[tupl
         if sizes[axis] < 0.1 * sizes[ranked[0]]:
             continue
         difference = less.axes[axis] - more.axes[axis]
-        shares = {name: explained(difference, signal, less.block)[0] for name, signal in less.drivers.items()}
+        shares = {name: explained(difference, signal, less.block, bins)[0] for name, signal in less.drivers.items()}
         found.append((axis, max(shares, key=shares.get)))
     return found

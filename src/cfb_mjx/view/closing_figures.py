@@ -10,11 +10,13 @@ import numpy as np
 
 from cfb_mjx.sysid.metrics import QUANTITIES
 from cfb_mjx.sysid.tracing.residuals import UNITS
-from cfb_mjx.sysid.tracing.structure import Pooled, Structure, binned, edges_of
+from cfb_mjx.sysid.tracing.structure import Pooled, Structure, binned
 from cfb_mjx.view import style
 
 BEFORE, AFTER = style.COLOURS["rotor_speed_in"], style.COLOURS["commands_in"]
 RANDOM = "#009E73"
+FEW = 2000
+"""Values below which bins are wider: one value per window instead of one per row."""
 _TITLES = {"position": "position, m", "velocity": "velocity, m/s", "attitude": "attitude, deg", "rate": "rate, rad/s"}
 
 
@@ -72,6 +74,11 @@ def errors_figure(before, after, floor: dict[str, float], random: dict[str, floa
         style.save(figure, path)
 
 
+def squared(unit: str) -> str:
+    """A unit as printed: with raised exponents."""
+    return unit.replace("^2", "²")
+
+
 @dataclass(frozen=True)
 class Panel:
     """One residual axis against one signal, of two models on the same flights."""
@@ -87,7 +94,7 @@ def binned_figure(panels: Sequence[Panel], labels: tuple[str, str], path: Path) 
 
     Args:
         panels: what to draw, side by side.
-        labels: of the two models.
+        labels: of the two models; one without a label is not drawn.
         path: file to write.
     """
     with style.context():
@@ -106,12 +113,16 @@ def binned_figure(panels: Sequence[Panel], labels: tuple[str, str], path: Path) 
 
 
 def _binned(drawn, panel: Panel, labels: tuple[str, str]) -> None:
-    one_per_window = len(panel.before.block) < 2000
-    edges = edges_of(panel.before.drivers[panel.signal], 6 if one_per_window else 12)
+    signal = panel.before.drivers[panel.signal]
+    # Evenly spaced, or a flight that mostly hovers would have all its bins in the middle.
+    count = 6 if len(signal) < FEW else 12
+    edges = np.linspace(*np.nanquantile(signal, [0.005, 0.995]), count + 1)
     for pooled, colour, marker, label in (
         (panel.before, BEFORE, "s", labels[0]),
         (panel.after, AFTER, "o", labels[1]),
     ):
+        if not label:
+            continue
         found = binned(pooled.axes[panel.axis], pooled.drivers[panel.signal], pooled.block, edges)
         drawn.errorbar(
             found.center,
@@ -125,8 +136,8 @@ def _binned(drawn, panel: Panel, labels: tuple[str, str]) -> None:
             label=label,
         )
     drawn.axhline(0, color=style.MEASURED, linewidth=0.8)
-    drawn.set_xlabel(f"{panel.signal}, {UNITS[panel.signal]}")
-    drawn.set_ylabel(f"{panel.axis}, {panel.before.units[panel.axis]}")
+    drawn.set_xlabel(f"{panel.signal}, {squared(UNITS[panel.signal])}")
+    drawn.set_ylabel(f"{panel.axis}, {squared(panel.before.units[panel.axis])}")
 
 
 def matrix_figure(before: Structure, after: Structure, path: Path) -> None:
@@ -175,7 +186,9 @@ def spectra_figure(
         units: of the axes.
         path: file to write.
     """
-    axes = list(before)
+    from matplotlib.ticker import NullFormatter
+
+    axes, ticks = list(before), [0.25, 0.5, 1, 2, 5, 10]
     rows = -(-len(axes) // 3)
     with style.context():
         figure = style.new_figure(13.6, 2.75 * rows + 0.45)
@@ -191,8 +204,13 @@ def spectra_figure(
             panel.set_xscale("log")
             panel.set_yscale("log")
             # Far below everything else the filter alone is seen.
-            panel.set_ylim(bottom=0.3 * min(before[axis][1].min(), after[axis][1].min()))
-            panel.set_title(f"{axis}, ({units[axis]})²/Hz")
+            low = min(before[axis][1].min(), after[axis][1].min())
+            high = max(before[axis][1].max(), after[axis][1].max())
+            panel.set_ylim(0.3 * low, 3 * max(high, 30 * low))
+            panel.set_title(f"{axis}, ({squared(units[axis])})²/Hz")
+            panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+            panel.xaxis.minorticks_off()
+            panel.yaxis.set_minor_formatter(NullFormatter())
         for panel in panels[len(axes) :]:
             panel.set_visible(False)
         for panel in panels[max(0, len(axes) - 3) : len(axes)]:

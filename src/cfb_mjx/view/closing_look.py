@@ -15,7 +15,7 @@ from cfb_mjx.sysid.tracing.residuals import Residuals, aligned, residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.structure import Pooled, Structure, pool, pool_predictions, structure
-from cfb_mjx.sysid.tracing.whitening import levels_from
+from cfb_mjx.sysid.tracing.whitening import FIRST, levels_from
 
 PREDICTION_BINS = 4
 """Bins of a signal where there is one value per window only."""
@@ -27,7 +27,6 @@ class Looked:
 
     Attributes:
         judge: the search on these flights, with the recording's faults taken out.
-        raw: the same with the faults left in.
         rows: residuals of each flight.
         pooled: the same in one piece.
         predictions: errors of predictions, in one piece.
@@ -37,7 +36,6 @@ class Looked:
     """
 
     judge: Search
-    raw: Search
     rows: tuple[list[Residuals], list[Residuals]]
     pooled: tuple[Pooled, Pooled]
     predictions: tuple[Pooled, Pooled]
@@ -50,7 +48,7 @@ class Looked:
         return self.predictions if axis in self.predictions[0].axes else self.pooled
 
 
-def beside(outcome: Outcome, logs: list[FlightLog], repaired: bool) -> Search:
+def _beside(outcome: Outcome, logs: list[FlightLog], repaired: bool) -> Search:
     """The search on other flights, with the faults the fit flights showed taken out or left in."""
     search = outcome.trace.search
     check = check_sensors(logs, search.delay)
@@ -59,7 +57,7 @@ def beside(outcome: Outcome, logs: list[FlightLog], repaired: bool) -> Search:
 
 def look(outcome: Outcome, logs: list[FlightLog]) -> Looked:
     """Residuals and predictions of the held-out ``logs``."""
-    judge, raw = beside(outcome, logs, True), beside(outcome, logs, False)
+    judge, raw = _beside(outcome, logs, True), _beside(outcome, logs, False)
     hypothesis = outcome.hypothesis
     # Commands missing between rows are no effect: both models get the same share of them.
     declared = replace(judge.nothing(), lead=hypothesis.lead)
@@ -67,9 +65,11 @@ def look(outcome: Outcome, logs: list[FlightLog]) -> Looked:
     pooled = pool(rows[0]), pool(rows[1])
     predictions = pool_predictions(outcome.before, rows[0]), pool_predictions(outcome.after, rows[1])
     found = [_stacked(structure(p), structure(q, PREDICTION_BINS)) for p, q in zip(pooled, predictions, strict=True)]
-    judge.learn_levels(hypothesis)
-    random = noise_floor(outcome.after, levels_from(jnp.asarray(judge.levels), judge.noise))
-    return Looked(judge, raw, rows, pooled, predictions, (found[0], found[1]), noise_floor(outcome.after), random)
+    # Predictions have commands in; measured rotor speeds would bring noise of their own.
+    blind = replace(judge, logs=[log.replace(rotor_speed=None) for log in judge.logs], levels=FIRST.copy(), _flights={})
+    blind.learn_levels(hypothesis)
+    random = noise_floor(outcome.after, levels_from(jnp.asarray(blind.levels), blind.noise))
+    return Looked(judge, rows, pooled, predictions, (found[0], found[1]), noise_floor(outcome.after), random)
 
 
 def _stacked(a: Structure, b: Structure) -> Structure:

@@ -5,8 +5,9 @@ from __future__ import annotations
 from cfb_mjx.sysid.metrics import QUANTITIES
 from cfb_mjx.sysid.tracing.outcome import Outcome
 from cfb_mjx.sysid.tracing.trace import ALPHA, LEAST_GAIN, MATERIAL
+from cfb_mjx.view.closing_figures import squared
 from cfb_mjx.view.closing_look import Looked
-from cfb_mjx.view.closing_words import EXPERIMENTS, FOLLOWS, probability, values
+from cfb_mjx.view.closing_words import EXPERIMENTS, FOLLOWS, numbers, probability
 
 UNSURE = 0.2
 """Relative standard deviation above which more flights of an effect's kind are asked for."""
@@ -31,63 +32,62 @@ def what_is_left(outcome: Outcome, looked: Looked) -> list[str]:
 def _size(looked: Looked, index: int) -> str:
     after = looked.structure[1]
     axis = after.axes[index]
-    return f"{after.rms[index]:.2g} {looked.pair(axis)[1].units[axis]}"
+    return f"{after.rms[index]:.2g} {squared(looked.pair(axis)[1].units[axis])}"
 
 
 def _budget(outcome: Outcome, looked: Looked) -> str:
     horizon = max(outcome.after.horizons)
-    errors, parts = outcome.after.metrics("commands_in"), []
+    errors = outcome.after.metrics("commands_in")
+    sensors, wandering = [], []
     for quantity, unit in QUANTITIES.items():
         key = f"{quantity}_rmse_{unit}@{horizon:g}s"
-        total = errors[key] ** 2
-        sensors = min(1.0, looked.floor[key] ** 2 / total)
-        disturbed = min(1.0, max(looked.random[key], looked.floor[key]) ** 2 / total)
-        parts.append(
-            f"{quantity} {100 * sensors:.0f} / {100 * (disturbed - sensors):.0f} / {100 * (1 - disturbed):.0f} %"
-        )
+        for found, floor in ((sensors, looked.floor[key]), (wandering, max(looked.floor[key], looked.random[key]))):
+            found.append(f"{quantity} {100 * min(1.0, floor**2 / errors[key] ** 2):.0f} %")
     return (
-        f"Of the squared error {horizon:g} s ahead: sensor noise / random disturbances of the size seen / the rest: "
-        + ", ".join(parts)
-        + ". Only the rest is left to a better model; disturbances are what varies without following any signal, and "
-        "would shrink if their cause were measured."
+        f"Where the remaining error comes from: of its square {horizon:g} s ahead, sensor noise makes "
+        f"{', '.join(sensors)}. Sensor noise together with forces and torques that wander as these residuals do makes "
+        f"{', '.join(wandering)}. What wanders without following a measured signal no model predicts; any structure "
+        "named above is part of it and could still be taken out."
     )
 
 
-def next_flights(outcome: Outcome, looked: Looked) -> tuple[str, list[str], list[list[str]]]:
-    """A table: what is not known well enough yet, and the flight that would tell."""
-    rows: list[list[str]] = []
+def next_flights(outcome: Outcome, looked: Looked) -> list[str]:
+    """Flights that would tell what is not known well enough yet, each with its reason, the most useful first."""
+    flights: dict[str, list[str]] = {}
 
-    def ask(why: str, flight: str) -> None:
-        if flight not in [row[1] for row in rows]:
-            rows.append([why, flight])
+    def fly(what: str, because: str) -> None:
+        flights.setdefault(what, []).append(because)
 
     for item in outcome.reported:
         rivals = [] if item.found is None else item.found.confusable
         for name in [item.name, *rivals] if rivals else []:
-            ask(f"{', '.join([item.name, *rivals])} look alike: show {name}", EXPERIMENTS.get(name, ""))
-        for label, value, std, _ in values(item):
-            if std > UNSURE * abs(value) and label == max(values(item), key=lambda v: abs(v[1]))[0]:
-                ask(f"{item.name} {label} is known to {100 * std / abs(value):.0f} % only", EXPERIMENTS[item.name])
+            others = ", ".join(other for other in [item.name, *rivals] if other != name)
+            fly(EXPERIMENTS.get(name, "flights of another kind"), f"this shows {name}, and not {others}")
+        main = max(numbers(item), key=lambda number: abs(number.value))
+        if main.std > UNSURE * abs(main.value):
+            share = 100 * main.std / max(abs(main.value), 1e-300)
+            fly(EXPERIMENTS[item.name], f"{item.name} is known to {share:.0f} % only")
     for item in outcome.unconfirmed:
-        ask(f"{item.name} was not confirmed on held-out flights", EXPERIMENTS[item.name])
+        fly(EXPERIMENTS[item.name], f"{item.name} was found, but not confirmed on held-out flights")
     after = looked.structure[1]
     for i, j in after.strongest(3):
         signal = after.signals[j]
-        flight = next(text for key, text in FOLLOWS.items() if signal.startswith(key))
-        ask(f"{after.axes[i]} still follows {signal}", flight)
+        fly(next(text for key, text in FOLLOWS.items() if signal.startswith(key)), f"{after.axes[i]} follows {signal}")
     logs = [*outcome.trace.search.logs, *looked.judge.logs]
-    if any(log.rotor_speed is None for log in logs):
-        count = sum(log.rotor_speed is None for log in logs)
-        ask(f"{count} of {len(logs)} flights lack rotor speed", "log it: it separates the motors from the aerodynamics")
-    if any(log.battery_voltage is None for log in logs):
-        ask("some flights lack the battery's voltage", "log it: without it battery_sag cannot be seen")
-    if not rows:
-        ask("nothing is open", "flights unlike these: faster, lower, longer; what was not flown was not tested")
-    return "In the order they would help", ["open", "fly"], rows
+    for column, name, why in (
+        ("rotor_speed", "rotor speed", "it separates the motors from the aerodynamics"),
+        ("battery_voltage", "the battery's voltage", "without it battery_sag cannot be seen"),
+    ):
+        lacking = sum(getattr(log, column) is None for log in logs)
+        if lacking:
+            fly(f"any flight with {name} logged, which {lacking} of {len(logs)} lack", why)
+    if not flights:
+        return ["Flights unlike these: faster, lower, longer. What was not flown was not tested."]
+    return [f"{what[0].upper()}{what[1:]}. Why: {'; '.join(why)}." for what, why in flights.items()]
 
 
-def refused_rows(outcome: Outcome) -> list[list[str]]:
-    """Effect, gain, p-value and reason of everything that was looked at and not reported, most nearly found first."""
+def refused(outcome: Outcome) -> tuple[list[list[str]], list[str]]:
+    """What was not reported: effect, gain, p-value and reason, most nearly found first; and names never near."""
     reported = {item.name for item in outcome.reported}
     unconfirmed = {item.name: item for item in outcome.unconfirmed}
     last: dict[str, dict] = {}
@@ -117,6 +117,4 @@ def refused_rows(outcome: Outcome) -> list[list[str]]:
             why = "less than another effect"
         rows.append([name, f"{line['gain']:.1f}", probability(line["p_value"]), why])
     others = sorted(set(outcome.trace.search.names) - set(last) - reported)
-    if others:
-        rows.append([", ".join(others), "", "", "never among the first"])
-    return rows
+    return rows, others

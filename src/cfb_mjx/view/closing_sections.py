@@ -13,9 +13,10 @@ from cfb_mjx.sysid.metrics import QUANTITIES
 from cfb_mjx.sysid.tracing.floor import noise_floor
 from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
 from cfb_mjx.view.closing_drawing import Figures
+from cfb_mjx.view.closing_figures import squared
 from cfb_mjx.view.closing_look import Looked
-from cfb_mjx.view.closing_next import next_flights, refused_rows, what_is_left
-from cfb_mjx.view.closing_words import MEANING, change, is_fault, probability, strength, values, with_error
+from cfb_mjx.view.closing_next import next_flights, refused, what_is_left
+from cfb_mjx.view.closing_words import MEANING, change, is_fault, numbers, probability, strength, with_error
 from cfb_mjx.view.page import Section
 
 Table = tuple[str, list[str], list[list[str]]]
@@ -26,19 +27,41 @@ def sections(
     outcome: Outcome, looked: Looked, figures: Figures, logs_fit: list[FlightLog], logs_held_out: list[FlightLog]
 ) -> list[Section]:
     """All of them, in the order they are read."""
-    found = [_missing(outcome, figures), _errors(outcome, looked, figures)]
+    found = [_short(logs_fit, logs_held_out), _missing(outcome, figures), _errors(figures)]
     unexplained = getattr(outcome, "unexplained", None)
     if unexplained:
-        found.append(_unexplained(unexplained))
+        found.append(_unexplained(unexplained, figures))
     found += [
         Section("What is left", what_is_left(outcome, looked), figures=figures.get("left", [])),
-        Section("What to fly next", tables=[next_flights(outcome, looked)]),
+        Section("What to fly next", next_flights(outcome, looked)),
+        _numbers(outcome, looked),
         _residuals(looked, figures),
         _measured(outcome, logs_fit, logs_held_out),
         _refused(outcome),
         _per_log(outcome),
     ]
     return found
+
+
+def _short(logs_fit: list[FlightLog], logs_held_out: list[FlightLog]) -> Section:
+    logs = [*logs_fit, *logs_held_out]
+    seconds = [sum(log.duration for log in group) for group in (logs_fit, logs_held_out)]
+    speed = max(np.linalg.norm(log.velocity, axis=1).max() for log in logs)
+    turn = max(np.linalg.norm(log.body_rate, axis=1).max() for log in logs)
+    low, high = min(log.position[:, 2].min() for log in logs), max(log.position[:, 2].max() for log in logs)
+    rows = np.median([1 / log.nominal_interval for log in logs])
+    text = (
+        f"{len(logs_fit)} flights to learn from ({seconds[0]:.0f} s) and {len(logs_held_out)} to be judged on "
+        f"({seconds[1]:.0f} s), {rows:.0f} rows per second; up to {speed:.1f} m/s and {turn:.1f} rad/s, {low:.2f} to "
+        f"{high:.2f} m high. Rotor speed was measured in {_how_many(logs, 'rotor_speed')} of them, the battery's voltage "
+        f"in {_how_many(logs, 'battery_voltage')}. Each flight is listed below."
+    )
+    return Section("What was measured", [text])
+
+
+def _how_many(logs: list[FlightLog], column: str) -> str:
+    count = sum(getattr(log, column) is not None for log in logs)
+    return {len(logs): "all", 0: "none"}.get(count, f"{count} of {len(logs)}")
 
 
 def _missing(outcome: Outcome, figures: Figures) -> Section:
@@ -49,18 +72,11 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
     paragraphs, rows = [], []
     for item in outcome.reported:
         paragraphs.append(_sentence(item))
-        for label, value, std, unit in values(item):
-            low, high = value - 1.96 * std, value + 1.96 * std
-            rows.append(
-                [
-                    item.name,
-                    label,
-                    with_error(value, std, unit),
-                    f"{low:.4g} to {high:.4g}",
-                    _prior(item.name, label.split()[0]),
-                    probability(item.p_value),
-                ]
-            )
+        for number in numbers(item):
+            low, high = number.value - 1.96 * number.std, number.value + 1.96 * number.std
+            plausible = "" if number.plausible is None else "{:g} to {:g}".format(*number.plausible)
+            span = f"{low:.4g} to {high:.4g}"
+            rows.append([item.name, number.label, str(number), span, plausible, probability(item.p_value)])
     caption = (
         "Value ± standard deviation. p: probability of this much evidence by chance, on the held-out flights "
         "(of a sensor fault: from comparing the sensors with each other, without any model)."
@@ -69,8 +85,9 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
     shown = [figure for item in outcome.reported for figure in figures.get(item.name, [])]
     if shown:
         paragraphs.append(
-            "Figures, one row per effect: mean residual (measured minus modelled) in bins of the signal it follows, "
-            "all flights together, with 95 % intervals. Zero is a perfect model."
+            "Figures, one row each: mean residual (measured minus modelled) in bins of the signal it follows, with 95 % "
+            "intervals; zero is a perfect model. Effects: force, torque or rotor speed in all flights. Faults of the "
+            "recording: predictions of the held-out flights 0.2 s ahead."
         )
     return Section("What is missing", paragraphs, [(caption, head, rows)], shown)
 
@@ -96,19 +113,18 @@ def _grows(buys: float) -> str:
     return f"{100 * growth:.0f} %" if growth < 2 else f"a factor of {1 + growth:.1f}"
 
 
-def _prior(name: str, field: str) -> str:
-    low_high = None if is_fault(name) else CATALOGUE[name].prior.get(field)
-    return "" if low_high is None else f"{low_high[0]:g} to {low_high[1]:g}"
-
-
-def _errors(outcome: Outcome, looked: Looked, figures: Figures) -> Section:
+def _errors(figures: Figures) -> Section:
     text = (
         "Open-loop predictions of flights nothing was fitted to, commands in. Bars are 95 % bootstrap intervals over "
         "windows. Hold: constant velocity and body rate. Noise floor (dashed): what a perfect model would score, "
         "because its start and the truth are measured; white noise of each column carried forward to first order "
         "(gyro noise times horizon adds to attitude, a wrong attitude tilts the thrust, and so on). Dotted: the same "
-        "with random forces and torques of the size these flights show, which no model predicts."
+        "with forces and torques that wander at random, as large and as fast as the residuals left on these flights."
     )
+    return Section("Error on held-out flights", [text], figures=figures["errors"])
+
+
+def _numbers(outcome: Outcome, looked: Looked) -> Section:
     windows = sum(len(log.windows) for log in outcome.before.logs)
     caption = f"RMS errors over {windows} windows of {len(outcome.before.logs)} held-out flights, with 95 % intervals"
     rows = _rows(outcome.before, outcome.after, looked.floor, looked.random)
@@ -117,7 +133,7 @@ def _errors(outcome: Outcome, looked: Looked, figures: Figures) -> Section:
     speed = outcome.before.metrics("rotor_speed_in"), outcome.after.metrics("rotor_speed_in")
     if all(speed):
         tables.append(_speed_in(*speed))
-    return Section("Error on held-out flights", [text], tables, figures["errors"])
+    return Section("Held-out errors in numbers", tables=tables)
 
 
 def _rows(before: Evaluation, after: Evaluation, floor: dict, random: dict | None) -> list[list[str]]:
@@ -153,14 +169,15 @@ def _speed_in(before: dict, after: dict) -> Table:
     return caption, ["error of", "ahead", "before", "after", "change"], rows
 
 
-def _unexplained(found) -> Section:
+def _unexplained(found, figures: Figures) -> Section:
     lead = (
         "A structured residual remains that no effect of the catalogue accounts for. Terms that describe it, fitted "
         "blindly: a description of the data, not physics."
     )
     rows = [[str(text)] for text in getattr(found, "formulas", None) or []]
     tables = [("Terms", ["term"], rows)] if rows else []
-    return Section("Unexplained", [lead, str(getattr(found, "where", "") or "")], tables)
+    texts = [text for text in (lead, str(getattr(found, "where", "") or "")) if text]
+    return Section("Unexplained", texts, tables, figures.get("unexplained", []))
 
 
 def _residuals(looked: Looked, figures: Figures) -> Section:
@@ -175,7 +192,7 @@ def _residuals(looked: Looked, figures: Figures) -> Section:
     before, after = looked.structure
     units = looked.pooled[0].units | looked.predictions[0].units
     rows = [
-        [axis, units[axis], f"{a:.3g}", f"{b:.3g}", change(a, b)]
+        [axis, squared(units[axis]), f"{a:.3g}", f"{b:.3g}", change(a, b)]
         for axis, a, b in zip(before.axes, before.rms, after.rms, strict=True)
         if np.isfinite(a)
     ]
@@ -193,13 +210,13 @@ def _measured(outcome: Outcome, logs_fit: list[FlightLog], logs_held_out: list[F
             rows[-1] += [f"{turn:.1f}", height, _yes(log.rotor_speed), _yes(log.battery_voltage), str(len(log.gaps()))]
     head = ["flight", "use", "s", "rows/s", "top m/s", "top rad/s", "height, m", "rotor speed", "voltage", "gaps"]
     looked = [
-        [name, with_error(*pair, "" if name.endswith("scale") else "s")]
-        for name, pair in outcome.trace.sensors.measured.items()
+        [name, with_error(value, std) if name.endswith("scale") else with_error(1e3 * value, 1e3 * std, "ms")]
+        for name, (value, std) in outcome.trace.sensors.measured.items()
     ]
     delay = 1e3 * outcome.trace.search.delay
     text = f"Pose and velocity rows are taken to be {delay:.0f} ms late, as declared; the rest is compared below."
     sensors = ("Sensors compared with each other, no model involved", ["fault", "found"], looked)
-    return Section("What was measured", [text], [("Flights", head, rows), sensors])
+    return Section("Flights and sensors", [text], [("Flights", head, rows), sensors])
 
 
 def _yes(column) -> str:
@@ -213,7 +230,9 @@ def _refused(outcome: Outcome) -> Section:
     )
     head = ["effect", "gain, nats", "p", "why not"]
     caption = "Effects not reported, at their last try (gain in log-likelihood on blocks left out)"
-    return Section("Tried and refused", [text], [(caption, head, refused_rows(outcome))])
+    rows, others = refused(outcome)
+    texts = [text, f"Never among the eight most likely: {', '.join(others)}."] if others else [text]
+    return Section("Tried and refused", texts, [(caption, head, rows)] if rows else [])
 
 
 def _per_log(outcome: Outcome) -> Section:

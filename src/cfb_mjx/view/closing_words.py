@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -92,19 +92,45 @@ def is_fault(name: str) -> bool:
 def unit_of(name: str, field: str) -> str:
     """Unit of a parameter of an effect or fault; empty for plain ratios."""
     unit = FAULT_UNITS[name][1] if is_fault(name) else CATALOGUE[name].units.get(field, "1")
-    return "" if unit == "1" else unit
+    return "" if unit == "1" else unit.replace("^2", "²")
 
 
-def values(item: Reported) -> Iterator[tuple[str, float, float, str]]:
-    """Label, value, standard deviation and unit of every number of an effect."""
+@dataclass(frozen=True)
+class Number:
+    """One number of an effect as printed, in a unit that needs no exponent."""
+
+    label: str
+    value: float
+    std: float
+    unit: str
+    plausible: tuple[float, float] | None
+    """Range the catalogue calls plausible; None for faults of the recording."""
+
+    def __str__(self) -> str:
+        return with_error(self.value, self.std, self.unit)
+
+
+def numbers(item: Reported) -> list[Number]:
+    """Every number of an effect or fault."""
+    found = []
+    prior = {} if is_fault(item.name) else CATALOGUE[item.name].prior
     for field, value in item.parameters.items():
-        unit, deviation = unit_of(item.name, field), item.uncertainty.get(field, np.nan)
-        if not isinstance(value, list):
-            yield field, float(value), float(deviation), unit
-            continue
-        labels = _COMPONENTS.get(len(value), tuple(str(i) for i in range(len(value))))
-        for label, v, s in zip(labels, value, np.broadcast_to(deviation, len(value)), strict=True):
-            yield f"{field} {label}", float(v), float(s), unit
+        several = isinstance(value, list)
+        each = np.atleast_1d(np.asarray(value, dtype=float))
+        deviation = np.broadcast_to(np.asarray(item.uncertainty.get(field, np.nan), dtype=float), each.shape)
+        factor, unit = readable(unit_of(item.name, field), float(np.max(np.abs(each))))
+        labels = _COMPONENTS.get(len(each), tuple(str(i) for i in range(len(each))))
+        low_high = None if field not in prior else (factor * prior[field][0], factor * prior[field][1])
+        for label, v, s in zip(labels, each, deviation, strict=True):
+            name = f"{field} {label}" if several else field
+            found.append(Number(name, factor * float(v), factor * float(s), unit, low_high))
+    return found
+
+
+def readable(unit: str, size: float) -> tuple[float, str]:
+    """Factor and unit in which a small number reads well: ms, mm and g for what is far below s, m and kg."""
+    smaller = {"s": "ms", "m": "mm", "kg": "g"}
+    return (1e3, smaller[unit]) if unit in smaller and size < 0.5 else (1.0, unit)
 
 
 def with_error(value: float, std: float, unit: str = "") -> str:
@@ -126,12 +152,13 @@ def probability(p: float) -> str:
 
 def strength(item: Reported) -> str:
     """All numbers of an effect in one phrase."""
-    return ", ".join(f"{label} {with_error(v, s, unit)}" for label, v, s, unit in values(item))
+    return ", ".join(f"{number.label} {number}" for number in numbers(item))
 
 
 def change(before: float, after: float) -> str:
     """A relative change as printed."""
-    return f"{100 * (after / before - 1):+.0f} %"
+    share = round(100 * (after / before - 1))
+    return f"{share:+d} %" if share else "0 %"
 
 
 def verdict(outcome: Outcome) -> str:
@@ -141,22 +168,36 @@ def verdict(outcome: Outcome) -> str:
     parts = []
     if len(physics) == 1:
         (item,) = physics
-        parts.append(f"The drone flies with {item.name} the model lacks ({MEANING[item.name]}): {strength(item)}.")
+        parts.append(
+            f"The drone flies with {item.name} the model lacks ({MEANING.get(item.name, 'no description')}): "
+            f"{strength(item)}{_interval(item)}."
+        )
     elif physics:
         named = "; ".join(f"{item.name} ({strength(item)})" for item in physics)
         parts.append(f"The drone flies with {len(physics)} effects the model lacks: {named}.")
     if faults:
         named = "; ".join(f"{item.name}, {MEANING[item.name]}: {strength(item)}" for item in faults)
         parts.append(f"The recording is at fault, not the physics: {named}.")
-        if not physics:
+        if not physics and not getattr(outcome, "unexplained", None):
             parts.append("Of the physics nothing is missing beyond chance.")
-    if not outcome.reported:
+    unexplained = getattr(outcome, "unexplained", None)
+    if unexplained:
+        where = str(getattr(unexplained, "where", "") or "see below")
+        parts.append(f"Something is left that no effect of the catalogue accounts for: {where}.")
+    elif not outcome.reported:
         parts.append("Nothing is missing beyond chance.")
-    if getattr(outcome, "unexplained", None):
-        parts.append("Something is left that no effect of the catalogue accounts for; see below.")
-    if outcome.reported:
+    if outcome.reported or unexplained:
         parts.append(_bought(outcome))
     return " ".join(parts)
+
+
+def _interval(item: Reported) -> str:
+    """The 95 % interval of an effect with one number."""
+    found = numbers(item)
+    if len(found) != 1:
+        return ""
+    low, high = (found[0].value + side * 1.96 * found[0].std for side in (-1, 1))
+    return f" (95 % interval {low:.4g} to {high:.4g})"
 
 
 def _bought(outcome: Outcome) -> str:
@@ -168,6 +209,6 @@ def _bought(outcome: Outcome) -> str:
     quantity, _, unit = key.partition("@")[0].split("_")
     unit = {"mps": "m/s", "radps": "rad/s"}.get(unit, unit)
     return (
-        f"On flights it was not fitted to, the {quantity} error {horizon[1:-1]} s ahead goes from {before[key]:.3g} to "
+        f"On held-out flights the {quantity} error {horizon[1:-1]} s ahead goes from {before[key]:.3g} to "
         f"{after[key]:.3g} {unit} ({change(before[key], after[key])})."
     )

@@ -1,9 +1,9 @@
 """Motors that spin up quicker than they spin down (or slower): active drive one way, drag the other.
 
-    T_i *= 1 - asymmetry * tanh((target_i - Omega_i) / 50 rad/s)
+    T_i *= 1 + (spin_up (1 + d_i) + spin_down (1 - d_i)) / 2,  d_i = tanh((target_i - Omega_i) / width)
 
-so T (1 - asymmetry) while spinning up and T (1 + asymmetry) while spinning down, switched smoothly. The direction is
-that of the start of a step and holds for the step.
+so T (1 + spin_up) while spinning up and T (1 + spin_down) while spinning down, switched smoothly over ``width``. The
+direction is that of the start of a step and holds for the step.
 """
 
 from __future__ import annotations
@@ -19,32 +19,38 @@ from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.parameters import Parameters
 
-SWITCHING_SPEED = 50.0
-"""Distance from the target at which a motor counts as spinning up or down, rad/s."""
-
 
 class MotorAsymmetry(Effect):
-    """T *= 1 -+ asymmetry while spinning up (down)."""
+    """T *= 1 + spin_up (spin_down) while spinning up (down)."""
 
     name: ClassVar[str] = "motor_asymmetry"
-    units: ClassVar[dict[str, str]] = {"asymmetry": "1"}
+    units: ClassVar[dict[str, str]] = {"spin_up": "1", "spin_down": "1", "width": "rad/s"}
     source: ClassVar[str] = (
         "F. Furrer, M. Burri, M. Achtelik, R. Siegwart, RotorS - a modular Gazebo MAV simulator framework, 2016 (a "
         "time constant for speeding up and one for slowing down)"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"asymmetry": (-0.5, 0.5)}
-    strengths: ClassVar[tuple[str, ...]] = ("asymmetry",)
+    prior: ClassVar[dict[str, tuple[float, float]]] = {
+        "spin_up": (-0.5, 0.5),
+        "spin_down": (-0.5, 0.5),
+        "width": (5.0, 200.0),
+    }
+    strengths: ClassVar[tuple[str, ...]] = ("spin_up", "spin_down")
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({"width": 15.0}, {"width": 60.0})
 
-    asymmetry: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Between -1 and 1; positive means quicker up than down."""
+    spin_up: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Relative change of the lag while spinning up, above -1."""
+    spin_down: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Relative change of the lag while spinning down, above -1."""
+    width: Float[Array, "*batch"] = eqx.field(converter=number, default=50.0)
+    """Distance from the target at which a motor counts as spinning up or down."""
 
     @classmethod
     def neutral(cls) -> MotorAsymmetry:
-        return cls(asymmetry=0.0)
+        return cls(spin_up=0.0, spin_down=0.0)
 
     def motors(
         self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
     ) -> tuple[Motors, Memory]:
-        direction = ((motors.target - rotor_speed) * (1 / SWITCHING_SPEED)).map(jnp.tanh)
-        factor = direction.map(lambda up: 1 - self.asymmetry * up)
+        direction = ((motors.target - rotor_speed) * (1 / self.width)).map(jnp.tanh)
+        factor = direction.map(lambda d: 1 + 0.5 * (self.spin_up * (1 + d) + self.spin_down * (1 - d)))
         return Motors(motors.target, motors.time_constant * factor), memory

@@ -22,14 +22,18 @@ ALPHA = 1e-3
 """An effect's p-value, times the number of effects tried, must be below this."""
 LEAST_GAIN = 5.0
 """And it must gain so many nats of log-likelihood on blocks left out."""
-MATERIAL = 0.03
+MATERIAL = 0.05
 """And lower at least one prediction error (four quantities, two horizons) by this share."""
+PARSIMONY = 0.02
+"""A rival with fewer numbers is preferred if it gains all but this share."""
 CLOSE = 0.1
 """A rival that gains all but this share of the winner's gain is named as confusable with it."""
 SMALLEST_SHIFT = 0.0015
 """Motor columns less late or early than this, s, are commands between rows rather than a fault."""
 LARGEST = 6
 """Effects at most."""
+PATIENCE = 4
+"""Candidates in a row that stand against chance but lower no error: then the search ends."""
 ERRORS = tuple(
     f"{q}@{h}s"
     for h in ("0.2", "0.5")
@@ -111,13 +115,14 @@ def trace(
         progress(f"going on with {', '.join(hypothesis.present) or 'no effect'} found before the interruption")
     hypothesis, linear = search.refine(hypothesis)
     errors = prediction_errors(search, hypothesis)
-    while len(hypothesis.present) < LARGEST:
+    vain = 0
+    while len(hypothesis.present) < LARGEST and vain < PATIENCE:
         ranking = rank(search, hypothesis, linear, refused)
         tried.append({"present": list(hypothesis.present), "ranking": [_line(v, e) for e, v in ranking[:8]]})
         passing = [(e, v) for e, v in ranking if significant(e, len(search.names))]
         if not passing:
             break
-        best, variant = passing[0]
+        best, variant = simplest(passing)
         name = variant[0].effect
         progress(f"trying {name} beside {', '.join(hypothesis.present) or 'nothing'}")
         richer, refined = search.refine(search.with_candidate(hypothesis, variant, best))
@@ -127,8 +132,10 @@ def trace(
         slight = name == SHIFT and abs(richer.shift) < SMALLEST_SHIFT
         if slight or drop.max() < MATERIAL or np.log(new / errors).sum() > 0:
             refused.add(name)
+            vain += 1
             checkpoint.save(hypothesis, search.levels, refused, tried)
             continue
+        vain = 0
         hypothesis, linear, errors = richer, refined, new
         hypothesis, linear, errors = re_examined(search, hypothesis, linear, errors, progress)
         checkpoint.save(hypothesis, search.levels, refused, tried)
@@ -150,6 +157,12 @@ def rank(
         if found is not None and (name not in best or found.gain > best[name][0].gain):
             best[name] = (found, variant)
     return sorted(best.values(), key=lambda pair: -pair[0].gain)
+
+
+def simplest(ranking: list[tuple[Evidence, list[Column]]]) -> tuple[Evidence, list[Column]]:
+    """Of the candidates that gain about as much as the best, the one with the fewest numbers."""
+    close = [pair for pair in ranking if pair[0].gain > (1 - PARSIMONY) * ranking[0][0].gain]
+    return min(close, key=lambda pair: len(pair[1]))
 
 
 def significant(found: Evidence, tried: int) -> bool:
