@@ -116,5 +116,7 @@ def where_it_shows(less: Pooled, more: Pooled, bins: int = BINS, count: int = PA
             continue
         difference = less.axes[axis] - more.axes[axis]
         shares = {name: explained(difference, signal, less.block, bins)[0] for name, signal in less.drivers.items()}
-        found.append((axis, max(shares, key=shares.get)))
+        best = max(shares, key=shares.get)
+        # A constant follows nothing; over time it shows as well as over any other signal.
+        found.append((axis, best if shares[best] > 0.1 else "time"))
     return found

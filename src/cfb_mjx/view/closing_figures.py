@@ -136,6 +136,7 @@ def _binned(drawn, panel: Panel, labels: tuple[str, str]) -> None:
             label=label,
         )
     drawn.axhline(0, color=style.MEASURED, linewidth=0.8)
+    drawn.locator_params(axis="x", nbins=6)
     drawn.set_xlabel(f"{panel.signal}, {squared(UNITS[panel.signal])}")
     drawn.set_ylabel(f"{panel.axis}, {squared(panel.before.units[panel.axis])}")
 

@@ -13,7 +13,7 @@ from cfb_mjx.sysid.tracing.residuals import UNITS, Residuals
 from cfb_mjx.view.closing_figures import AFTER, BEFORE
 from cfb_mjx.view.style import MEASURED
 
-RATE, ROWS = 40.0, 2000
+RATE, ROWS = 40.0, 1500
 """Rows per second kept, and rows of all flights together at most: residuals are smoothed, and the file stays small."""
 FLIGHTS = 6
 """Flights recorded at most."""

@@ -53,8 +53,8 @@ def _short(logs_fit: list[FlightLog], logs_held_out: list[FlightLog]) -> Section
     text = (
         f"{len(logs_fit)} flights to learn from ({seconds[0]:.0f} s) and {len(logs_held_out)} to be judged on "
         f"({seconds[1]:.0f} s), {rows:.0f} rows per second; up to {speed:.1f} m/s and {turn:.1f} rad/s, {low:.2f} to "
-        f"{high:.2f} m high. Rotor speed was measured in {_how_many(logs, 'rotor_speed')} of them, the battery's voltage "
-        f"in {_how_many(logs, 'battery_voltage')}. Each flight is listed below."
+        f"{high:.2f} m high. Rotor speed was measured in {_how_many(logs, 'rotor_speed')} of them, the battery's "
+        f"voltage in {_how_many(logs, 'battery_voltage')}. Each flight is listed below."
     )
     return Section("What was measured", [text])
 
@@ -68,7 +68,7 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
     if not outcome.reported:
         count = len(outcome.trace.search.names)
         text = f"None of the {count} effects of the catalogue and no sensor fault was both significant and material."
-        return Section("What is missing", [text])
+        return Section("What was found", [text])
     paragraphs, rows = [], []
     for item in outcome.reported:
         paragraphs.append(_sentence(item))
@@ -85,11 +85,11 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
     shown = [figure for item in outcome.reported for figure in figures.get(item.name, [])]
     if shown:
         paragraphs.append(
-            "Figures, one row each: mean residual (measured minus modelled) in bins of the signal it follows, with 95 % "
-            "intervals; zero is a perfect model. Effects: force, torque or rotor speed in all flights. Faults of the "
-            "recording: predictions of the held-out flights 0.2 s ahead."
+            "Figures, one row each: mean residual (measured minus modelled) in bins of the signal it follows, with "
+            "95 % intervals; zero is a perfect model. Effects: force, torque or rotor speed in all flights. Faults of "
+            "the recording: predictions of the held-out flights 0.2 s ahead."
         )
-    return Section("What is missing", paragraphs, [(caption, head, rows)], shown)
+    return Section("What was found", paragraphs, [(caption, head, rows)], shown)
 
 
 def _sentence(item: Reported) -> str:
@@ -171,8 +171,8 @@ def _speed_in(before: dict, after: dict) -> Table:
 
 def _unexplained(found, figures: Figures) -> Section:
     lead = (
-        "A structured residual remains that no effect of the catalogue accounts for. Terms that describe it, fitted "
-        "blindly: a description of the data, not physics."
+        "A structured residual remains that no effect of the catalogue accounts for. Terms that describe it were "
+        "fitted blindly and are part of the corrected model: a description of the data, not physics."
     )
     rows = [[str(text)] for text in getattr(found, "formulas", None) or []]
     tables = [("Terms", ["term"], rows)] if rows else []

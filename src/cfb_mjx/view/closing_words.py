@@ -38,23 +38,23 @@ MEANING = {
     "sensor_gyro_lowpass": "the gyro is filtered and lags",
     "sensor_time_shift": "command and rotor-speed columns are late or early against all others",
 }
-MOTORS = "`cfb excite single-motor`: steps of one motor at a time, rotor speed logged"
-TURNS = "`cfb excite roll-pitch`: doublets about roll and pitch, and yaw turns both ways"
+MOTORS = "cfb excite single-motor: steps of one motor at a time, rotor speed logged"
+TURNS = "cfb excite roll-pitch: doublets about roll and pitch, and yaw turns both ways"
 PASSES = "straight passes at constant speed, 0.5 to 3 m/s, forth and back and in both body axes"
 HOVERS = "long hovers with the heading turned by 90 degrees in between"
 EXPERIMENTS = {
     "thrust_scale": "weigh the drone, then hover: mass and thrust cannot be told apart in flight",
-    "torque_scale": "yaw turns and stops at constant height (`cfb excite single-motor`)",
+    "torque_scale": "yaw turns and stops at constant height (cfb excite single-motor)",
     "inertia": TURNS,
     "cog_offset": HOVERS,
-    "payload": "weigh the drone, then hover and `cfb excite roll-pitch`",
+    "payload": "weigh the drone, then hover and cfb excite roll-pitch",
     "motor_gain_mismatch": MOTORS,
     "motor_time_constant": MOTORS,
-    "motor_asymmetry": "large command steps up and down, rotor speed logged (`cfb excite single-motor`)",
+    "motor_asymmetry": "large command steps up and down, rotor speed logged (cfb excite single-motor)",
     "motor_second_order": MOTORS,
     "motor_thermal_drift": "hover for a minute from cold, twice: on a full and on a half-empty battery",
     "battery_sag": "hover from a full battery to an empty one with the voltage logged",
-    "command_delay": "sharp command steps, rotor speed and every command logged (`cfb excite single-motor`)",
+    "command_delay": "sharp command steps, rotor speed and every command logged (cfb excite single-motor)",
     "esc_rate_limit": "command steps of several sizes, rotor speed logged: a limit shows in the large ones only",
     "inflow_thrust": "climbs and dives at 0.5 to 2 m/s",
     "ground_effect": "hover for five seconds each at 0.1, 0.15, 0.25, 0.5 and 1 m",
@@ -67,7 +67,7 @@ EXPERIMENTS = {
     "payload_swing": "a sharp stop followed by a hover of five seconds: a load swings on",
     "sensor_delay": "fast turns in yaw and hard stops: delay shows where signals change quickly",
     "sensor_velocity_scale": "long straight passes",
-    "sensor_gyro_lowpass": "`cfb excite roll-pitch`: fast rates show a filter",
+    "sensor_gyro_lowpass": "cfb excite roll-pitch: fast rates show a filter",
     "sensor_time_shift": "sharp command steps with rotor speed logged",
 }
 FOLLOWS = {
@@ -76,7 +76,9 @@ FOLLOWS = {
     "rotor mean": "climbs, dives and hovers at several thrusts, rotor speed logged",
     "rotor": MOTORS,
     "command": MOTORS,
+    "position": "the same manoeuvre at another place, away from walls, cables and other drones",
     "height": "hover at several heights, and the same heights over another floor",
+    "heading": HOVERS,
     "voltage": "hover from a full battery to an empty one",
     "time": "hover for a minute from cold, twice",
     "offset": HOVERS,
@@ -134,7 +136,7 @@ def readable(unit: str, size: float) -> tuple[float, str]:
 
 
 def with_error(value: float, std: float, unit: str = "") -> str:
-    """``value ± std unit`` with as many digits as the deviation allows."""
+    """value ± std unit with as many digits as the deviation allows."""
     unit = f" {unit}" if unit else ""
     if not np.isfinite(std) or std <= 0:
         return f"{value:.3g}{unit}"

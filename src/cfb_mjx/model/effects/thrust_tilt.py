@@ -1,9 +1,10 @@
 """Thrust that does not point along body z: rotors mounted askew, or body axes that the estimator sees askew.
 
-    F += f (tilt_x, tilt_y, 0)
+    F += f (tilt_x, tilt_y, 0),  tau_z += f twist l / sqrt(2)
 
-with f the total thrust, small angles, and the line of thrust through the rotors' centre: no torque about it. f is the
-body-z force of the rotors and of whatever precedes this effect in the model's list.
+with f the total thrust and small angles. The common part of the rotors' tilts moves the force sideways; the part that
+leans every rotor the same way round the drone (``twist``) turns it. f is the body-z force of the rotors and of whatever
+precedes this effect in the model's list.
 """
 
 from __future__ import annotations
@@ -14,30 +15,34 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
-from cfb_mjx.model.effects.fields import vector
+from cfb_mjx.model.effects.fields import number, vector
 from cfb_mjx.model.vector import Vec
 
 
 class ThrustTilt(Effect):
-    """F += f (tilt_x, tilt_y, 0)."""
+    """F += f (tilt_x, tilt_y, 0), tau_z += f twist l / sqrt(2)."""
 
     name: ClassVar[str] = "thrust_tilt"
-    units: ClassVar[dict[str, str]] = {"tilt": "rad"}
+    units: ClassVar[dict[str, str]] = {"tilt": "rad", "twist": "rad"}
     source: ClassVar[str] = (
         "G. Michieletto, M. Ryll, A. Franchi, Fundamental actuation properties of multirotors, IEEE T-RO 34(3), "
         "2018 (thrust along tilted axes)"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"tilt": (-0.05, 0.05)}
-    strengths: ClassVar[tuple[str, ...]] = ("tilt",)
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"tilt": (-0.05, 0.05), "twist": (-0.05, 0.05)}
+    strengths: ClassVar[tuple[str, ...]] = ("tilt", "twist")
 
     tilt: Float[Array, "*batch 2"] = eqx.field(converter=vector(2))
     """Of the thrust towards body x and y."""
+    twist: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
+    """Of every rotor counter-clockwise round the drone, seen from above."""
 
     @classmethod
     def neutral(cls) -> ThrustTilt:
-        return cls(tilt=0.0)
+        return cls(tilt=0.0, twist=0.0)
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         x, y = Vec.unstack(self.tilt)
         thrust = wrench.force[2]
-        return Wrench(wrench.force + Vec(thrust * x, thrust * y, 0.0), wrench.torque)
+        arm = condition.parameters.rotor_spacing * 0.5**0.5
+        turn = Vec(0.0, 0.0, thrust * self.twist * arm)
+        return Wrench(wrench.force + Vec(thrust * x, thrust * y, 0.0), wrench.torque + turn)

@@ -107,8 +107,8 @@ def terms_of(hypothesis: Hypothesis, deviation: np.ndarray, gains: dict[Column, 
 
 
 @dataclass(frozen=True)
-class Unexplained:
-    """Structure that no effect of the catalogue accounts for, and a formula that describes it.
+class Proposal:
+    """A formula beside the effects found.
 
     Attributes:
         terms: the formula, the largest gain first.
@@ -122,17 +122,6 @@ class Unexplained:
     hypothesis: Hypothesis
     without: Hypothesis
 
-    @property
-    def formulas(self) -> list[str]:
-        """One line per term."""
-        return [str(term) for term in self.terms]
-
-    @property
-    def where(self) -> str:
-        """Axes and signals in words."""
-        axes = list(dict.fromkeys(term.axis for term in self.terms))
-        return "; ".join(f"{a} follows {', '.join(t.signal for t in self.terms if t.axis == a)}" for a in axes)
-
 
 def explain(
     search: Search,
@@ -140,7 +129,7 @@ def explain(
     errors: Callable[[Search, Hypothesis], np.ndarray],
     material: float,
     progress: Callable[[str], None] = lambda _: None,
-) -> tuple[Search, Unexplained | None]:
+) -> tuple[Search, Proposal | None]:
     """Look for a formula beside what was found, keep it if it is material, and drop effects it makes needless.
 
     Args:
@@ -158,10 +147,13 @@ def explain(
     old, new = errors(widened, base), errors(widened, richer)
     if np.max(1 - new / old) < material or np.log(new / old).sum() > 0:
         return search, None
-    for name in hypothesis.present:
-        # An effect may have stood in for what the formula says better.
-        progress(f"looking at {name} again, beside the formula")
-        less, spread = fit_formula(widened, richer.without(name), terms)
+    if "wind" in hypothesis.present and any(c.field == "place" for c in terms):
+        # A force that hangs on the place has a constant part, which looked like wind.
+        constants = [c for c in term_columns(3) + term_columns(4) + term_columns(5) if c.field == "place"]
+        terms = terms + [c for c in constants if c.index[1] == 0 and c not in terms]
+        gains = {c: 0.0 for c in terms} | gains
+        progress("looking at wind again, beside the formula")
+        less, spread = fit_formula(widened, richer.without("wind"), terms)
         without = errors(widened, less)
         if np.max(1 - new / without) < material:
             richer, deviation, new = less, spread, without
@@ -171,4 +163,4 @@ def explain(
         plain = plain if name in kept else plain.without(name)
     plain, _ = widened.refine(plain)
     buys = float(np.max(1 - new / errors(widened, plain)))
-    return widened, Unexplained(terms_of(richer, deviation, gains), buys, richer, plain)
+    return widened, Proposal(terms_of(richer, deviation, gains), buys, richer, plain)

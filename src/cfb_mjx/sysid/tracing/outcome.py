@@ -16,7 +16,9 @@ from cfb_mjx.sysid.sensor_faults import UNITS, SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import FORMULA
 from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
-from cfb_mjx.sysid.tracing.formula import Unexplained, explain
+from cfb_mjx.sysid.tracing.formula import Proposal, explain
+from cfb_mjx.sysid.tracing.lines import Line, find_lines
+from cfb_mjx.sysid.tracing.residuals import residual_rows
 from cfb_mjx.sysid.tracing.search import Hypothesis, Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.trace import Found, Trace, prediction_errors, trace
@@ -25,7 +27,7 @@ STRUCTURE = 0.06
 """A formula counts when it lowers at least one prediction error by this share."""
 SURE = 3.0
 """And when its statistic on held-out flights is above this."""
-DOUBTFUL = 1.0
+DOUBTFUL = 2.3
 """An effect whose statistic on held-out flights is below this is not reported."""
 
 
@@ -54,6 +56,29 @@ class Reported:
             "parameters": self.parameters,
             "uncertainty": self.uncertainty,
         } | more
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Structure that no effect of the catalogue accounts for."""
+
+    proposal: Proposal | None
+    """A formula that describes it, borne out by the held-out flights."""
+    lines: list[Line]
+    """What swings at its own pace."""
+
+    @property
+    def formulas(self) -> list[str]:
+        """One line per term, with units and uncertainty."""
+        return [str(term) for term in self.proposal.terms] if self.proposal else []
+
+    @property
+    def where(self) -> str:
+        """Axes, signals and frequencies in words."""
+        terms = self.proposal.terms if self.proposal else []
+        axes = list(dict.fromkeys(term.axis for term in terms))
+        words = [f"{a} follows {', '.join(t.signal for t in terms if t.axis == a)}" for a in axes]
+        return "; ".join(words + [str(line) for line in self.lines])
 
 
 @dataclass
@@ -105,7 +130,7 @@ class Outcome:
             if item.name in self.hypothesis.present and item.name in {type(e).name for e in self.hypothesis.effects}:
                 mapping = effect_to_mapping(self.hypothesis.effect(item.name))
                 effects.append(mapping | {"uncertainty": item.uncertainty, "p_value": item.p_value})
-        if self.unexplained is not None:
+        if self.unexplained is not None and self.unexplained.proposal is not None:
             effects.append(effect_to_mapping(self.hypothesis.effect(FORMULA)))
         replaced = {item["name"] for item in effects} | set(UNITS)
         kept = [item for item in self.base.effects if item["name"] not in replaced]
@@ -140,31 +165,33 @@ def close_loop(
     delays = {log.observation_delay for log in fit} - {None}
     delay = float(np.median(list(delays))) if delays else float(parameters.observation_delay)
     found = trace(fit, parameters, delay, progress, declared, checkpoint)
-    search, unexplained = explain(found.search, found.hypothesis, prediction_errors, STRUCTURE, progress)
+    search, proposal = explain(found.search, found.hypothesis, prediction_errors, STRUCTURE, progress)
     progress("judging on held-out flights")
     nothing = found.search.nothing()
     before = evaluate(nothing.model(parameters), held_out)
     # Biases of the held-out sensors come from their own kinematics; no model is fitted.
     check = replace(check_sensors(held_out, delay), faults=found.sensors.faults)
     judge = found.search.beside(held_out, check)
-    hypothesis, reported, unconfirmed = found.hypothesis, [], []
+    if proposal is not None:
+        wide = search.beside(held_out, check)
+        verdict = confirm(wide, proposal.without, proposal.hypothesis)
+        if verdict.t < SURE or _change(wide, proposal.without, proposal.hypothesis) > 0:
+            proposal = None
+    hypothesis, reported, unconfirmed = proposal.hypothesis if proposal else found.hypothesis, [], []
     for item in found.found:
         verdict = confirm(judge, item.without, found.hypothesis)
         entry = Reported(item.name, verdict.p_value, item.parameters, item.uncertainty, item, verdict)
-        kept = unexplained is None or item.name in unexplained.hypothesis.present
         worse = _change(judge, item.without, found.hypothesis) > 0
-        if not kept or verdict.t < DOUBTFUL or worse:
+        if item.name not in hypothesis.present or verdict.t < DOUBTFUL or worse:
             unconfirmed.append(entry)
             hypothesis = hypothesis.without(item.name)
         else:
             reported.append(entry)
-    if unexplained is not None:
-        wide = search.beside(held_out, check)
-        verdict = confirm(wide, unexplained.without, unexplained.hypothesis)
-        if verdict.t < SURE or _change(wide, unexplained.without, unexplained.hypothesis) > 0:
-            unexplained = None
-        else:
-            hypothesis = unexplained.hypothesis
+    best = proposal.hypothesis if proposal else found.hypothesis
+    lines = find_lines(residual_rows(search if proposal else found.search, best))
+    elsewhere = find_lines(residual_rows(wide if proposal else judge, best)) if len(held_out) >= 3 else lines
+    lines = [a for a in lines if any(a.axis == b.axis and abs(a.frequency - b.frequency) < 0.1 for b in elsewhere)]
+    unexplained = Unexplained(proposal, lines) if proposal or lines else None
     for fault in found.sensors.findings:
         field = {"sensor_velocity_scale": "scale", "sensor_delay": "delay"}.get(fault.name, "lag")
         reported.insert(0, Reported(fault.name, fault.p_value, {field: fault.value}, {field: fault.std}))

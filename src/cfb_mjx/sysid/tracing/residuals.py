@@ -26,7 +26,10 @@ UNITS = {
     **{f"rotor {name}": "rad/s" for name in PATTERNS},
     **{f"rotor {name} slope": "rad/s^2" for name in PATTERNS},
     "command slope": "1/s",
+    "position x": "m",
+    "position y": "m",
     "height": "m",
+    "heading": "rad",
     "voltage": "V",
     "time": "s",
 }
@@ -42,6 +45,7 @@ class Residuals:
         time: (n,) s.
         angular_acceleration: (n, 3) body axes, rad/s^2: times the inertia, the torque the model misses.
         specific_force: (n, 3) body axes, m/s^2: times the mass, the force it misses.
+        world_force: (n, 3) the same in world axes: what hangs on a place shows here.
         rotor_speed: (n, 4) measured minus modelled from commands alone, rad/s; None where not measured.
         valid: (n,) rows where a residual means something.
         drivers: signals (n,) that could drive it, named and in the units of `UNITS`; NaN where not measured.
@@ -51,6 +55,7 @@ class Residuals:
     time: np.ndarray
     angular_acceleration: np.ndarray
     specific_force: np.ndarray
+    world_force: np.ndarray
     rotor_speed: np.ndarray | None
     valid: np.ndarray
     drivers: dict[str, np.ndarray]
@@ -59,12 +64,13 @@ class Residuals:
         """Every residual axis (n,) by name, with its unit."""
         found = {f"torque {a}": (self.angular_acceleration[:, i], "rad/s^2") for i, a in enumerate("xyz")}
         found |= {f"force {a}": (self.specific_force[:, i], "m/s^2") for i, a in enumerate("xyz")}
+        found |= {f"world force {a}": (self.world_force[:, i], "m/s^2") for i, a in enumerate("xy")}
         speed = np.full((len(self.time), 4), np.nan) if self.rotor_speed is None else self.rotor_speed
         return found | {f"rotor M{i + 1}": (speed[:, i], "rad/s") for i in range(4)}
 
     def rows(self, index: np.ndarray, valid: np.ndarray) -> Residuals:
         """The rows ``index`` selects, of which ``valid`` count."""
-        fields = ("time", "angular_acceleration", "specific_force")
+        fields = ("time", "angular_acceleration", "specific_force", "world_force")
         return replace(
             self,
             **{field: getattr(self, field)[index] for field in fields},
@@ -100,7 +106,9 @@ def _one(search: Search, hypothesis: Hypothesis, flight: Flight, name: str) -> R
     drivers |= {f"rotor {key}": smooth(value) for key, value in patterns.items()}
     drivers |= {f"rotor {key} slope": smooth(value, 1) for key, value in patterns.items()}
     drivers["command slope"] = smooth(np.asarray(flight.command)[:n].mean(axis=1), 1)
-    drivers["height"] = smooth(np.asarray(flight.position)[:n, 2])
+    position = smooth(np.asarray(flight.position)[:n])
+    drivers |= {key: position[:, i] for i, key in enumerate(("position x", "position y", "height"))}
+    drivers["heading"] = _heading(at["quaternion"])
     drivers["voltage"] = np.asarray(flight.voltage)[:n]
     drivers["time"] = at["time"]
     return Residuals(
@@ -108,10 +116,17 @@ def _one(search: Search, hypothesis: Hypothesis, flight: Flight, name: str) -> R
         at["time"],
         smooth(quantity[:, :3], 1),
         smooth(to_body(at["quaternion"], world)),
+        smooth(world),
         smooth(quantity[:, 6:]) if float(flight.measured) else None,
         smooth.inside,
         drivers,
     )
+
+
+def _heading(quaternion: np.ndarray) -> np.ndarray:
+    """Yaw (n,), rad, -pi to pi."""
+    w, x, y, z = quaternion.T
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 class Smoother:

@@ -13,7 +13,7 @@ HIGHEST = 12.0
 
 
 def spectra(rows: list[Residuals]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Frequency (f,) Hz and power spectral density (f,), unit^2/Hz, by residual axis; rotors together.
+    """Frequency (f,) Hz and power spectral density (f,), unit^2/Hz, by residual axis of the body; rotors together.
 
     Stretches shorter than `LENGTH` are left out, and so are axes of which nothing is long enough.
     """
@@ -29,7 +29,8 @@ def spectra(rows: list[Residuals]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
             if len(grid) * step < LENGTH:
                 continue
             for name, (values, _) in flight.axes().items():
-                if not np.isfinite(values[begin:end]).all():
+                # World axes would only repeat the body's.
+                if name.startswith("world") or not np.isfinite(values[begin:end]).all():
                     continue
                 even = np.interp(grid, time, values[begin:end])
                 frequency, density = welch(even, 1 / step, nperseg=int(LENGTH / step), detrend=False)

@@ -18,7 +18,7 @@ from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
 from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Linear, Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
 
-ALPHA = 1e-3
+ALPHA = 1e-2
 """An effect's p-value, times the number of effects tried, must be below this."""
 LEAST_GAIN = 5.0
 """And it must gain so many nats of log-likelihood on blocks left out."""
@@ -28,6 +28,8 @@ PARSIMONY = 0.02
 """A rival with fewer numbers is preferred if it gains all but this share."""
 CLOSE = 0.1
 """A rival that gains all but this share of the winner's gain is named as confusable with it."""
+OF_FIRST = 0.02
+"""And by this share of what the declared model scores, so that the last crumbs of a large error are not chased."""
 SMALLEST_SHIFT = 0.0015
 """Motor columns less late or early than this, s, are commands between rows rather than a fault."""
 LARGEST = 6
@@ -115,6 +117,7 @@ def trace(
         progress(f"going on with {', '.join(hypothesis.present) or 'no effect'} found before the interruption")
     hypothesis, linear = search.refine(hypothesis)
     errors = prediction_errors(search, hypothesis)
+    first = errors if saved is None else prediction_errors(search, search.nothing())
     vain = 0
     while len(hypothesis.present) < LARGEST and vain < PATIENCE:
         ranking = rank(search, hypothesis, linear, refused)
@@ -130,6 +133,7 @@ def trace(
         drop = 1 - new / errors
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, drop.tolist(), strict=True))}
         slight = name == SHIFT and abs(richer.shift) < SMALLEST_SHIFT
+        slight = slight or np.max((errors - new) / first) < OF_FIRST
         if slight or drop.max() < MATERIAL or np.log(new / errors).sum() > 0:
             refused.add(name)
             vain += 1

@@ -1,0 +1,240 @@
+"""The report of a closed loop says what the outcome says, stands alone, and its statistics are right."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import xml.etree.ElementTree as ElementTree
+from base64 import b64decode
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cfb_mjx.cli.demo import simulated_log
+from cfb_mjx.model.effects import CATALOGUE, RotorDrag
+from cfb_mjx.parameters import load_model_file
+from cfb_mjx.sysid import evaluate
+from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.tracing.floor import noise_floor, sensor_levels
+from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
+from cfb_mjx.sysid.tracing.residuals import UNITS, Smoother, residual_rows
+from cfb_mjx.sysid.tracing.search import Search
+from cfb_mjx.sysid.tracing.sensors import check_sensors
+from cfb_mjx.sysid.tracing.structure import BLOCK, OFFSET, binned, edges_of, explained
+from cfb_mjx.sysid.tracing.trace import Found, Trace
+from cfb_mjx.view import closing_words as words
+from cfb_mjx.view.closing import write_report
+
+DRAG = 0.01
+
+
+def _noisy(log, seed: int, name: str):
+    rng = np.random.default_rng(seed)
+
+    def some(values, size):
+        return values + size * rng.standard_normal(values.shape)
+
+    return log.replace(
+        position=some(log.position, 4e-4),
+        velocity=some(log.velocity, 4e-3),
+        body_rate=some(log.body_rate, 0.015),
+        specific_force=some(log.specific_force, 0.2),
+        metadata=dict(log.metadata) | {"name": name},
+    )
+
+
+@pytest.fixture(scope="module")
+def logs():
+    """Two short flights of the declared drone and two to judge on, one of each without rotor speed."""
+    flight = simulated_log(10.0)
+    found = [_noisy(flight, seed, f"flight {seed}") for seed in range(4)]
+    return [found[0], found[1].replace(rotor_speed=None)], [found[2], found[3].replace(rotor_speed=None)]
+
+
+@pytest.fixture(scope="module")
+def outcome(logs):
+    """A hand-made outcome: a drag the drone does not have was 'found', with a made-up verdict."""
+    base = load_model_file("cfb-guards")
+    parameters = base.parameters()
+    sensors = check_sensors(logs[0], 0.008)
+    sensors = replace(sensors, faults=SensorFaults(), findings=[])
+    # One effect instead of the whole catalogue compiles in a fraction of the time.
+    search = replace(Search.start(logs[0], parameters, 0.008, sensors), names=("rotor_drag",))
+    nothing = search.nothing()
+    hypothesis = replace(nothing, effects=(RotorDrag(DRAG),), present=("rotor_drag",))
+    values, stds = {"coefficient": DRAG}, {"coefficient": 4e-4}
+    found = Found("rotor_drag", 1e-9, 40.0, 0.5, values, stds, ["parasitic_drag"], nothing)
+    line = {"name": "wind", "gain": 2.0, "t": 1.0, "p_value": 0.2}
+    tried = [{"present": [], "ranking": [line], "tried": "inertia", "drop": {"position_rmse_m@0.2s": 0.01}}]
+    before, after = (evaluate(h.model(parameters), logs[1]) for h in (nothing, hypothesis))
+    reported = [
+        Reported("sensor_delay", 1e-12, {"delay": 0.012}, {"delay": 1e-4}),
+        Reported("rotor_drag", 1e-7, values, stds, found),
+    ]
+    return Outcome(
+        Trace(hypothesis, sensors, [found], tried, search),
+        base,
+        reported,
+        [],
+        hypothesis,
+        SensorFaults(),
+        before,
+        after,
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(outcome, logs, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    write_report(outcome, folder, {"date": "2000-01-02", "jax": "x.y"}, *logs)
+    return folder
+
+
+def test_page_stands_alone_and_says_what_the_outcome_says(folder, outcome):
+    assert sorted(path.name for path in folder.iterdir()) == ["report.html", "residual.rrd"]
+    page = (folder / "report.html").read_text()
+    text = re.sub(r"data:image/[^\"]*", "", page)
+    assert "http" not in text
+    assert "<link" not in text
+    assert "<script" not in text
+    for expected in ("0.01000 ± 0.00040 N s/m", "12.00 ± 0.10 ms", "fault", "wind", "date 2000-01-02", "flight 3"):
+        assert expected in text
+    # What looks alike is named together with the flight that would tell.
+    assert "parasitic_drag" in text
+    assert words.EXPERIMENTS["parasitic_drag"][1:] in text
+    before, after = outcome.before.metrics("commands_in"), outcome.after.metrics("commands_in")
+    low, high = outcome.after.intervals("commands_in")["velocity_rmse_mps@0.5s"]
+    assert f"{before['velocity_rmse_mps@0.5s']:.3g} [" in text
+    assert f"{after['velocity_rmse_mps@0.5s']:.3g} [{low:.3g}, {high:.3g}]" in text
+
+
+def test_figures_are_drawings(folder):
+    page = (folder / "report.html").read_text()
+    figures = re.findall(r'<img alt="([^"]+)" src="data:image/svg\+xml;base64,([^"]+)"', page)
+    shown = {}
+    for alternative, data in figures:
+        root = ElementTree.fromstring(b64decode(data))
+        shown[alternative.partition(":")[0]] = "".join(root.itertext())
+        assert len(list(root.iter("{http://www.w3.org/2000/svg}path"))) > 10
+    assert len(figures) >= 4
+    assert "best model without rotor_drag" in shown["rotor_drag"]
+    # A drag that is not there shows where drag would: along the velocity.
+    assert re.search(r"force [xy], m/s²", shown["rotor_drag"])
+    assert re.search(r"velocity [xy], m/s", shown["rotor_drag"])
+
+
+def test_recording_opens(folder, tmp_path):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    path = folder / "residual.rrd"
+    assert 5e4 < path.stat().st_size < 3e6
+    done = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", "stats", str(path)],
+        capture_output=True,
+        text=True,
+        env={"HOME": str(tmp_path), "PATH": "/usr/bin:/bin", "RUST_LOG": "warn"},
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    for entity in ("residual/force_x/before", "residual/torque_z/after", "world/drone", "world/prediction_after"):
+        assert f"/flight\\ 2/{entity}: " in done.stdout, done.stdout
+    assert "/flight\\ 3/residual/rotor_M1" not in done.stdout
+
+
+def test_residuals_see_a_drag_that_is_not_there(outcome):
+    declared = residual_rows(outcome.trace.search, outcome.trace.search.nothing())
+    wrong = residual_rows(outcome.trace.search, outcome.hypothesis)
+    assert declared[0].rotor_speed is not None
+    assert declared[1].rotor_speed is None
+    for right, flight in zip(declared, wrong, strict=True):
+        good = flight.valid
+        assert good.mean() > 0.9
+        speed = flight.drivers["velocity x"][good]
+        slope = np.polyfit(speed, (flight.specific_force - right.specific_force)[good, 0], 1)[0]
+        # The drone does not drag, the model does: what is measured minus modelled points along the velocity.
+        assert slope == pytest.approx(DRAG / 0.044, rel=0.15)
+        # Accelerometer noise of 0.2 m/s^2 at 250 rows per second behind the Gaussian of 20 ms.
+        assert np.std(right.specific_force[good, 0]) == pytest.approx(0.047, rel=0.3)
+
+
+def test_smoother_is_zero_phase_and_stays_inside_stretches():
+    time = np.arange(0, 6, 0.004)
+    valid = (time < 2.5) | (time > 3.0)
+    smooth = Smoother(time, valid)
+    wave = np.sin(2 * np.pi * time)
+    passed = np.exp(-0.5 * (2 * np.pi * 0.02) ** 2)
+    inside = smooth.inside
+    assert not inside[(time > 2.46) & (time < 3.04)].any()
+    np.testing.assert_allclose(smooth(wave)[inside], passed * wave[inside], atol=3e-3)
+    slope = 2 * np.pi * np.cos(2 * np.pi * time)
+    far = inside & (np.abs(time - 2.5) > 0.2) & (np.abs(time - 3.0) > 0.2) & (time > 0.2) & (time < 5.8)
+    np.testing.assert_allclose(smooth(wave, 1)[far], passed * slope[far], atol=1e-2)
+    assert np.isnan(smooth(wave)[~valid]).all()
+
+
+def test_shares_are_those_on_data_left_out():
+    rng = np.random.default_rng(1)
+    time = np.arange(0, 80, 0.02)
+    block = np.floor(time / BLOCK).astype(int)
+    signal = np.sin(2 * np.pi * time / 3)
+    noise = rng.standard_normal(len(time))
+    share, sigma = explained(signal**2 - 0.5 + 0.2 * noise, signal, block)
+    assert share == pytest.approx(0.125 / (0.125 + 0.04), abs=0.06)
+    assert sigma > 5
+    unrelated = [explained(rng.standard_normal(len(time)), signal, block) for _ in range(50)]
+    assert max(share for share, _ in unrelated) < 0.01
+    offset, sigma = explained(0.3 + 0.1 * noise, None, block)
+    assert offset == pytest.approx(0.9, abs=0.02)
+    assert sigma > 10
+    found = binned(2 * signal + noise, signal, block, edges_of(signal))
+    assert np.max(np.abs(found.mean - 2 * found.center) / found.error) < 4.5
+
+
+def test_noise_floor_is_the_noise_put_in(outcome, logs):
+    found = sensor_levels(logs[1][0])
+    assert found["position"] == pytest.approx(4e-4, rel=0.1)
+    assert found["gyro"] == pytest.approx(0.015, rel=0.1)
+    # Uneven rows make a steady motion no noise.
+    uneven = logs[1][0].rows(np.random.default_rng(0).random(len(logs[1][0])) < 0.7)
+    fast = uneven.replace(position=uneven.position + 5.0 * uneven.time[:, None])
+    assert sensor_levels(fast)["position"] == pytest.approx(4e-4, rel=0.15)
+    # The declared model is right here, so it scores the floor; a drag that is not there scores more.
+    floor = noise_floor(outcome.before)
+    right, wrong = outcome.before.metrics("commands_in"), outcome.after.metrics("commands_in")
+    for key, value in floor.items():
+        assert right[key] == pytest.approx(value, rel=0.25), key
+    assert wrong["velocity_rmse_mps@0.5s"] > 1.5 * floor["velocity_rmse_mps@0.5s"]
+
+
+def test_nothing_and_unexplained_in_words(outcome):
+    nothing = replace(outcome, reported=[])
+    assert words.verdict(nothing) == "Nothing is missing beyond chance."
+    nothing.unexplained = SimpleNamespace(formulas=["force_x = 1 N"], where="force_x follows x")
+    assert "no effect of the catalogue accounts for: force_x follows x." in words.verdict(nothing)
+    fault = replace(outcome, reported=outcome.reported[:1])
+    assert "fault, not the physics" in words.verdict(fault)
+
+
+def test_every_effect_has_words():
+    names = {*CATALOGUE, *words.FAULT_UNITS}
+    assert names <= set(words.MEANING)
+    assert names <= set(words.EXPERIMENTS)
+    for signal in (OFFSET, *UNITS):
+        assert any(signal.startswith(key) for key in words.FOLLOWS), signal
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "unit", "expected"),
+    [
+        (0.019853, 0.00035, "N s/m", "0.01985 ± 0.00035 N s/m"),
+        (-0.123, 0.02, "", "-0.123 ± 0.020"),
+        (1234.0, 56.0, "rad/s", "1234 ± 56 rad/s"),
+        (5.158e-5, 1.8e-6, "N s", "(5.16 ± 0.18)e-5 N s"),
+        (0.5, float("nan"), "m", "0.5 m"),
+    ],
+)
+def test_numbers_have_the_digits_they_deserve(value, std, unit, expected):
+    assert words.with_error(value, std, unit) == expected
