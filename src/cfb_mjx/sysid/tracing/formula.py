@@ -123,6 +123,22 @@ class Proposal:
     without: Hypothesis
 
 
+def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Column]) -> bool:
+    """Whether the terms can say most of what an effect says: then the effect, which has a meaning, stays.
+
+    An effect that the terms cannot say, but that nothing misses beside them, had only stood in for them.
+    """
+    own = search.own_columns(hypothesis)
+    linear = search.linearise(hypothesis, own, _WIDTH)
+    total = linear.pooled.sum(0) * np.outer(linear.scale, linear.scale)
+    effect = linear.index([c for c in own if c.effect == name and c not in terms])
+    term = linear.index(terms)
+    inside = total[np.ix_(term, term)]
+    across = total[np.ix_(term, effect)]
+    said = np.trace(across.T @ np.linalg.solve(inside + 1e-9 * np.trace(inside) * np.eye(len(term)), across))
+    return bool(said > 0.5 * np.trace(total[np.ix_(effect, effect)]))
+
+
 def explain(
     search: Search,
     hypothesis: Hypothesis,
@@ -154,6 +170,14 @@ def explain(
         gains = {c: 0.0 for c in terms} | gains
         progress("looking at wind again, beside the formula")
         less, spread = fit_formula(widened, richer.without("wind"), terms)
+        without = errors(widened, less)
+        if np.max(1 - new / without) < material:
+            richer, deviation, new = less, spread, without
+    for name in hypothesis.present:
+        if name not in richer.present or mimicked(widened, richer, name, terms):
+            continue
+        progress(f"looking at {name} again, beside the formula")
+        less, spread = fit_formula(widened, richer.without(name), terms)
         without = errors(widened, less)
         if np.max(1 - new / without) < material:
             richer, deviation, new = less, spread, without

@@ -1,0 +1,192 @@
+"""Tracing on labelled plants (tests/plants), and the pieces it is made of."""
+
+from __future__ import annotations
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from plants import Case, fly_campaigns
+from scipy.stats import norm
+
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.model.effects import CATALOGUE, RotorDrag
+from cfb_mjx.parameters import load_model_file, save_model_file
+from cfb_mjx.sysid import evaluate
+from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
+from cfb_mjx.sysid.tracing.evidence import evidence
+from cfb_mjx.sysid.tracing.lines import find_lines
+from cfb_mjx.sysid.tracing.outcome import close_loop
+from cfb_mjx.sysid.tracing.residuals import residual_rows
+from cfb_mjx.sysid.tracing.search import Search
+from cfb_mjx.sysid.tracing.sensors import check_sensors
+
+CASES = [
+    Case("clean", 9001, ()),
+    Case("drag", 9002, (("rotor_drag", 1.0),)),
+    Case("late", 9003, (("sensor_delay", 1.0),)),
+    Case("stretched", 9004, (("sensor_velocity_scale", 1.0),)),
+    Case("filtered", 9005, (("sensor_gyro_lowpass", 1.0),)),
+    Case("periodic", 9006, (("outside_periodic", 1.0),)),
+]
+
+
+@pytest.fixture(scope="module")
+def campaigns():
+    """A third of the usual length: enough for strong effects."""
+    return {c.case.name: c for c in fly_campaigns(CASES, duration_scale=0.35)}
+
+
+@pytest.fixture(scope="module")
+def base():
+    return load_model_file("cfb-guards")
+
+
+def test_healthy_sensors_agree_with_each_other(campaigns):
+    check = check_sensors(campaigns["clean"].fit, 0.008)
+    assert check.faults.healthy
+    assert not check.findings
+    for name, healthy in (("sensor_delay", 0.0), ("sensor_gyro_lowpass", 0.0), ("sensor_velocity_scale", 1.0)):
+        value, std = check.measured[name]
+        assert abs(value - healthy) < 5 * std
+        assert std < 0.002
+
+
+@pytest.mark.parametrize(
+    ("case", "fault", "truth", "tolerance"),
+    [
+        ("late", "sensor_delay", lambda t: 0.002 * t["extra_delay"], 0.001),
+        ("stretched", "sensor_velocity_scale", lambda t: t["velocity_scale"], 0.003),
+        # A second-order low-pass delays slow motion by sqrt(2) over its corner.
+        ("filtered", "sensor_gyro_lowpass", lambda t: np.sqrt(2) / (2 * np.pi * t["gyro_corner"]), 0.002),
+    ],
+)
+def test_sensor_faults_are_named_and_measured(campaigns, case, fault, truth, tolerance):
+    campaign = campaigns[case]
+    check = check_sensors(campaign.fit, 0.008)
+    assert [f.name for f in check.findings] == [fault]
+    assert check.findings[0].value == pytest.approx(truth(campaign.truth["effects"][fault]), abs=tolerance)
+    # With the fault told, the declared model scores better on other flights; no other effect is needed for that.
+    model = Quadrotor.from_file(load_model_file("cfb-guards"))
+    key = "rate_rmse_radps@0.2s" if "gyro" in fault else "velocity_rmse_mps@0.2s"
+    before = evaluate(model, campaign.held_out).metrics("commands_in")[key]
+    after = evaluate(model, campaign.held_out, faults=check.faults).metrics("commands_in")[key]
+    assert after < 0.8 * before
+
+
+def test_repairs_undo_faults(campaigns):
+    log = campaigns["clean"].fit[0]
+    shifted = log.replace(
+        command=np.concatenate([np.repeat(log.command[:1], 2, axis=0), log.command[:-2]]), velocity=1.1 * log.velocity
+    )
+    interval = log.nominal_interval
+    repaired = SensorFaults(velocity_scale=1.1, motor_shift=2 * interval).repaired(shifted)
+    inner = np.isin(repaired.time, log.time)
+    assert inner.all()
+    rows = np.searchsorted(log.time, repaired.time)
+    np.testing.assert_allclose(repaired.velocity, log.velocity[rows])
+    # Rows are evenly spaced in this log wherever no row is missing.
+    even = np.abs(np.interp(repaired.time + 2 * interval, log.time, log.time) - repaired.time - 2 * interval) < 1e-9
+    steady = even & (np.diff(log.time, append=log.time[-1])[rows] < 1.1 * interval)
+    error = np.abs(repaired.command - log.command[rows])[steady]
+    assert np.median(error) < 1e-9
+    assert SensorFaults().repaired(log) is log
+
+
+def test_evidence_is_calibrated_on_noise():
+    rng = np.random.default_rng(1)
+    statistics = []
+    for _ in range(300):
+        x = rng.normal(size=(40, 30, 3))
+        blocks = np.einsum("bri,brj->bij", x, x)
+        statistics.append(evidence(blocks, [], [1, 2], np.ones(3)).t)
+    assert abs(np.mean(statistics)) < 0.25
+    assert np.mean(np.array(statistics) > norm.isf(0.05)) < 0.1
+    x[..., 0] += 0.3 * x[..., 1]
+    found = evidence(np.einsum("bri,brj->bij", x, x), [2], [1], np.ones(3))
+    assert found.p_value < 1e-6
+    assert found.values[0] == pytest.approx(0.3, abs=0.1)
+
+
+def test_a_line_in_every_flight_is_found_and_noise_has_none(campaigns, base):
+    for name in ("periodic", "clean"):
+        campaign = campaigns[name]
+        search = Search.start(campaign.fit, base.parameters(), 0.008, check_sensors(campaign.fit, 0.008))
+        lines = find_lines(residual_rows(search, search.nothing()))
+        if name == "clean":
+            assert not lines
+        else:
+            truth = campaign.truth["effects"]["outside_periodic"]["spin_frequency"] / (2 * np.pi)
+            assert lines
+            assert all(line.frequency == pytest.approx(truth, abs=0.1) for line in lines)
+
+
+@pytest.fixture(scope="module")
+def closed(campaigns, base, tmp_path_factory):
+    """The loop closed on drag, with a checkpoint."""
+    path = tmp_path_factory.mktemp("search") / "search.json"
+    campaign = campaigns["drag"]
+    return close_loop(campaign.fit, campaign.held_out, base, checkpoint=Checkpoint(path, "key")), path
+
+
+def test_drag_is_named_measured_and_bought(closed, campaigns):
+    outcome, _ = closed
+    assert [item.name for item in outcome.reported] == ["rotor_drag"]
+    truth = campaigns["drag"].truth["effects"]["rotor_drag"]
+    # The plant's drag saturates at speed, so the linear coefficient comes out below its slope at rest.
+    total = 4 * np.mean(truth["rotor_drag"])
+    found = outcome.reported[0].parameters["coefficient"]
+    assert 0.6 * total < found < 1.05 * total
+    assert outcome.reported[0].p_value < 1e-6
+    before, after = (e.metrics("commands_in") for e in (outcome.before, outcome.after))
+    assert after["velocity_rmse_mps@0.5s"] < 0.5 * before["velocity_rmse_mps@0.5s"]
+    assert not outcome.faults.to_mappings()
+    report = outcome.to_json()
+    json.dumps(report, default=float)
+    assert report["unexplained"] is False
+
+
+def test_the_corrected_model_predicts_as_reported(closed, campaigns, tmp_path):
+    outcome, _ = closed
+    path = tmp_path / "model.yaml"
+    save_model_file(outcome.model_file("closed", {"command": "test"}), path)
+    model = Quadrotor.from_file(str(path))
+    assert [type(e) for e in model.effects] == [RotorDrag]
+    again = evaluate(model, campaigns["drag"].held_out).metrics("commands_in")
+    reported = outcome.after.metrics("commands_in")
+    for key, value in reported.items():
+        assert again[key] == pytest.approx(value, rel=1e-6)
+
+
+def test_an_interrupted_search_goes_on(closed, base):
+    outcome, path = closed
+    saved = Checkpoint(path, "key", json.loads(path.read_text()))
+    nothing = outcome.trace.search.nothing()
+    hypothesis, _, _, _ = saved.restore(nothing)
+    assert hypothesis.present == ("rotor_drag",)
+    drag = hypothesis.effect("rotor_drag")
+    np.testing.assert_allclose(drag.coefficient, outcome.hypothesis.effect("rotor_drag").coefficient, rtol=0.2)
+    assert set(CATALOGUE) == {type(e).name for e in hypothesis.effects}
+    other = Checkpoint(path, "another", None)
+    assert other.restore(nothing) is None
+
+
+def test_nothing_is_reported_on_a_clean_drone(campaigns, base):
+    campaign = campaigns["clean"]
+    outcome = close_loop(campaign.fit, campaign.held_out, base)
+    assert outcome.reported == []
+    assert outcome.unexplained is None
+    before, after = (e.metrics("commands_in") for e in (outcome.before, outcome.after))
+    assert before == pytest.approx(after)
+
+
+def test_all_effects_at_neutral_replay_like_the_bare_model(campaigns, base):
+    campaign = campaigns["clean"]
+    search = Search.start(campaign.fit[:1], base.parameters(), 0.008, check_sensors(campaign.fit[:1], 0.008))
+    bare = evaluate(Quadrotor(base.parameters()), campaign.fit[:1]).metrics("commands_in")
+    full = evaluate(search.nothing().model(base.parameters()), campaign.fit[:1]).metrics("commands_in")
+    for key, value in bare.items():
+        assert full[key] == pytest.approx(value, rel=1e-9)
+    assert jnp.isfinite(jnp.asarray(list(full.values()))).all()
