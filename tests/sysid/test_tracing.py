@@ -22,6 +22,7 @@ from cfb_mjx.sysid.tracing.outcome import close_loop
 from cfb_mjx.sysid.tracing.residuals import residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
+from cfb_mjx.sysid.tracing.trace import trace
 
 CASES = [
     Case("clean", 9001, ()),
@@ -102,7 +103,8 @@ def test_evidence_is_calibrated_on_noise():
         x = rng.normal(size=(40, 30, 3))
         blocks = np.einsum("bri,brj->bij", x, x)
         statistics.append(evidence(blocks, [], [1, 2], np.ones(3)).t)
-    assert abs(np.mean(statistics)) < 0.25
+    # Fitting on the other blocks leaves noise a little below zero: never too sure.
+    assert -0.6 < np.mean(statistics) < 0.1
     assert np.mean(np.array(statistics) > norm.isf(0.05)) < 0.1
     x[..., 0] += 0.3 * x[..., 1]
     found = evidence(np.einsum("bri,brj->bij", x, x), [2], [1], np.ones(3))
@@ -174,12 +176,9 @@ def test_an_interrupted_search_goes_on(closed, base):
 
 
 def test_nothing_is_reported_on_a_clean_drone(campaigns, base):
-    campaign = campaigns["clean"]
-    outcome = close_loop(campaign.fit, campaign.held_out, base)
-    assert outcome.reported == []
-    assert outcome.unexplained is None
-    before, after = (e.metrics("commands_in") for e in (outcome.before, outcome.after))
-    assert before == pytest.approx(after)
+    found = trace(campaigns["clean"].fit, base.parameters())
+    assert found.found == []
+    assert found.faults.healthy
 
 
 def test_all_effects_at_neutral_replay_like_the_bare_model(campaigns, base):

@@ -99,7 +99,7 @@ class Search:
     names: tuple[str, ...]
     declared: tuple[Effect, ...] = ()
     """Effects the declared model has already."""
-    levels: np.ndarray = field(default_factory=lambda: FIRST.copy())
+    levels: np.ndarray = field(default_factory=lambda: FIRST)
     _flights: dict[float, list[Flight]] = field(default_factory=dict)
 
     @classmethod

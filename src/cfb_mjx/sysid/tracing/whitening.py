@@ -219,6 +219,7 @@ def fit_levels(blocks: Blocks, noise: dict[str, np.ndarray], start: np.ndarray =
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(low, high, strict=True)),
-        options={"maxiter": 40, "ftol": 1e-7},
+        # From levels found before, a few steps are enough.
+        options={"maxiter": 40 if start is FIRST else 15, "ftol": 1e-7},
     )
     return found.x
