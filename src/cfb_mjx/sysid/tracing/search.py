@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import CATALOGUE, Effect
+from cfb_mjx.model.effects import CATALOGUE, KNOWN, Effect
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight, prepare_flight
@@ -27,6 +27,7 @@ LEAD_RANGE, LEAD_USUAL, LEAD_SPREAD = (0.0, 0.5), 0.25, 0.1
 Beyond this a lead would be a time shift, so what is known of it beforehand has to decide between the two."""
 FILTERED_GYRO = 0.1
 """Level given to a low-pass filtered gyro, rad/s: only what it shows slowly is believed."""
+LEAST_RELATIVE = -0.8
 PAD = 8
 """Columns are padded to a multiple of this with copies of the lead, so that one compiled program serves all rounds."""
 
@@ -221,6 +222,9 @@ class Search:
             if column.field in CATALOGUE[column.effect].strengths:
                 # A strength may exceed what is plausible (the report will say so), but not change a meaningless sign.
                 low, high = (0.0 if low >= 0 else 3 * low), 3 * high
+                if KNOWN[column.effect].units[column.field] == "1":
+                    # Relative changes: a lag or a gain of less than nothing is no motor.
+                    low = max(low, LEAST_RELATIVE)
             value = np.clip(value, low, high)
             effects[column.effect] = eqx.tree_at(lambda e, f=column.field: getattr(e, f), effect, jnp.asarray(value))
         lead = float(np.clip(hypothesis.lead + by[0], *LEAD_RANGE))

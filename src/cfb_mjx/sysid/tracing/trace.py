@@ -134,6 +134,7 @@ def trace(
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, drop.tolist(), strict=True))}
         slight = name == SHIFT and abs(richer.shift) < SMALLEST_SHIFT
         slight = slight or np.max((errors - new) / first) < OF_FIRST
+        slight = slight or not np.isfinite(new).all()
         if slight or drop.max() < MATERIAL or np.log(new / errors).sum() > 0:
             refused.add(name)
             vain += 1
