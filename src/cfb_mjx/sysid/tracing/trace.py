@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import Effect
+from cfb_mjx.model.effects import KNOWN, Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.evaluation import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
@@ -26,6 +26,8 @@ MATERIAL = 0.05
 """And lower at least one prediction error (four quantities, two horizons) by this share."""
 PARSIMONY = 0.02
 """A rival with fewer numbers is preferred if it gains all but this share."""
+RIVALS, AS_GOOD = 3, 0.03
+"""So many effects are tried alone in place of several; no error may grow by more than this share."""
 CLOSE = 0.1
 """A rival that gains all but this share of the winner's gain is named as confusable with it."""
 OF_FIRST = 0.02
@@ -144,6 +146,8 @@ def trace(
         hypothesis, linear, errors = richer, refined, new
         hypothesis, linear, errors = re_examined(search, hypothesis, linear, errors, progress)
         checkpoint.save(hypothesis, search.levels, refused, tried)
+    if len(hypothesis.present) > 1:
+        hypothesis, linear, errors = simplified(search, hypothesis, linear, errors, tried[0]["ranking"], progress)
     found = [_summary(search, hypothesis, linear, errors, name) for name in hypothesis.present]
     found.sort(key=lambda f: -f.buys)
     return Trace(hypothesis, sensors, found, tried, search)
@@ -167,7 +171,13 @@ def rank(
 def simplest(ranking: list[tuple[Evidence, list[Column]]]) -> tuple[Evidence, list[Column]]:
     """Of the candidates that gain about as much as the best, the one with the fewest numbers."""
     close = [pair for pair in ranking if pair[0].gain > (1 - PARSIMONY) * ranking[0][0].gain]
-    return min(close, key=lambda pair: len(pair[1]))
+    best = min(close, key=lambda pair: len(pair[1]))
+    if best[1][0].effect == SHIFT and best[0].values[0] < 0:
+        # Commands logged early and commands that act late look the same unless rotor speeds were logged: the
+        # physical cause comes first, and the report names both.
+        near = [pair for pair in ranking if pair[0].gain > (1 - CLOSE) * best[0].gain]
+        return next((pair for pair in near if pair[1][0].effect == "command_delay"), best)
+    return best
 
 
 def significant(found: Evidence, tried: int) -> bool:
@@ -193,6 +203,27 @@ def re_examined(search: Search, hypothesis: Hypothesis, linear: Linear, errors: 
             new = prediction_errors(search, other)
             if np.log(new / errors).sum() < 0:
                 hypothesis, linear, errors = other, refined, new
+    return hypothesis, linear, errors
+
+
+def simplified(
+    search: Search, hypothesis: Hypothesis, linear: Linear, errors: np.ndarray, ranking: list[dict], progress
+):
+    """One effect in place of several, where it does as well: the first steps of a search may have split it up."""
+    rivals = [item["name"] for item in ranking if item["name"] not in hypothesis.present][:RIVALS]
+    nothing = search.nothing()
+    own, around = search.refine(nothing)
+    for name in rivals:
+        if name not in KNOWN:
+            continue
+        progress(f"trying {name} in place of {', '.join(hypothesis.present)}")
+        pair = next((p for p in rank(search, own, around, set()) if p[1][0].effect == name), None)
+        if pair is None:
+            continue
+        single, refined = search.refine(search.with_candidate(own, pair[1], pair[0]))
+        new = prediction_errors(search, single)
+        if np.isfinite(new).all() and np.max(new / errors - 1) < AS_GOOD:
+            return single, refined, new
     return hypothesis, linear, errors
 
 
