@@ -66,6 +66,7 @@ class DelayLine(eqx.Module):
                 quaternion=mixed / jnp.linalg.norm(mixed),
                 body_rate=blend(node.body_rate),
                 rotor_speed=blend(node.rotor_speed),
+                memory=jax.tree.map(blend, node.memory),
             )
 
         return jax.tree.map(read_node, self.samples, is_leaf=lambda x: isinstance(x, State))

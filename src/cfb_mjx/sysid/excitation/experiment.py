@@ -181,11 +181,11 @@ def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs):
 
     first = jax.tree.map(lambda x: x[0], inputs[2])
     memory = stabiliser.start(start)
-    line = DelayLine.filled(start, TICK, 0.1)
     wandering = wander * jnp.concatenate([first["torque"], first["force"], first["rotor"]])
     # The push remembers nothing, but a state has an entry for each effect.
     pushed = eqx.tree_at(lambda q: q.effects, model, (*model.effects, _Push(jnp.zeros(3), jnp.zeros(3))))
-    carry = (begin(pushed, start), line, memory, start.position, wandering)
+    begun = begin(pushed, start)
+    carry = (begun, DelayLine.filled(begun, TICK, 0.1), memory, start.position, wandering)
     return jax.lax.scan(tick, carry, jax.tree.map(jnp.asarray, inputs))[1]
 
 
