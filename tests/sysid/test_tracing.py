@@ -24,6 +24,9 @@ from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.trace import trace
 
+# One worker: every program is compiled once.
+pytestmark = pytest.mark.xdist_group("tracing")
+
 CASES = [
     Case("clean", 9001, ()),
     Case("drag", 9002, (("rotor_drag", 1.0),)),
