@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from cfb_mjx import __version__
+from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_json
 from cfb_mjx.model.effects import effect_from_mapping, effect_to_mapping
 from cfb_mjx.parameters import ModelFile
@@ -60,7 +61,10 @@ class Checkpoint:
         """The hypothesis, noise levels, refused effects and history that were saved; None if there are none."""
         if self.state is None:
             return None
-        values = {item["name"]: effect_from_mapping(item, str(self.path)) for item in self.state["effects"]}
+        try:
+            values = {item["name"]: effect_from_mapping(item, str(self.path)) for item in self.state["effects"]}
+        except (CfbError, KeyError, TypeError):
+            return None  # damaged: the search begins anew
         effects = tuple(values.get(type(e).name, e) for e in nothing.effects)
         hypothesis = Hypothesis(
             effects, tuple(self.state["present"]), self.state["lead"], self.state["shift"], nothing.origin
