@@ -136,7 +136,7 @@ def trace(
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, drop.tolist(), strict=True))}
         slight = name == SHIFT and abs(richer.shift) < SMALLEST_SHIFT
         slight = slight or np.max((errors - new) / first) < OF_FIRST
-        slight = slight or not np.isfinite(new).all()
+        slight = slight or not np.isfinite(new).all() or implausible(richer, name)
         if slight or drop.max() < MATERIAL or np.log(new / errors).sum() > 0:
             refused.add(name)
             vain += 1
@@ -166,6 +166,15 @@ def rank(
         if found is not None and (name not in best or found.gain > best[name][0].gain):
             best[name] = (found, variant)
     return sorted(best.values(), key=lambda pair: -pair[0].gain)
+
+
+def implausible(hypothesis: Hypothesis, name: str) -> bool:
+    """Whether an effect had to be stretched to twice its plausible strength: then it stands in for another."""
+    if name == SHIFT:
+        return False
+    effect, kind = hypothesis.effect(name), KNOWN[name]
+    values = {field: np.asarray(getattr(effect, field)) for field in kind.strengths}
+    return any(np.any((v > 2 * kind.prior[f][1]) | (v < 2 * kind.prior[f][0])) for f, v in values.items())
 
 
 def simplest(ranking: list[tuple[Evidence, list[Column]]]) -> tuple[Evidence, list[Column]]:
