@@ -28,7 +28,7 @@ class EscRateLimit(Effect):
     source: ClassVar[str] = (
         "B. Stevens, F. Lewis, E. Johnson, Aircraft Control and Simulation, 3rd ed. 2016 (rate-limited actuator)"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"slowness": (0.0, 0.1)}
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"slowness": (0.0, 0.4)}
     strengths: ClassVar[tuple[str, ...]] = ("slowness",)
 
     slowness: Float[Array, "*batch"] = eqx.field(converter=number)

@@ -18,7 +18,7 @@ SHIFT = "sensor_time_shift"
 """Not an effect of the catalogue but a fault of the recording: command and rotor-speed columns late or early."""
 TORQUE_UNIT, FORCE_UNIT = 3e-5, 4e-3
 """Coefficients of a formula are counted in these: about 1 rad/s^2 and 0.1 m/s^2 on this drone."""
-_COARSE = {"esc_rate_limit": 0.5, "command_delay": 0.2, "motor_second_order": 0.3}
+_COARSE = {"esc_rate_limit": 0.125, "command_delay": 0.2, "motor_second_order": 0.3}
 """Effects whose slope at zero says little are looked for at this share of their prior range."""
 
 
