@@ -174,6 +174,11 @@ def test_an_interrupted_search_goes_on(closed, base):
     drag = hypothesis.effect("rotor_drag")
     np.testing.assert_allclose(drag.coefficient, outcome.hypothesis.effect("rotor_drag").coefficient, rtol=0.2)
     assert set(CATALOGUE) == {type(e).name for e in hypothesis.effects}
+    # What was taken up can be searched on, and given up again.
+    assert hypothesis.terms == ()
+    assert [c.effect for c in outcome.trace.search.own_columns(hypothesis)] == ["rotor_drag"]
+    given_up = hypothesis.without("rotor_drag")
+    np.testing.assert_array_equal(given_up.effect("rotor_drag").coefficient, 0.0)
     other = Checkpoint(path, "another", None)
     assert other.restore(nothing) is None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -66,8 +66,12 @@ class Checkpoint:
         except (CfbError, KeyError, TypeError):
             return None  # damaged: the search begins anew
         effects = tuple(values.get(type(e).name, e) for e in nothing.effects)
-        hypothesis = Hypothesis(
-            effects, tuple(self.state["present"]), self.state["lead"], self.state["shift"], nothing.origin
+        hypothesis = replace(
+            nothing,
+            effects=effects,
+            present=tuple(self.state["present"]),
+            lead=self.state["lead"],
+            shift=self.state["shift"],
         )
         return hypothesis, np.array(self.state["levels"]), set(self.state["refused"]), self.state["tried"]
 
