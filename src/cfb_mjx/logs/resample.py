@@ -10,6 +10,14 @@ from cfb_mjx.logs.flight_log import FlightLog, quantise_time
 _LINEAR = ("position", "velocity", "body_rate", "specific_force", "battery_voltage")
 
 
+def interpolate(time: np.ndarray, values: np.ndarray, instants: np.ndarray) -> np.ndarray:
+    """Linear interpolation of (n, k) values at instants of any shape; the first and last row hold beyond the ends.
+
+    It knows nothing of gaps: whoever asks across one has to.
+    """
+    return np.stack([np.interp(instants, time, column) for column in values.T], axis=-1)
+
+
 def resample(log: FlightLog, rate: float) -> FlightLog:
     """Resample to instants ``time[0] + k / rate``.
 

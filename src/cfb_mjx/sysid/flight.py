@@ -7,11 +7,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.resample import interpolate
+from cfb_mjx.logs.rotation import tidy
 
 LENGTHS = (2560, 4608, 7680)
 """Rows a flight is padded to (beyond, a multiple of the last): few shapes, so that programs come from the cache."""
 WARM_UP = 0.3
 """After the start and after every gap rotor speeds are not known from commands for so long, s: six motor lags."""
+MEASURED_SHARE = 0.98
+"""Rotor speeds are used where every motor has at least this share of valid readings."""
 _VOLTAGE_SMOOTHING = 0.25
 
 
@@ -60,16 +64,15 @@ def prepare_flight(log: FlightLog, delay: float) -> Flight:
     valid = (since >= WARM_UP) & (until >= delay)
 
     def late(values):
-        return np.stack([np.interp(time + delay, time, column) for column in values.T], axis=1)
+        return interpolate(time, values, time + delay)
 
-    quaternion = late(_continuous(log.quaternion))
     speed, measured = _rotor_speed(log)
     flight = {
         "time": time,
         "interval": np.append(np.diff(time), 0.0),
         "position": late(log.position),
         "velocity": late(log.velocity),
-        "quaternion": quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+        "quaternion": tidy(late(tidy(log.quaternion))),
         "body_rate": log.body_rate,
         "specific_force": log.specific_force,
         "command": np.clip(log.command, 0.0, 1.0),
@@ -85,12 +88,6 @@ def prepare_flight(log: FlightLog, delay: float) -> Flight:
     return Flight(**padded, measured=np.array(float(measured)))
 
 
-def _continuous(quaternion: np.ndarray) -> np.ndarray:
-    """Signs chosen so that neighbouring rows are close."""
-    flips = np.sign(np.sum(quaternion[1:] * quaternion[:-1], axis=1))
-    return quaternion * np.concatenate([[1.0], np.cumprod(np.where(flips < 0, -1.0, 1.0))])[:, None]
-
-
 def _rotor_speed(log: FlightLog) -> tuple[np.ndarray, bool]:
     """Measured rotor speeds with short holes bridged, and whether all motors were measured throughout."""
     if log.rotor_speed is None:
@@ -98,7 +95,7 @@ def _rotor_speed(log: FlightLog) -> tuple[np.ndarray, bool]:
     out = log.rotor_speed.copy()
     for motor in range(4):
         good = np.isfinite(out[:, motor])
-        if good.mean() < 0.98:
+        if good.mean() < MEASURED_SHARE:
             return np.zeros((len(log), 4)), False
         out[:, motor] = np.interp(log.time, log.time[good], out[good, motor])
     return out, True

@@ -30,12 +30,10 @@ from cfb_mjx.model.effects import Condition, Effect, Memory, Motors, Wrench
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.flight import Flight, prepare_flight
+from cfb_mjx.sysid.flight import MEASURED_SHARE, Flight, prepare_flight
 from cfb_mjx.sysid.replay import Replay, replay
 from cfb_mjx.sysid.windows import Windows
 
-MEASURED_SHARE = 0.98
-"""Rotor speeds are used where every motor has at least this share of valid readings, as in `prepare_flight`."""
 RIDGE = 1e-3
 """Weight of the prior that holds the logarithms of noise levels, per row of a fit: levels the data say nothing about
 stay where they were."""

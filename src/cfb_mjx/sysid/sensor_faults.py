@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import tidy
 from cfb_mjx.model import State
 
@@ -49,11 +48,11 @@ class SensorFaults:
         changes = {}
 
         def later(values, by):
-            return np.stack([np.interp(time + by, time, column) for column in values.T], axis=1)
+            return interpolate(time, values, time + by)
 
         if self.delay:
             changes["position"] = later(log.position, self.delay)
-            changes["quaternion"] = tidy(later(_continuous(log.quaternion), self.delay))
+            changes["quaternion"] = tidy(later(tidy(log.quaternion), self.delay))
         if self.delay or self.velocity_scale != 1.0:
             changes["velocity"] = later(log.velocity, self.delay) / self.velocity_scale
         if self.gyro_lag:
@@ -118,8 +117,3 @@ class SensorFaults:
 
 
 HEALTHY = SensorFaults()
-
-
-def _continuous(quaternion: np.ndarray) -> np.ndarray:
-    flips = np.sign(np.sum(quaternion[1:] * quaternion[:-1], axis=1))
-    return quaternion * np.concatenate([[1.0], np.cumprod(np.where(flips < 0, -1.0, 1.0))])[:, None]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.resample import interpolate
 
 FIRST_START = 0.6
 START_SPACING = 0.2
@@ -99,19 +100,19 @@ def find_windows(
     ends = starts[:, None] + np.asarray(horizons)
     return Windows(
         start=starts,
-        position=_at(log.time, log.position, starts + delay),
-        velocity=_at(log.time, log.velocity, starts + delay),
-        quaternion=_unit(_at(log.time, log.quaternion, starts + delay)),
-        body_rate=_at(log.time, log.body_rate, starts),
+        position=interpolate(log.time, log.position, starts + delay),
+        velocity=interpolate(log.time, log.velocity, starts + delay),
+        quaternion=_unit(interpolate(log.time, log.quaternion, starts + delay)),
+        body_rate=interpolate(log.time, log.body_rate, starts),
         row=_row(log.time, starts),
         step=step,
         command=command,
         rotor_speed=_measured_rotor_speed(log, boundary),
         at=at,
-        true_position=_at(log.time, log.position, ends + delay),
-        true_velocity=_at(log.time, log.velocity, ends + delay),
-        true_quaternion=_unit(_at(log.time, log.quaternion, ends + delay)),
-        true_body_rate=_at(log.time, log.body_rate, ends),
+        true_position=interpolate(log.time, log.position, ends + delay),
+        true_velocity=interpolate(log.time, log.velocity, ends + delay),
+        true_quaternion=_unit(interpolate(log.time, log.quaternion, ends + delay)),
+        true_body_rate=interpolate(log.time, log.body_rate, ends),
     )
 
 
@@ -131,12 +132,6 @@ def _plan(time: np.ndarray, t0: float, horizons: tuple[float, ...]) -> tuple[np.
 
 def _row(time: np.ndarray, instants: np.ndarray) -> np.ndarray:
     return np.clip(np.searchsorted(time, instants + 1e-9, side="right") - 1, 0, len(time) - 1)
-
-
-def _at(time: np.ndarray, values: np.ndarray, instants: np.ndarray) -> np.ndarray:
-    """Linear interpolation of (n, k) values at instants of any shape."""
-    columns = [np.interp(instants, time, values[:, k]) for k in range(values.shape[1])]
-    return np.stack(columns, axis=-1)
 
 
 def _unit(quaternion: np.ndarray) -> np.ndarray:

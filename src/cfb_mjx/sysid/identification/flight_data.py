@@ -132,10 +132,19 @@ def _runs(mask: np.ndarray):
     return [range(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def white_noise(values: np.ndarray) -> np.ndarray:
-    """(k,) white noise on a smooth (n, k) signal from its third differences (variance factor 20), robustly."""
-    third = np.diff(values, n=3, axis=0)
-    return 1.4826 * np.nanmedian(np.abs(third), axis=0) / np.sqrt(20.0)
+def white_noise(values: np.ndarray, time: np.ndarray | None = None) -> np.ndarray:
+    """(k,) white noise on a smooth (n, k) signal from its third differences, robustly.
+
+    With the rows' ``time`` (s) they are divided differences: at uneven rows plain ones take steady motion for noise.
+    """
+    if time is None:
+        third = np.diff(values, n=3, axis=0) / np.sqrt(20.0)
+    else:
+        t = np.stack([time[i : len(time) - 3 + i] for i in range(4)])
+        weight = np.stack([1 / np.prod([t[i] - t[j] for j in range(4) if j != i], axis=0) for i in range(4)])
+        weight /= np.linalg.norm(weight, axis=0)
+        third = sum(weight[i, :, None] * values[i : len(time) - 3 + i] for i in range(4))
+    return 1.4826 * np.nanmedian(np.abs(third), axis=0)
 
 
 def _noise(log: FlightLog) -> tuple[np.ndarray, np.ndarray, float]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.sysid.evaluation import Evaluation, LogEvaluation
+from cfb_mjx.sysid.identification.flight_data import white_noise
 from cfb_mjx.sysid.metrics import QUANTITIES
 from cfb_mjx.sysid.tracing.whitening import Levels
 
@@ -34,21 +35,9 @@ def noise_floor(evaluation: Evaluation, levels: Levels | None = None) -> dict[st
 def sensor_levels(log: FlightLog) -> dict[str, np.ndarray]:
     """White noise of a row: position (3) m, velocity (3) m/s, angle () rad, gyro (3) rad/s."""
     # Noise of three angles is twice that of the quaternion's vector part, and leaves its norm alone.
-    angle = 2 * np.sqrt(np.sum(_white(log.time, log.quaternion) ** 2) / 3)
+    angle = 2 * np.sqrt(np.sum(white_noise(log.quaternion, log.time) ** 2) / 3)
     columns = {"position": log.position, "velocity": log.velocity, "gyro": log.body_rate}
-    return {key: _white(log.time, values) for key, values in columns.items()} | {"angle": angle}
-
-
-def _white(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(k,) white noise on a smooth (n, k) signal, robustly.
-
-    Third divided differences: at uneven rows plain ones would take a steady motion for noise.
-    """
-    t = np.stack([time[i : len(time) - 3 + i] for i in range(4)])
-    weight = np.stack([1 / np.prod([t[i] - t[j] for j in range(4) if j != i], axis=0) for i in range(4)])
-    weight /= np.linalg.norm(weight, axis=0)
-    third = sum(weight[i, :, None] * values[i : len(time) - 3 + i] for i in range(4))
-    return 1.4826 * np.nanmedian(np.abs(third), axis=0)
+    return {key: white_noise(values, log.time) for key, values in columns.items()} | {"angle": angle}
 
 
 def _squares(evaluated: LogEvaluation, horizons: tuple[float, ...], levels: Levels | None) -> np.ndarray:

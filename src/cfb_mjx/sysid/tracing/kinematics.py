@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.resample import interpolate
+from cfb_mjx.logs.rotation import tidy
 from cfb_mjx.logs.rotation import to_world as rotate
 
 SHORT, LONG = 0.12, 0.6
@@ -53,10 +55,9 @@ def compare_sensors(log: FlightLog, delay: float, gravity: float = 9.81) -> Kine
     covered = _covered(log, grid)
 
     def at(values, shift=0.0):
-        return np.stack([np.interp(grid + shift, log.time, column) for column in values.T], axis=1)
+        return interpolate(log.time, values, grid + shift)
 
-    quaternion = at(_continuous(log.quaternion), delay)
-    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    quaternion = tidy(at(tidy(log.quaternion), delay))
     velocity, position = at(log.velocity, delay), at(log.position, delay)
     world = rotate(quaternion, at(log.specific_force)) - [0, 0, gravity]
     gyro = at(log.body_rate)
@@ -115,7 +116,7 @@ def _integral(values: np.ndarray, step: float) -> np.ndarray:
 def _span(total: np.ndarray, rows: int, lag: float, step: float) -> np.ndarray:
     """Differences of an integral over spans that begin ``lag`` seconds earlier."""
     index = np.arange(len(total))
-    moved = np.stack([np.interp(index - lag / step, index, column) for column in total.T], axis=1)
+    moved = interpolate(index, total, index - lag / step)
     return moved[rows:] - moved[:-rows]
 
 
@@ -175,8 +176,3 @@ def _lag(missing, ok) -> tuple[float, float]:
     lag = LAGS[best] + (0.5 * width * (before - after) / curve if curve > 0 else 0.0)
     samples = ok.sum() / 8
     return float(lag), float(samples * max(curve, 0.0) / width**2 / max(here, 1e-12))
-
-
-def _continuous(quaternion: np.ndarray) -> np.ndarray:
-    flips = np.sign(np.sum(quaternion[1:] * quaternion[:-1], axis=1))
-    return quaternion * np.concatenate([[1.0], np.cumprod(np.where(flips < 0, -1.0, 1.0))])[:, None]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import jax.numpy as jnp
 import numpy as np
 
+from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import to_body
 from cfb_mjx.sysid.flight import Flight
 from cfb_mjx.sysid.tracing.gram import driven_by, residual_blocks
@@ -156,9 +157,9 @@ class Smoother:
             step = float(np.median(np.diff(t)))
             grid = np.arange(t[0], t[-1] + 0.5 * step, step)
             columns = values[stretch].reshape(len(t), -1)
-            even = np.stack([np.interp(grid, t, column) for column in columns.T], axis=1)
+            even = interpolate(t, columns, grid)
             found = gaussian_filter1d(even, self.width / step, axis=0, order=order, mode="nearest") / step**order
-            back = np.stack([np.interp(t, grid, column) for column in found.T], axis=1)
+            back = interpolate(grid, found, t)
             out[stretch] = back.reshape(values[stretch].shape)
         return out
 
