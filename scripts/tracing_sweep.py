@@ -23,6 +23,7 @@ from plants import EFFECTS, Case, fly_campaigns, label  # noqa: E402
 from cfb_mjx.cli.runtime import configure_jax, environment  # noqa: E402
 from cfb_mjx.files import write_text  # noqa: E402
 from cfb_mjx.parameters import load_model_file  # noqa: E402
+from cfb_mjx.sysid.tracing.trace import ERRORS  # noqa: E402
 
 BATCH = 12
 WEAK = 0.35
@@ -39,11 +40,6 @@ MIXTURES = [
     ("wind", "motor_gain_mismatch"),
     ("motor_second_order", "parasitic_drag"),
     ("thrust_scale", "ground_effect", "rotor_drag"),
-]
-KEYS = [
-    f"{quantity}@{horizon}s"
-    for horizon in ("0.2", "0.5")
-    for quantity in ("position_rmse_m", "velocity_rmse_mps", "attitude_rmse_deg", "rate_rmse_radps")
 ]
 
 
@@ -105,19 +101,19 @@ def run(wanted: list[Case], results: Path) -> None:
 
 
 def _pick(metrics: dict) -> dict:
-    return {key: metrics[key] for key in KEYS}
+    return {key: metrics[key] for key in ERRORS}
 
 
 def achievable(line: dict) -> float:
     """Largest share by which a perfect model would lower an error."""
-    return max(1 - line["perfect"][key] / line["before"][key] for key in KEYS)
+    return max(1 - line["perfect"][key] / line["before"][key] for key in ERRORS)
 
 
 def recovered(line: dict) -> float:
     """Share of the achievable improvement reached, mean over errors a perfect model lowers by a tenth or more."""
     shares = [
         (line["before"][key] - line["after"][key]) / (line["before"][key] - line["perfect"][key])
-        for key in KEYS
+        for key in ERRORS
         if line["perfect"][key] < 0.9 * line["before"][key]
     ]
     return float(np.mean(np.minimum(shares, 1.0))) if shares else float("nan")

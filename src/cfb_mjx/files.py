@@ -7,7 +7,7 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from cfb_mjx.errors import CfbError
@@ -62,6 +62,24 @@ def require_folder(*paths: str | os.PathLike | None) -> None:
             raise CfbError(f"{path}: the folder {Path(path).parent} does not exist; create it first.")
 
 
+def output_folder(path: str | os.PathLike) -> Path:
+    """Make the folder a command writes its files into, with those above it, before any work is done.
+
+    Raises:
+        CfbError: a file is in the way, or the folder cannot be made.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise CfbError(f"{path}: there is a file in the way; give the name of a folder for the results.") from None
+    except OSError as error:
+        raise CfbError(
+            f"{path}: this folder cannot be made ({error.strerror or error}); choose another place."
+        ) from None
+    return path
+
+
 def read_bytes(path: str | os.PathLike, count: int = -1) -> bytes:
     """The first ``count`` bytes of a file, all of it by default.
 
@@ -87,16 +105,17 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 
 def write_json(path: str | os.PathLike, value: object) -> None:
     """Write ``value`` as JSON atomically; NaN and infinities, which JSON lacks, become null."""
-    write_text(path, json.dumps(_plain(value), indent=1) + "\n")
+    write_text(path, json.dumps(plain(value), indent=1) + "\n")
 
 
-def _plain(value):
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
+def plain(value):
+    """JSON terms only: arrays become lists; NaN and infinities, which JSON lacks, become null."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [plain(v) for v in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

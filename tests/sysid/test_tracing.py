@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import jax.numpy as jnp
@@ -10,13 +11,16 @@ import pytest
 from plants import Case, fly_campaigns
 from scipy.stats import norm
 
+from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import CATALOGUE, RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
+from cfb_mjx.sysid.tracing.columns import term_columns
 from cfb_mjx.sysid.tracing.evidence import evidence
+from cfb_mjx.sysid.tracing.formula import with_library
 from cfb_mjx.sysid.tracing.lines import find_lines
 from cfb_mjx.sysid.tracing.outcome import close_loop
 from cfb_mjx.sysid.tracing.residuals import residual_rows
@@ -169,7 +173,7 @@ def test_an_interrupted_search_goes_on(closed, base):
     outcome, path = closed
     saved = Checkpoint(path, "key", json.loads(path.read_text()))
     nothing = outcome.trace.search.nothing()
-    hypothesis, _, _, _ = saved.restore(nothing)
+    hypothesis, _, _ = saved.restore(nothing)
     assert hypothesis.present == ("rotor_drag",)
     drag = hypothesis.effect("rotor_drag")
     np.testing.assert_allclose(drag.coefficient, outcome.hypothesis.effect("rotor_drag").coefficient, rtol=0.2)
@@ -197,3 +201,29 @@ def test_all_effects_at_neutral_replay_like_the_bare_model(campaigns, base):
     for key, value in bare.items():
         assert full[key] == pytest.approx(value, rel=1e-9)
     assert jnp.isfinite(jnp.asarray(list(full.values()))).all()
+
+
+@pytest.mark.parametrize("axis", [1, 3])
+def test_terms_of_formulas_are_the_derivatives_by_their_numbers(closed, axis):
+    """Without replaying the model for each: so they must agree with replays."""
+    outcome, _ = closed
+    search, hypothesis = with_library(outcome.trace.search, outcome.hypothesis)
+    search = dataclasses.replace(search, logs=search.logs[:1], _flights={})
+    own, library = search.own_columns(hypothesis), term_columns(axis)
+    quick = search.linearise_terms(hypothesis, own)[axis]
+    slow = search.linearise(hypothesis, own + library, 64)
+    a, b = (x.blocks[:, :, [0, *x.index(own + library)]][:, [0, *x.index(own + library)]] for x in (quick, slow))
+    size = np.sqrt(np.einsum("bii->bi", b)) + 1e-30
+    assert np.max(np.abs(a - b) / (size[:, :, None] * size[:, None, :])) < 0.01
+
+
+@pytest.mark.parametrize("value", ["fast", None, float("nan"), True])
+def test_a_sensor_fault_without_a_sensible_number_is_refused(value):
+    item = {"name": "sensor_delay", "parameters": {"delay": value}}
+    with pytest.raises(CfbError, match="drone.yaml: effects.sensor_delay.parameters.delay"):
+        SensorFaults.from_mappings([item], "drone.yaml")
+
+
+def test_an_unknown_sensor_fault_is_refused(base):
+    with pytest.raises(CfbError, match="unknown effect 'sensor_mood'"):
+        Quadrotor.from_file(dataclasses.replace(base, effects=({"name": "sensor_mood"},)))

@@ -219,7 +219,7 @@ def test_nothing_and_unexplained_in_words(outcome):
 
 
 def test_every_effect_has_words():
-    names = {*CATALOGUE, *words.FAULT_UNITS}
+    names = {*CATALOGUE, *SENSOR_FAULTS}
     assert names <= set(words.MEANING)
     assert names <= set(words.EXPERIMENTS)
     for signal in (OFFSET, *UNITS):

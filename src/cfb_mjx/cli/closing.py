@@ -8,8 +8,8 @@ from pathlib import Path
 from cfb_mjx.cli.fitted_model import provenance
 from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import write_json
-from cfb_mjx.logs import FlightLog, read_log
+from cfb_mjx.files import output_folder, write_json
+from cfb_mjx.logs import FlightLog, read_log, require_own_names
 
 LEAST_SECONDS = 10.0
 """Of flight to fit: below this nothing could be told from chance."""
@@ -22,10 +22,7 @@ def run_close_loop(fit: list[Path], held_out: list[Path], output: Path, model: s
         CfbError: bad logs, a log on both sides, a bad model, or a folder that cannot be written.
     """
     logs, judged = _read(fit, held_out)
-    if output.exists() and not output.is_dir():
-        raise CfbError(f"{output}: this is a file; give the name of a folder for the report.")
-    if not output.absolute().parent.is_dir():
-        raise CfbError(f"{output}: the folder {output.absolute().parent} does not exist; create it first.")
+    output_folder(output)
     configure_jax(x64=True)
     from cfb_mjx.cli.evaluating import changed_model
     from cfb_mjx.parameters import save_model_file
@@ -34,7 +31,6 @@ def run_close_loop(fit: list[Path], held_out: list[Path], output: Path, model: s
     from cfb_mjx.view.closing import write_report
 
     base = changed_model(model, changes)
-    output.mkdir(exist_ok=True)
     checkpoint = Checkpoint.open(output / "search.json", fit, base)
     outcome = close_loop(logs, judged, base, _say, checkpoint)
     story = provenance("close-loop", base.name, "fit_logs_sha256", fit, held_out=[path.name for path in held_out])
@@ -59,10 +55,7 @@ def _read(fit: list[Path], held_out: list[Path]) -> tuple[list[FlightLog], list[
         raise CfbError(f"{names}: given to --fit and to --held-out; nothing may be judged on what it was fitted to.")
     logs, judged = [read_log(path) for path in fit], [read_log(path) for path in held_out]
     for group in (logs, judged):
-        names = [log.name for log in group]
-        for name in names:
-            if names.count(name) > 1:
-                raise CfbError(f"{name}: two logs have this name; rename one file, results are listed by name.")
+        require_own_names(group)
     if sum(log.duration for log in logs) < LEAST_SECONDS:
         raise CfbError(f"--fit: less than {LEAST_SECONDS:g} s of flight; give longer or more logs.")
     return logs, judged

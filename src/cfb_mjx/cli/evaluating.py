@@ -43,7 +43,7 @@ def run_evaluate(
     from cfb_mjx.sysid.sensor_faults import SensorFaults
 
     settings = Observer() if observer else None
-    faults = SensorFaults.from_mappings(described.effects)
+    faults = SensorFaults.from_mappings(described.effects, model)
     evaluation = evaluate(
         Quadrotor.from_file(described), logs, progress=Progress("evaluating"), observer=settings, faults=faults
     )

@@ -5,7 +5,7 @@ Importing this package loads numpy only; pyarrow, mcap and protobuf are loaded b
 
 from cfb_mjx.logs.alignment import AlignmentEstimate, apply_shift, estimate_command_shift
 from cfb_mjx.logs.crazyswarm import read_crazyswarm
-from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.flight_log import FlightLog, require_own_names
 from cfb_mjx.logs.idsia import read_idsia
 from cfb_mjx.logs.mcap_reader import read_mcap
 from cfb_mjx.logs.mcap_writer import write_mcap
@@ -32,6 +32,7 @@ __all__ = [
     "read_radio_csv",
     "read_tabular",
     "read_usd_card",
+    "require_own_names",
     "resample",
     "validate",
     "write_mcap",

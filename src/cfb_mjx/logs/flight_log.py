@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import plain
 from cfb_mjx.logs.gaps import longest_step, stretches
 
 REQUIRED = ("time", "position", "velocity", "quaternion", "body_rate", "specific_force", "command")
@@ -73,9 +74,9 @@ class FlightLog:
             array.flags.writeable = False
             object.__setattr__(self, field, array)
         # Through JSON, so that what is stored in a file is exactly what was in memory.
-        plain = json.loads(json.dumps(_to_plain(self.metadata), allow_nan=False))
+        given = json.loads(json.dumps(plain(self.metadata), allow_nan=False))
         defaults = {"name": "log", "source": "", "format": "memory", "observation_delay": None}
-        object.__setattr__(self, "metadata", MappingProxyType(defaults | plain))
+        object.__setattr__(self, "metadata", MappingProxyType(defaults | given))
 
     @property
     def name(self) -> str:
@@ -143,6 +144,18 @@ class FlightLog:
         return FlightLog, (*(getattr(self, f) for f in (*REQUIRED, *OPTIONAL)), dict(self.metadata))
 
 
+def require_own_names(logs: Sequence[FlightLog]) -> None:
+    """Refuse two logs of one name: results are listed by name.
+
+    Raises:
+        CfbError: names the log.
+    """
+    names = [log.name for log in logs]
+    for name in names:
+        if names.count(name) > 1:
+            raise CfbError(f"{name}: two logs have this name; rename one file, results are listed by name.")
+
+
 def quantise_time(time: np.ndarray) -> np.ndarray:
     """Round times (s) to whole nanoseconds, the resolution log files keep; applying it twice changes nothing."""
     return from_nanoseconds(*to_nanoseconds(time))
@@ -160,16 +173,3 @@ def to_nanoseconds(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def from_nanoseconds(seconds: np.ndarray, nanos: np.ndarray) -> np.ndarray:
     """Inverse of `to_nanoseconds`."""
     return np.asarray(seconds, dtype=np.float64) + np.asarray(nanos, dtype=np.float64) / 1e9
-
-
-def _to_plain(value):
-    """JSON terms only: arrays become lists, and NaN and infinities, which JSON lacks, become None."""
-    if isinstance(value, Mapping):
-        return {str(k): _to_plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_to_plain(v) for v in value]
-    if hasattr(value, "tolist"):
-        return _to_plain(value.tolist())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import rotors
 from cfb_mjx.model.bodies import Body, RigidBody
-from cfb_mjx.model.effects import Condition, Effect, Motors, Wrench, effect_from_mapping, overrides
+from cfb_mjx.model.effects import SENSOR_FAULTS, Condition, Effect, Motors, Wrench, effect_from_mapping, overrides
 from cfb_mjx.model.integrate import END, INTEGRATORS, MIDDLE, START
 from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec, rotate_inverse
@@ -64,7 +64,7 @@ class Quadrotor(eqx.Module):
         where = str(model) if not isinstance(model, ModelFile) else model.name
         model = model if isinstance(model, ModelFile) else load_model_file(model)
         # What a model file says of the sensors does not change how the drone flies.
-        physical = (item for item in model.effects if not str(item.get("name")).startswith("sensor_"))
+        physical = (item for item in model.effects if item.get("name") not in SENSOR_FAULTS)
         effects = tuple(effect_from_mapping(item, where) for item in physical)
         return cls(parameters=model.parameters(), effects=effects, **choices)
 

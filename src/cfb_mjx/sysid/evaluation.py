@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs import FlightLog, require_own_names
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.sysid import metrics
 from cfb_mjx.sysid.observer import Observer, at_starts, observe, observed_model
@@ -94,10 +94,7 @@ def evaluate(
     Raises:
         CfbError: two logs of one name, or no log allows a window.
     """
-    names = [log.name for log in logs]
-    for name in names:
-        if names.count(name) > 1:
-            raise CfbError(f"{name}: two logs have this name; rename one file, results are listed by name.")
+    require_own_names(logs)
     precise = Quadrotor(model.parameters, model.effects, body=model.body, integrator="rk4", rotor_loads="instant")
     results = []
     for index, log in enumerate(logs):
@@ -105,9 +102,8 @@ def evaluate(
         if progress is not None:
             progress(index + 1, len(logs))
     if not any(len(result.windows) for result in results):
-        raise CfbError(
-            f"{', '.join(names)}: no prediction window fits; a log must fly at least 1.2 s without a gap in its data."
-        )
+        names = ", ".join(log.name for log in logs)
+        raise CfbError(f"{names}: no prediction window fits; a log must fly at least 1.2 s without a gap in its data.")
     variants = VARIANTS if observer is None else VARIANTS + OBSERVED
     return Evaluation(tuple(results), tuple(horizons), variants)
 

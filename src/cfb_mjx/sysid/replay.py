@@ -10,6 +10,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.model import rotors
@@ -123,8 +124,6 @@ def smoothed_rotor_speed(flight: Flight, modelled: Array, width: float = 0.012) 
 
     Errors in a regressor pull what multiplies it towards zero, most of all the rotors' acceleration.
     """
-    import numpy as np
-
     error = np.asarray(flight.rotor_speed) - np.asarray(modelled)
     step = float(np.median(np.asarray(flight.interval)[np.asarray(flight.interval) > 0]))
     reach = max(1, int(np.ceil(3 * width / step)))

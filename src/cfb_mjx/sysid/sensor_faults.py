@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import tidy
 from cfb_mjx.model import State
+from cfb_mjx.model.effects import SENSOR_FAULTS
 
-UNITS = {
-    "sensor_delay": ("delay", "s"),
-    "sensor_velocity_scale": ("scale", "1"),
-    "sensor_gyro_lowpass": ("lag", "s"),
-    "sensor_time_shift": ("shift", "s"),
+ATTRIBUTES = {
+    "sensor_delay": "delay",
+    "sensor_velocity_scale": "velocity_scale",
+    "sensor_gyro_lowpass": "gyro_lag",
+    "sensor_time_shift": "motor_shift",
 }
-"""Field and unit of every fault a model file may list among its effects."""
+"""Attribute of `SensorFaults` that holds a fault of `SENSOR_FAULTS`."""
 
 
 @dataclass(frozen=True)
@@ -94,26 +98,33 @@ class SensorFaults:
 
     def to_mappings(self) -> list[dict]:
         """As listed among the effects of a model file."""
-        values = (self.delay, self.velocity_scale, self.gyro_lag, self.motor_shift)
-        healthy = SensorFaults()
-        usual = (healthy.delay, healthy.velocity_scale, healthy.gyro_lag, healthy.motor_shift)
         return [
-            {"name": name, "parameters": {field: value}}
-            for (name, (field, _)), value, normal in zip(UNITS.items(), values, usual, strict=True)
-            if value != normal
+            {"name": name, "parameters": {fault.parameter: getattr(self, ATTRIBUTES[name])}}
+            for name, fault in SENSOR_FAULTS.items()
+            if getattr(self, ATTRIBUTES[name]) != fault.healthy
         ]
 
     @classmethod
-    def from_mappings(cls, items) -> SensorFaults:
-        """The faults among the effects of a model file."""
-        found = {item["name"]: (item.get("parameters") or {}) for item in items if item.get("name") in UNITS}
-        pick = {name: values.get(UNITS[name][0]) for name, values in found.items()}
-        return cls(
-            delay=float(pick.get("sensor_delay") or 0.0),
-            velocity_scale=float(pick.get("sensor_velocity_scale") or 1.0),
-            gyro_lag=float(pick.get("sensor_gyro_lowpass") or 0.0),
-            motor_shift=float(pick.get("sensor_time_shift") or 0.0),
-        )
+    def from_mappings(cls, items: Iterable[Mapping], where: str) -> SensorFaults:
+        """The faults among the effects of a model file.
+
+        Raises:
+            CfbError: a fault without its number, or with something else; ``where`` is the file.
+        """
+        found = {}
+        for item in items:
+            name = item.get("name")
+            if name not in SENSOR_FAULTS:
+                continue
+            key, values = SENSOR_FAULTS[name].parameter, item.get("parameters")
+            value = values.get(key) if isinstance(values, Mapping) else None
+            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+            if not number or (name == "sensor_velocity_scale" and value <= 0):
+                raise CfbError(
+                    f"{where}: effects.{name}.parameters.{key} = {value!r} must be a number that makes sense."
+                )
+            found[ATTRIBUTES[name]] = float(value)
+        return cls(**found)
 
 
 HEALTHY = SensorFaults()

@@ -85,7 +85,8 @@ def find_windows(
         starts: window starts, s, in place of those of `find_starts`.
     """
     starts = find_starts(log, horizons, delay) if starts is None else starts
-    plans = [_plan(log.time, t0, horizons) for t0 in starts]
+    ticks = np.ceil(log.time / COMMAND_TICK - 1e-6) * COMMAND_TICK
+    plans = [_plan(ticks, t0, horizons) for t0 in starts]
     width = max((len(edges) - 1 for edges, _, _ in plans), default=0)
     count, reach = len(starts), len(horizons)
     step, at = np.zeros((count, width)), np.zeros((count, reach), dtype=int)
@@ -116,18 +117,20 @@ def find_windows(
     )
 
 
-def _plan(time: np.ndarray, t0: float, horizons: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Step boundaries from t0 to the last horizon, the row whose command holds in each step, horizon indices."""
-    time = np.ceil(time / COMMAND_TICK - 1e-6) * COMMAND_TICK
+def _plan(ticks: np.ndarray, t0: float, horizons: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Step boundaries from t0 to the last horizon, the row whose command holds in each step, horizon indices.
+
+    ``ticks`` are the instants the commands of the rows take effect.
+    """
     ends = t0 + np.asarray(horizons)
-    inside = time[(time > t0 + 1e-9) & (time < ends[-1] - 1e-9)]
+    inside = ticks[np.searchsorted(ticks, t0 + 1e-9, side="right") : np.searchsorted(ticks, ends[-1] - 1e-9)]
     marks = np.unique(np.concatenate([[t0], inside, ends]))
     # Two marks that differ by rounding only are one.
     marks = marks[np.concatenate([[True], np.diff(marks) > 1e-9])]
     pieces = np.ceil(np.diff(marks) / LONGEST_STEP - 1e-9).astype(int)
-    edges = [np.linspace(a, b, n, endpoint=False) for a, b, n in zip(marks[:-1], marks[1:], pieces, strict=True)]
-    edges = np.concatenate([*edges, marks[-1:]])
-    return edges, _row(time, edges[:-1]), np.searchsorted(edges, ends - 2e-9)
+    nth = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    edges = np.append(np.repeat(marks[:-1], pieces) + nth * np.repeat(np.diff(marks) / pieces, pieces), marks[-1])
+    return edges, _row(ticks, edges[:-1]), np.searchsorted(edges, ends - 2e-9)
 
 
 def _row(time: np.ndarray, instants: np.ndarray) -> np.ndarray:

@@ -66,9 +66,9 @@ def look(outcome: Outcome, logs: list[FlightLog]) -> Looked:
     predictions = pool_predictions(outcome.before, rows[0]), pool_predictions(outcome.after, rows[1])
     found = [_stacked(structure(p), structure(q, PREDICTION_BINS)) for p, q in zip(pooled, predictions, strict=True)]
     # Predictions have commands in; measured rotor speeds would bring noise of their own.
-    blind = replace(judge, logs=[log.replace(rotor_speed=None) for log in judge.logs], levels=FIRST.copy(), _flights={})
-    blind.learn_levels(hypothesis)
-    random = noise_floor(outcome.after, levels_from(jnp.asarray(blind.levels), blind.noise))
+    blind = replace(judge, logs=[log.replace(rotor_speed=None) for log in judge.logs], _flights={})
+    levels = blind.learned(replace(hypothesis, levels=FIRST)).levels
+    random = noise_floor(outcome.after, levels_from(jnp.asarray(levels), blind.noise))
     return Looked(judge, rows, pooled, predictions, (found[0], found[1]), noise_floor(outcome.after), random)
 
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cfb_mjx.model.effects import CATALOGUE
-from cfb_mjx.sysid.sensor_faults import UNITS as FAULT_UNITS
+from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS
 from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
 
 MEANING = {
@@ -88,12 +87,12 @@ _COMPONENTS = {2: ("x", "y"), 3: ("x", "y", "z"), 4: ("M1", "M2", "M3", "M4")}
 
 def is_fault(name: str) -> bool:
     """Whether a name is one of the recording's faults and not physics."""
-    return name in FAULT_UNITS
+    return name in SENSOR_FAULTS
 
 
 def unit_of(name: str, field: str) -> str:
     """Unit of a parameter of an effect or fault; empty for plain ratios."""
-    unit = FAULT_UNITS[name][1] if is_fault(name) else CATALOGUE[name].units.get(field, "1")
+    unit = SENSOR_FAULTS[name].unit if is_fault(name) else CATALOGUE[name].units.get(field, "1")
     return "" if unit == "1" else unit.replace("^2", "²")
 
 

@@ -3,7 +3,13 @@
 from cfb_mjx.model.effects.base import Condition, Effect, Memory, Motors, Reading, Wrench, overrides
 from cfb_mjx.model.effects.battery_sag import BatterySag
 from cfb_mjx.model.effects.blade_flapping import BladeFlapping
-from cfb_mjx.model.effects.catalogue import CATALOGUE, KNOWN, effect_from_mapping, effect_to_mapping
+from cfb_mjx.model.effects.catalogue import (
+    CATALOGUE,
+    KNOWN,
+    SENSOR_FAULTS,
+    effect_from_mapping,
+    effect_to_mapping,
+)
 from cfb_mjx.model.effects.cog_offset import CogOffset
 from cfb_mjx.model.effects.command_delay import CommandDelay
 from cfb_mjx.model.effects.esc_rate_limit import EscRateLimit
@@ -29,6 +35,7 @@ from cfb_mjx.model.effects.wind import Wind
 __all__ = [
     "CATALOGUE",
     "KNOWN",
+    "SENSOR_FAULTS",
     "BatterySag",
     "BladeFlapping",
     "CogOffset",

@@ -64,7 +64,25 @@ CATALOGUE: dict[str, type[Effect]] = {
 
 
 KNOWN: dict[str, type[Effect]] = CATALOGUE | {ResidualFormula.name: ResidualFormula}
-"""What a model file may name: the catalogue, and formulas, which a search turns to only when the catalogue fails."""
+"""The physics a model file may name: the catalogue, and formulas, which a search turns to only when it fails."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorFault:
+    """One thing that can be wrong with a recording: its parameter in a model file, unit and value when healthy."""
+
+    parameter: str
+    unit: str
+    healthy: float
+
+
+SENSOR_FAULTS: dict[str, SensorFault] = {
+    "sensor_delay": SensorFault("delay", "s", 0.0),
+    "sensor_velocity_scale": SensorFault("scale", "1", 1.0),
+    "sensor_gyro_lowpass": SensorFault("lag", "s", 0.0),
+    "sensor_time_shift": SensorFault("shift", "s", 0.0),
+}
+"""What a model file may name beside physics: it changes what is recorded, not how the drone flies."""
 
 
 def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
@@ -75,7 +93,7 @@ def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
     """
     name = item.get("name")
     if not isinstance(name, str) or name not in KNOWN:
-        raise CfbError(f"{where}: unknown effect {name!r}; known are {', '.join(sorted(KNOWN))}.")
+        raise CfbError(f"{where}: unknown effect {name!r}; known are {', '.join(sorted([*KNOWN, *SENSOR_FAULTS]))}.")
     kind = KNOWN[name]
     fields = {field.name for field in dataclasses.fields(kind)}
     values = item.get("parameters") or {}

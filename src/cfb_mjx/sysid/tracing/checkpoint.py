@@ -40,7 +40,7 @@ class Checkpoint:
             state = found if isinstance(found, dict) and found.get("key") == key else None
         return cls(path, key, state)
 
-    def save(self, hypothesis: Hypothesis, levels: np.ndarray, refused: set[str], tried: list[dict]) -> None:
+    def save(self, hypothesis: Hypothesis, refused: set[str], tried: list[dict]) -> None:
         """Remember where the search is."""
         if self.path is None:
             return
@@ -51,14 +51,14 @@ class Checkpoint:
             "effects": [{"name": e["name"], "parameters": e["parameters"]} for e in effects],
             "lead": hypothesis.lead,
             "shift": hypothesis.shift,
-            "levels": levels.tolist(),
+            "levels": hypothesis.levels.tolist(),
             "refused": sorted(refused),
             "tried": tried,
         }
         write_json(self.path, self.state)
 
-    def restore(self, nothing: Hypothesis) -> tuple[Hypothesis, np.ndarray, set[str], list[dict]] | None:
-        """The hypothesis, noise levels, refused effects and history that were saved; None if there are none."""
+    def restore(self, nothing: Hypothesis) -> tuple[Hypothesis, set[str], list[dict]] | None:
+        """The hypothesis, refused effects and history that were saved; None if there are none."""
         if self.state is None:
             return None
         try:
@@ -72,8 +72,9 @@ class Checkpoint:
             present=tuple(self.state["present"]),
             lead=self.state["lead"],
             shift=self.state["shift"],
+            levels=np.array(self.state["levels"]),
         )
-        return hypothesis, np.array(self.state["levels"]), set(self.state["refused"]), self.state["tried"]
+        return hypothesis, set(self.state["refused"]), self.state["tried"]
 
     def discard(self) -> None:
         """The search is done."""

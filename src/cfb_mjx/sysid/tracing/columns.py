@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.model.effects import KNOWN, Effect
-from cfb_mjx.model.effects.formula import PLACES, TERMS
+from cfb_mjx.model.effects.formula import PLACES, TERMS, ResidualFormula
 
 LEAD = "command_lead"
 """Nuisance: commands sent between two rows are not in the log. Always free, never reported as an effect."""
 SHIFT = "sensor_time_shift"
 """Not an effect of the catalogue but a fault of the recording: command and rotor-speed columns late or early."""
+FORMULA = ResidualFormula.name
 TORQUE_UNIT, FORCE_UNIT = 3e-5, 4e-3
 """Coefficients of a formula are counted in these: about 1 rad/s^2 and 0.1 m/s^2 on this drone."""
 _COARSE = {"esc_rate_limit": 0.125, "command_delay": 0.2, "motor_second_order": 0.3}
@@ -32,11 +33,6 @@ class Column:
     probe: tuple[tuple[str, float], ...] = ()
     scale: float = field(default=1.0, compare=False)
     """Half the prior range: the unit in which the search counts."""
-
-    @property
-    def label(self) -> str:
-        """As printed: the field, with the component's number where there are several."""
-        return self.field if self.index is None else f"{self.field}[{self.index}]"
 
 
 def neutral_effects(names: tuple[str, ...]) -> tuple[Effect, ...]:
@@ -85,9 +81,6 @@ def moved(effect: Effect, column: Column, by: float, present: bool) -> Effect:
     old = getattr(effect, column.field)
     new = old + by if column.index is None else old.at[column.index].add(by)
     return eqx.tree_at(lambda e: getattr(e, column.field), effect, new)
-
-
-FORMULA = "residual_formula"
 
 
 def term_columns(axis: int) -> list[Column]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import jax.numpy as jnp
 import numpy as np
 from scipy.stats import norm
 
-from cfb_mjx.sysid.tracing.gram import driven_by, residual_blocks
+from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.tracing.search import Hypothesis, Search
 from cfb_mjx.sysid.tracing.whitening import Blocks, Signals, innovations, levels_from
 
@@ -29,27 +30,29 @@ class Verdict:
 
 
 def confirm(search: Search, poorer: Hypothesis, richer: Hypothesis) -> Verdict:
-    """Compare two fitted hypotheses on the flights of ``search``, at its noise levels."""
-    levels = levels_from(jnp.asarray(search.levels), search.noise)
-    score, power, noise, count = 0.0, 0.0, 0.0, 0
-    for index in range(len(search.logs)):
-        pair = [_residual(search, hypothesis, index) for hypothesis in (poorer, richer)]
+    """Compare two fitted hypotheses on the flights of ``search``, at the noise levels of the poorer one."""
+    levels = levels_from(jnp.asarray(poorer.levels), search.noise)
+    score, power, noise = 0.0, 0.0, 0.0
+    for less, more in _flights(search, poorer, richer):
+        pair = search.residual(poorer, less)[0], search.residual(richer, more)[0]
         both = Signals(
             *(jnp.stack([getattr(p.signals, k) for p in pair], axis=-1) for k in ("quantity", "acceleration"))
         )
         e, _, _ = innovations(Blocks(both, pair[0].interval, pair[0].valid), levels)
-        less, more = np.asarray(e[..., 0]), np.asarray(e[..., 1])
-        said = less - more
-        rz, zz = (np.sum(x * said, axis=(1, 2)) for x in (less, said))
+        left, said = np.asarray(e[..., 0]), np.asarray(e[..., 0] - e[..., 1])
+        rz, zz = (np.sum(x * said, axis=(1, 2)) for x in (left, said))
         score, power = score + rz.sum(), power + zz.sum()
         noise += np.sum((rz - zz) ** 2)
-        count += len(rz)
     t = score / np.sqrt(max(noise, power, 1e-30))
     return Verdict(float(score - 0.5 * power), float(t), float(norm.sf(t)))
 
 
-def _residual(search: Search, hypothesis: Hypothesis, index: int) -> Blocks:
-    flight = search.flights(hypothesis)[index]
-    model = hypothesis.model(search.parameters)
-    driven = driven_by(model, flight, hypothesis.lead)
-    return residual_blocks(model, flight, driven, jnp.asarray(hypothesis.lead))
+def _flights(search: Search, poorer: Hypothesis, richer: Hypothesis) -> Iterator[tuple[Flight, Flight]]:
+    """Every flight as both read it, row by row: a shift of the motor columns costs rows at the ends and at gaps."""
+    if poorer.shift == richer.shift:
+        yield from zip(search.flights(poorer), search.flights(richer), strict=True)
+        return
+    for log in search.logs:
+        logs = [hypothesis.faults.repaired(log) for hypothesis in (poorer, richer)]
+        both = np.intersect1d(logs[0].time, logs[1].time)
+        yield tuple(prepare_flight(one.rows(np.isin(one.time, both)), search.delay) for one in logs)

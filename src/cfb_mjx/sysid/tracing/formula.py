@@ -62,15 +62,14 @@ def propose(
     own = search.own_columns(hypothesis)
     tried = sum(len(term_columns(axis)) for axis in range(6))
     chosen, gains = [], {}
-    for axis in range(6):
-        progress(f"looking for structure in what is left: {AXES[axis]}")
+    progress("looking for structure in what is left")
+    for axis, linear in enumerate(search.linearise_terms(hypothesis, own)):
         library = term_columns(axis)
-        linear = search.linearise(hypothesis, own + library, _WIDTH)
         base, picked = linear.index(own), []
         for _ in range(PER_AXIS):
             rest = [c for c in library if c not in picked]
             found = [
-                (evidence(linear.pooled, base + linear.index(picked), linear.index([c]), linear.scale), c) for c in rest
+                (evidence(linear.blocks, base + linear.index(picked), linear.index([c]), linear.scale), c) for c in rest
             ]
             best, column = max(found, key=lambda pair: pair[0].gain)
             if best.p_value * tried > ALPHA or best.gain < LEAST_GAIN:
@@ -88,9 +87,9 @@ def fit_formula(search: Search, hypothesis: Hypothesis, terms: list[Column]) -> 
         own = search.own_columns(richer)
         linear = search.linearise(richer, own, _WIDTH)
         index = linear.index(own)
-        values = solve(linear.pooled.sum(0), index, linear.scale)
+        values = solve(linear.blocks.sum(0), index, linear.scale)
         richer = search.moved(richer, own, np.concatenate([[0.0], values * linear.scale[index]]))
-    spread = covariance(linear.pooled, [1, *index], linear.scale, np.concatenate([[0.0], values]), 1 / LEAD_SPREAD**2)
+    spread = covariance(linear.blocks, [1, *index], linear.scale, np.concatenate([[0.0], values]), 1 / LEAD_SPREAD**2)
     deviation = np.sqrt(np.diag(spread))[1:] * linear.scale[index]
     return richer, deviation[len(own) - len(terms) :]
 
@@ -130,7 +129,7 @@ def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Colu
     """
     own = search.own_columns(hypothesis)
     linear = search.linearise(hypothesis, own, _WIDTH)
-    total = linear.pooled.sum(0) * np.outer(linear.scale, linear.scale)
+    total = linear.blocks.sum(0) * np.outer(linear.scale, linear.scale)
     effect = linear.index([c for c in own if c.effect == name and c not in terms])
     term = linear.index(terms)
     inside = total[np.ix_(term, term)]

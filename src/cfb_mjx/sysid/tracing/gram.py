@@ -5,19 +5,21 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.effects import Wrench
+from cfb_mjx.model.effects.formula import body_signals, place_signals
+from cfb_mjx.model.quadrotor import Quadrotor, at_rotor_center, conditions, prepare, remembering
+from cfb_mjx.model.state import State, unstack
+from cfb_mjx.model.vector import Vec, rotate_inverse
 from cfb_mjx.sysid.flight import Flight
 from cfb_mjx.sysid.replay import remembered, smoothed_rotor_speed
 from cfb_mjx.sysid.tracing.whitening import (
-    DOMAINS,
     Blocks,
     Levels,
     Signals,
+    accumulated,
     cut,
-    domain_of_channel,
     innovations,
     measured,
     predicted,
@@ -43,10 +45,8 @@ def residual_blocks(model: Quadrotor, flight: Flight, driven: Array, lead: Array
 
 
 @eqx.filter_jit
-def gram(
-    models: Quadrotor, flight: Flight, driven: Array, leads: Array, shifts: Array, steps: Array, levels: Levels
-) -> tuple[Float[Array, "b d c c"], Float[Array, "b d"]]:
-    """Inner products of the whitened residual and its derivatives, per block and domain; and how many rows count.
+def with_slopes(models: Quadrotor, flight: Flight, driven: Array, leads: Array, shifts: Array, steps: Array) -> Signals:
+    """The residual of a flight and, side by side along the last axis (c), its derivatives.
 
     Args:
         models: leaves of the effects with a leading axis (c): the model as it is, then moved by each step.
@@ -55,7 +55,6 @@ def gram(
         leads: (c,) command lead of each.
         shifts: (c,) s by which the motor columns of each are taken to be late.
         steps: (c - 1,) size of the moves, in the units of the columns.
-        levels: noise levels.
 
     Returns:
         Column 0 is the residual, the others are what the model would say more per unit of each number.
@@ -78,12 +77,40 @@ def gram(
         slopes = (s[1:] - s[:1]) / steps.reshape(-1, *([1] * base.ndim))
         return jnp.moveaxis(jnp.concatenate([base[None], slopes]), 0, -1)
 
-    signals = Signals(*(side_by_side(getattr(seen, k), getattr(said, k)) for k in ("quantity", "acceleration")))
-    e, _, use = innovations(cut(flight, signals), levels)
-    kind = domain_of_channel()
-    products, counts = [], []
-    for index in range(len(DOMAINS)):
-        part = e[:, :, np.flatnonzero(kind == index)]
-        products.append(jnp.einsum("brkc,brkd->bcd", part, part))
-        counts.append(jnp.sum(use[:, :, np.flatnonzero(kind == index)], axis=(1, 2)))
-    return jnp.stack(products, axis=1), jnp.stack(counts, axis=1)
+    return Signals(*(side_by_side(getattr(seen, k), getattr(said, k)) for k in ("quantity", "acceleration")))
+
+
+@eqx.filter_jit
+def term_slopes(model: Quadrotor, flight: Flight, driven: Array, axis: Array) -> Signals:
+    """What each term of the formulas' library (c: body terms, then places) along one axis (0..5) adds.
+
+    The same as the derivatives by a `ResidualFormula`'s numbers, without replaying the model for every one of them:
+    a wrench on the body does not change how the rotors run.
+    """
+
+    def between(x):
+        return 0.5 * (x + jnp.concatenate([x[1:], x[-1:]]))
+
+    prepared = prepare(model)
+    middle = (flight.position, flight.velocity, flight.quaternion, flight.body_rate, driven)
+    at = unstack(State(*map(between, middle)), prepared.parameters.center_of_gravity)
+    (seen,) = conditions(prepared, remembering(at, ((),)), at.rotor_speed)
+    along = [jnp.where(axis == i, 1.0, 0.0) for i in range(6)]
+
+    def signals(force: Vec, torque: Vec) -> Signals:
+        spin, push = at_rotor_center(prepared.parameters, Wrench(force, torque), Vec(0.0, 0.0, 0.0))
+        still = jnp.zeros((flight.time.shape[0], 4))
+        return accumulated(flight, spin.stack(), push.stack(), still, jnp.zeros(()))
+
+    found = [signals(Vec(*(a * s for a in along[3:])), Vec(*(a * s for a in along[:3]))) for s in body_signals(seen)]
+    for s in place_signals(seen):
+        pull = rotate_inverse(seen.quaternion, Vec(*(a * s for a in along[3:])))
+        found.append(signals(pull, Vec(0.0, 0.0, 0.0)))
+    return jax.tree.map(lambda *x: jnp.stack(x, axis=-1), *found)
+
+
+@eqx.filter_jit
+def inner_products(flight: Flight, signals: Signals, levels: Levels) -> Float[Array, "b c c"]:
+    """Inner products of whitened signals side by side, per block."""
+    e, _, _ = innovations(cut(flight, signals), levels)
+    return jnp.einsum("brkc,brkd->bcd", e, e)

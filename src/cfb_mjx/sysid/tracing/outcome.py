@@ -9,10 +9,10 @@ import numpy as np
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.model.effects import effect_to_mapping
+from cfb_mjx.model.effects import SENSOR_FAULTS, effect_to_mapping
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
-from cfb_mjx.sysid.sensor_faults import UNITS, SensorFaults
+from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import FORMULA
 from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
@@ -132,7 +132,7 @@ class Outcome:
                 effects.append(mapping | {"uncertainty": item.uncertainty, "p_value": item.p_value})
         if self.unexplained is not None and self.unexplained.proposal is not None:
             effects.append(effect_to_mapping(self.hypothesis.effect(FORMULA)))
-        replaced = {item["name"] for item in effects} | set(UNITS)
+        replaced = {item["name"] for item in effects} | set(SENSOR_FAULTS)
         kept = [item for item in self.base.effects if item["name"] not in replaced]
         named = ", ".join(item.name for item in self.reported) or "nothing"
         return replace(
@@ -193,7 +193,7 @@ def close_loop(
     lines = [a for a in lines if any(a.axis == b.axis and abs(a.frequency - b.frequency) < 0.1 for b in elsewhere)]
     unexplained = Unexplained(proposal, lines) if proposal or lines else None
     for fault in found.sensors.findings:
-        field = {"sensor_velocity_scale": "scale", "sensor_delay": "delay"}.get(fault.name, "lag")
+        field = SENSOR_FAULTS[fault.name].parameter
         reported.insert(0, Reported(fault.name, fault.p_value, {field: fault.value}, {field: fault.std}))
     faults = replace(found.sensors.faults, motor_shift=hypothesis.shift)
     after = evaluate(hypothesis.model(parameters), held_out, faults=faults)

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import to_body
 from cfb_mjx.sysid.flight import Flight
-from cfb_mjx.sysid.tracing.gram import driven_by, residual_blocks
 from cfb_mjx.sysid.tracing.search import Hypothesis, Search
 
 WIDTH = 0.02
@@ -90,9 +88,7 @@ def residual_rows(search: Search, hypothesis: Hypothesis) -> list[Residuals]:
 
 
 def _one(search: Search, hypothesis: Hypothesis, flight: Flight, name: str) -> Residuals:
-    model = hypothesis.model(search.parameters)
-    driven = driven_by(model, flight, hypothesis.lead)
-    blocks = residual_blocks(model, flight, driven, jnp.asarray(hypothesis.lead))
+    blocks, driven = search.residual(hypothesis, flight)
     # Blocks and padding only serve the compiler: the flight again, in one piece.
     n = int(np.sum(np.asarray(flight.interval) > 0)) + 1
     quantity = np.asarray(blocks.signals.quantity).reshape(-1, 10)[:n]

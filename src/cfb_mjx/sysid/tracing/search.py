@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import CATALOGUE, KNOWN, Effect
@@ -17,10 +19,10 @@ from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing import columns as cols
 from cfb_mjx.sysid.tracing.columns import LEAD, Column
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, evidence, solve
-from cfb_mjx.sysid.tracing.gram import driven_by, gram, residual_blocks
+from cfb_mjx.sysid.tracing.gram import driven_by, inner_products, residual_blocks, term_slopes, with_slopes
 from cfb_mjx.sysid.tracing.noise import sensor_noise
 from cfb_mjx.sysid.tracing.sensors import SensorCheck
-from cfb_mjx.sysid.tracing.whitening import FIRST, Blocks, fit_levels, levels_from
+from cfb_mjx.sysid.tracing.whitening import FIRST, Blocks, Signals, fit_levels, levels_from
 
 LEAD_RANGE, LEAD_USUAL, LEAD_SPREAD = (0.0, 0.5), 0.25, 0.1
 """Share of the next command in the mean over an interval: a quarter if every second command is logged, half at most.
@@ -28,7 +30,9 @@ Beyond this a lead would be a time shift, so what is known of it beforehand has 
 FILTERED_GYRO = 0.1
 """Level given to a low-pass filtered gyro, rad/s: only what it shows slowly is believed."""
 LEAST_RELATIVE = -0.8
-PAD = 8
+SAMPLE = 32
+"""Blocks from which noise levels are learned: about a minute, many times longer than what wanders."""
+PAD = 16
 """Columns are padded to a multiple of this with copies of the lead, so that one compiled program serves all rounds."""
 
 
@@ -45,6 +49,8 @@ class Hypothesis:
     """Of a formula, where the catalogue has failed."""
     origin: tuple[Effect, ...] = ()
     """The effects of the declared model: what an absent effect goes back to."""
+    levels: np.ndarray = field(default_factory=lambda: FIRST, compare=False)
+    """Noise levels that fit what this hypothesis leaves (the vector of `whitening.levels_from`)."""
 
     def effect(self, name: str) -> Effect:
         """The effect of that name."""
@@ -74,18 +80,13 @@ class Linear:
     hypothesis: Hypothesis
     columns: list[Column]
     blocks: np.ndarray
-    """(b, d, c, c)."""
+    """(b, c, c)."""
     scale: np.ndarray
 
     def index(self, wanted: list[Column]) -> list[int]:
         """Positions of columns in the inner products."""
         where = {c: i + 1 for i, c in reversed(list(enumerate(self.columns)))}
         return [where[c] for c in wanted]
-
-    @property
-    def pooled(self) -> np.ndarray:
-        """(b, c, c) over all domains."""
-        return self.blocks.sum(1)
 
 
 @dataclass
@@ -100,7 +101,6 @@ class Search:
     names: tuple[str, ...]
     declared: tuple[Effect, ...] = ()
     """Effects the declared model has already."""
-    levels: np.ndarray = field(default_factory=lambda: FIRST)
     _flights: dict[float, list[Flight]] = field(default_factory=dict)
 
     @classmethod
@@ -125,10 +125,15 @@ class Search:
             self._flights[key] = [prepare_flight(faults.repaired(log), self.delay) for log in self.logs]
         return self._flights[key]
 
+    def residual(self, hypothesis: Hypothesis, flight: Flight) -> tuple[Blocks, Array]:
+        """What a hypothesis misses along one of `flights`, and the rotor speeds (n, 4) that drove the body."""
+        model = hypothesis.model(self.parameters)
+        driven = driven_by(model, flight, hypothesis.lead)
+        return residual_blocks(model, flight, driven, jnp.asarray(hypothesis.lead)), driven
+
     def beside(self, logs: list[FlightLog], sensors: SensorCheck) -> Search:
         """The same search, with its noise levels, on other flights of the drone."""
-        here = replace(self, logs=[sensors.corrected(log) for log in logs], _flights={})
-        return here
+        return replace(self, logs=[sensors.corrected(log) for log in logs], _flights={})
 
     def nothing(self) -> Hypothesis:
         """The declared model."""
@@ -136,18 +141,44 @@ class Search:
         effects = tuple(given.get(type(e).name, e) for e in cols.neutral_effects(self.names))
         return Hypothesis(effects, origin=effects)
 
-    def learn_levels(self, hypothesis: Hypothesis) -> None:
-        """Noise levels that fit what this hypothesis leaves."""
-        model = hypothesis.model(self.parameters)
-        pieces = []
-        for flight in self.flights(hypothesis):
-            driven = driven_by(model, flight, hypothesis.lead)
-            pieces.append(residual_blocks(model, flight, driven, jnp.asarray(hypothesis.lead)))
+    def learned(self, hypothesis: Hypothesis) -> Hypothesis:
+        """The hypothesis with the noise levels that fit what it leaves."""
+        pieces = [self.residual(hypothesis, flight)[0] for flight in self.flights(hypothesis)]
         blocks = Blocks(*(_joined([getattr(p, k) for p in pieces]) for k in ("signals", "interval", "valid")))
-        self.levels = fit_levels(_padded(blocks), self.noise, self.levels)
+        return replace(hypothesis, levels=fit_levels(_sample(blocks), self.noise, hypothesis.levels))
 
     def linearise(self, hypothesis: Hypothesis, wanted: list[Column], width: int = 0) -> Linear:
         """Residual and derivatives by ``wanted`` at a hypothesis, padded to ``width`` columns at least."""
+        signals, columns, scale = self._slopes(hypothesis, wanted, width)
+        return Linear(hypothesis, columns, self._products(hypothesis, signals), scale)
+
+    def linearise_terms(self, hypothesis: Hypothesis, own: list[Column]) -> list[Linear]:
+        """`linearise` by ``own`` and the library of formulas, for each axis (`formula.AXES`)."""
+        model, lead = hypothesis.model(self.parameters), hypothesis.lead
+        beside, columns, scale = self._slopes(hypothesis, own, 0)
+        driven = [driven_by(model, flight, lead) for flight in self.flights(hypothesis)]
+        found = []
+        for axis in range(6):
+            library = cols.term_columns(axis)
+            # Columns of the padding have to be passed over by name: any that is asked for comes first.
+            names = columns + [columns[0]] * (len(scale) - 1 - len(columns)) + library
+            signals = []
+            for flight, speed, some in zip(self.flights(hypothesis), driven, beside, strict=True):
+                terms = term_slopes(model, flight, speed, jnp.asarray(axis))
+                signals.append(jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=-1), some, terms))
+            unit = np.concatenate([scale, [c.scale for c in library]])
+            found.append(Linear(hypothesis, names, self._products(hypothesis, signals), unit))
+        return found
+
+    def _products(self, hypothesis: Hypothesis, signals: list[Signals]) -> np.ndarray:
+        levels = levels_from(jnp.asarray(hypothesis.levels), self.noise)
+        pairs = zip(self.flights(hypothesis), signals, strict=True)
+        return np.concatenate([np.asarray(inner_products(flight, one, levels)) for flight, one in pairs])
+
+    def _slopes(
+        self, hypothesis: Hypothesis, wanted: list[Column], width: int
+    ) -> tuple[list[Signals], list[Column], np.ndarray]:
+        """Residuals and derivatives of every flight, the columns they belong to, and the units of all."""
         lead = Column(LEAD, LEAD, None, (), 0.25)
         columns = [lead, *wanted]
         padded = columns + [lead] * max(-(len(columns) + 1) % PAD, width - 1 - len(columns))
@@ -155,14 +186,11 @@ class Search:
         model = hypothesis.model(self.parameters)
         models = eqx.tree_at(lambda m: m.effects, model, moves.effects)
         steps = [jnp.asarray(x) for x in (moves.lead, moves.shift, moves.step)]
-        levels = levels_from(jnp.asarray(self.levels), self.noise)
-        found = []
-        for flight in self.flights(hypothesis):
-            driven = driven_by(model, flight, hypothesis.lead)
-            products, _ = gram(models, flight, driven, *steps, levels)
-            found.append(np.asarray(products))
-        scale = np.array([1.0] + [c.scale for c in padded])
-        return Linear(hypothesis, columns, np.concatenate(found), scale)
+        found = [
+            with_slopes(models, flight, driven_by(model, flight, hypothesis.lead), *steps)
+            for flight in self.flights(hypothesis)
+        ]
+        return found, columns, np.array([1.0] + [c.scale for c in padded])
 
     # -- one hypothesis -------------------------------------------------------------------------------------------
 
@@ -182,28 +210,26 @@ class Search:
 
     def refine(self, hypothesis: Hypothesis, rounds: int = 5) -> tuple[Hypothesis, Linear]:
         """Fit everything that is there together; derivatives by the whole catalogue come with the result."""
-        for attempt in range(rounds):
+        for attempt in range(rounds - 1):
             own = self.own_columns(hypothesis)
-            absent = [c for v in self.candidates() if v[0].effect not in hypothesis.present for c in v]
-            linear = self.linearise(hypothesis, own + absent)
-            if attempt == rounds - 1:
-                break
+            linear = self.linearise(hypothesis, own)
             index = [1, *linear.index(own)]
             lead = linear.scale[1]
             pull = 0, (LEAD_USUAL - hypothesis.lead) / lead, (lead / LEAD_SPREAD) ** 2
-            values = solve(linear.pooled.sum(0), index, linear.scale, pull)
+            values = solve(linear.blocks.sum(0), index, linear.scale, pull)
             kept = np.clip(hypothesis.lead + values[0] * lead, *LEAD_RANGE)
             if kept != hypothesis.lead + values[0] * lead:
                 # What the lead may not take the others have to explain.
                 fixed = 0, (kept - hypothesis.lead) / lead, 1e9
-                values = solve(linear.pooled.sum(0), index, linear.scale, fixed)
-            deviation = np.sqrt(np.diag(covariance(linear.pooled, index, linear.scale, values, pull[2])))
+                values = solve(linear.blocks.sum(0), index, linear.scale, fixed)
+            deviation = np.sqrt(np.diag(covariance(linear.blocks, index, linear.scale, values, pull[2])))
             if np.max(np.abs(values) / deviation) < 0.3:
                 break
             hypothesis = self.moved(hypothesis, own, values * linear.scale[index])
             if attempt == 0:
-                self.learn_levels(hypothesis)
-        return hypothesis, linear
+                hypothesis = self.learned(hypothesis)
+        absent = [c for v in self.candidates() if v[0].effect not in hypothesis.present for c in v]
+        return hypothesis, self.linearise(hypothesis, self.own_columns(hypothesis) + absent)
 
     def moved(self, hypothesis: Hypothesis, own: list[Column], by: np.ndarray) -> Hypothesis:
         """The hypothesis after a step: the lead's first, then one for each of its columns."""
@@ -235,7 +261,7 @@ class Search:
         """Evidence for a candidate beside what is there; None where its sign makes no sense."""
         # Not beside a free lead: late commands would look like one.
         base = linear.index(self.own_columns(hypothesis))
-        found = evidence(linear.pooled, base, linear.index(variant), linear.scale)
+        found = evidence(linear.blocks, base, linear.index(variant), linear.scale)
         if variant[0].effect == cols.SHIFT:
             return found
         low = CATALOGUE[variant[0].effect].prior[variant[0].field][0]
@@ -255,17 +281,15 @@ class Search:
 
 
 def _joined(parts):
-    import jax
-
     return jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x]), *parts)
 
 
-def _padded(blocks: Blocks) -> Blocks:
-    import jax
-
-    count = len(blocks.interval)
-    wanted = next(n for n in (32, 48, 64, 96, 128, 192, 256, 512, 1024, 4096) if n >= count)
-    more = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[:1], wanted - count, axis=0)]), blocks)
-    valid = more.valid.copy()
-    valid[count:] = 0.0
-    return Blocks(more.signals, more.interval, valid)
+def _sample(blocks: Blocks) -> Blocks:
+    """`SAMPLE` of the blocks, spread evenly over those in flight: one compiled program serves every campaign."""
+    share = np.asarray(blocks.valid)[:, :, 0].mean(axis=1)
+    good = np.flatnonzero(share > 0.5 * share.max())
+    chosen = good[np.linspace(0, len(good) - 1, SAMPLE).round().astype(int)]
+    picked = jax.tree.map(lambda x: x[chosen], blocks)
+    # Where there are fewer than that, none counts twice.
+    first = np.concatenate([[True], np.diff(chosen) > 0])
+    return Blocks(picked.signals, picked.interval, picked.valid * first[:, None, None])

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.stats import norm
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.model.effects import SENSOR_FAULTS
+from cfb_mjx.sysid.sensor_faults import ATTRIBUTES, SensorFaults
 from cfb_mjx.sysid.tracing.kinematics import Kinematics, compare_sensors
 
 SMALLEST = {"sensor_delay": 0.003, "sensor_gyro_lowpass": 0.0025, "sensor_velocity_scale": 0.01}
@@ -30,8 +31,7 @@ class Finding:
     @property
     def p_value(self) -> float:
         """Two-sided, of no fault."""
-        healthy = 1.0 if self.name == "sensor_velocity_scale" else 0.0
-        return float(2 * norm.sf(abs(self.value - healthy) / self.std))
+        return float(2 * norm.sf(abs(self.value - SENSOR_FAULTS[self.name].healthy) / self.std))
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
     }
     findings = []
     for name, (value, std) in looked.items():
-        away = abs(value - (1.0 if name == "sensor_velocity_scale" else 0.0))
+        away = abs(value - SENSOR_FAULTS[name].healthy)
         # A gyro cannot be ahead of what it measures.
         if away > SMALLEST[name] and away > SURE * std and not (name == "sensor_gyro_lowpass" and value < 0):
             findings.append(Finding(name, value, std))
@@ -89,12 +89,7 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
         findings = [
             Finding(f.name, value, float(weight.sum() ** -0.5)) if f.name == "sensor_delay" else f for f in findings
         ]
-    found = {f.name: f.value for f in findings}
-    faults = SensorFaults(
-        delay=found.get("sensor_delay", 0.0),
-        velocity_scale=found.get("sensor_velocity_scale", 1.0),
-        gyro_lag=found.get("sensor_gyro_lowpass", 0.0),
-    )
+    faults = SensorFaults(**{ATTRIBUTES[f.name]: f.value for f in findings})
     if not faults.healthy:
         # Biases again, from repaired flights.
         kinematics = [compare_sensors(faults.repaired(log), delay) for log in logs]

@@ -87,6 +87,39 @@ def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
     return np.array([metrics[key] for key in ERRORS])
 
 
+@dataclass(frozen=True)
+class Fit:
+    """A hypothesis fitted to the flights, with its derivatives by the whole catalogue and its `prediction_errors`."""
+
+    hypothesis: Hypothesis
+    linear: Linear
+    errors: np.ndarray
+
+
+def fitted(search: Search, hypothesis: Hypothesis) -> Fit:
+    """Fit everything a hypothesis holds."""
+    hypothesis, linear = search.refine(hypothesis)
+    return Fit(hypothesis, linear, prediction_errors(search, hypothesis))
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A fit without one of its effects, fitted anew."""
+
+    fit: Fit
+    ranking: list[tuple[Evidence, list[Column]]]
+    """Of everything that could come in its place."""
+    own: Evidence | None
+    """For the effect itself; None if its best value makes no sense."""
+
+
+def leave_out(search: Search, fit: Fit, name: str) -> LeftOut:
+    """Fit without an effect and see what would come in its place."""
+    less = fitted(search, fit.hypothesis.without(name))
+    ranking = rank(search, less, set())
+    return LeftOut(less, ranking, next((e for e, v in ranking if v[0].effect == name), None))
+
+
 def trace(
     logs: list[FlightLog],
     parameters: Parameters,
@@ -109,60 +142,53 @@ def trace(
     progress("comparing the sensors with each other")
     sensors = check_sensors(logs, delay)
     search = Search.start(logs, parameters, delay, sensors, declared)
-    hypothesis, tried, refused = search.nothing(), [], set()
-    saved = checkpoint.restore(hypothesis)
-    if saved is None:
-        progress("replaying the declared model")
-        search.learn_levels(hypothesis)
-    else:
-        hypothesis, search.levels, refused, tried = saved
+    progress("replaying the declared model")
+    nothing = fitted(search, search.learned(search.nothing()))
+    saved = checkpoint.restore(nothing.hypothesis)
+    fit, refused, tried = nothing, set(), []
+    if saved is not None:
+        hypothesis, refused, tried = saved
         progress(f"going on with {', '.join(hypothesis.present) or 'no effect'} found before the interruption")
-    hypothesis, linear = search.refine(hypothesis)
-    errors = prediction_errors(search, hypothesis)
-    first = errors if saved is None else prediction_errors(search, search.nothing())
+        fit = fitted(search, hypothesis)
+    left_out: dict[str, LeftOut] = {}
     vain = 0
-    while len(hypothesis.present) < LARGEST and vain < PATIENCE:
-        ranking = rank(search, hypothesis, linear, refused)
-        tried.append({"present": list(hypothesis.present), "ranking": [_line(v, e) for e, v in ranking[:8]]})
+    while len(fit.hypothesis.present) < LARGEST and vain < PATIENCE:
+        ranking = rank(search, fit, refused)
+        tried.append({"present": list(fit.hypothesis.present), "ranking": [_line(v, e) for e, v in ranking[:8]]})
         passing = [(e, v) for e, v in ranking if significant(e, len(search.names))]
         if not passing:
             break
         best, variant = simplest(passing)
         name = variant[0].effect
-        progress(f"trying {name} beside {', '.join(hypothesis.present) or 'nothing'}")
-        richer, refined = search.refine(search.with_candidate(hypothesis, variant, best))
-        new = prediction_errors(search, richer)
-        drop = 1 - new / errors
-        tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, drop.tolist(), strict=True))}
-        slight = name == SHIFT and abs(richer.shift) < SMALLEST_SHIFT
-        slight = slight or np.max((errors - new) / first) < OF_FIRST
-        slight = slight or not np.isfinite(new).all() or implausible(richer, name)
-        if slight or drop.max() < MATERIAL or np.log(new / errors).sum() > 0:
+        progress(f"trying {name} beside {', '.join(fit.hypothesis.present) or 'nothing'}")
+        richer = fitted(search, search.with_candidate(fit.hypothesis, variant, best))
+        tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))}
+        if worth_it(name, fit, richer, nothing.errors):
+            vain = 0
+            fit, left_out = re_examined(search, richer, progress)
+        else:
             refused.add(name)
             vain += 1
-            checkpoint.save(hypothesis, search.levels, refused, tried)
-            continue
-        vain = 0
-        hypothesis, linear, errors = richer, refined, new
-        hypothesis, linear, errors = re_examined(search, hypothesis, linear, errors, progress)
-        checkpoint.save(hypothesis, search.levels, refused, tried)
-    if len(hypothesis.present) > 1:
-        hypothesis, linear, errors = simplified(search, hypothesis, linear, errors, tried[0]["ranking"], progress)
-    found = [_summary(search, hypothesis, linear, errors, name) for name in hypothesis.present]
+        checkpoint.save(fit.hypothesis, refused, tried)
+    if len(fit.hypothesis.present) > 1:
+        single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
+        fit, left_out = (single, {}) if single is not None else (fit, left_out)
+    found = [
+        _summary(search, fit, name, left_out.get(name) or leave_out(search, fit, name))
+        for name in fit.hypothesis.present
+    ]
     found.sort(key=lambda f: -f.buys)
-    return Trace(hypothesis, sensors, found, tried, search)
+    return Trace(fit.hypothesis, sensors, found, tried, search)
 
 
-def rank(
-    search: Search, hypothesis: Hypothesis, linear: Linear, refused: set[str]
-) -> list[tuple[Evidence, list[Column]]]:
+def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, list[Column]]]:
     """Every absent effect at its best probe, the largest gain first."""
     best: dict[str, tuple[Evidence, list[Column]]] = {}
     for variant in search.candidates():
         name = variant[0].effect
-        if name in hypothesis.present or name in refused:
+        if name in fit.hypothesis.present or name in refused:
             continue
-        found = search.adding(hypothesis, linear, variant)
+        found = search.adding(fit.hypothesis, fit.linear, variant)
         if found is not None and (name not in best or found.gain > best[name][0].gain):
             best[name] = (found, variant)
     return sorted(best.values(), key=lambda pair: -pair[0].gain)
@@ -194,58 +220,78 @@ def significant(found: Evidence, tried: int) -> bool:
     return found.p_value * tried < ALPHA and found.gain > LEAST_GAIN
 
 
-def re_examined(search: Search, hypothesis: Hypothesis, linear: Linear, errors: np.ndarray, progress):
-    """Drop what the others explain as well by now, and swap what another effect explains better."""
-    for name in hypothesis.present[:-1]:
+def worth_it(name: str, fit: Fit, richer: Fit, first: np.ndarray) -> bool:
+    """Whether an effect that stands against chance also predicts better, and is no other one in disguise.
+
+    Args:
+        name: the effect.
+        fit: without it.
+        richer: with it.
+        first: errors of the declared model.
+    """
+    if not np.isfinite(richer.errors).all() or implausible(richer.hypothesis, name):
+        return False
+    if name == SHIFT and abs(richer.hypothesis.shift) < SMALLEST_SHIFT:
+        return False
+    if np.max((fit.errors - richer.errors) / first) < OF_FIRST or np.log(richer.errors / fit.errors).sum() > 0:
+        return False
+    return np.max(1 - richer.errors / fit.errors) >= MATERIAL
+
+
+def re_examined(search: Search, fit: Fit, progress: Callable[[str], None]) -> tuple[Fit, dict[str, LeftOut]]:
+    """Drop what the others explain as well by now, and swap what another effect explains better.
+
+    Returns:
+        The fit, and what is left of it without each effect looked at since it last changed.
+    """
+    seen: dict[str, LeftOut] = {}
+    for name in fit.hypothesis.present[:-1]:
         progress(f"looking at {name} again")
-        less, around = search.refine(hypothesis.without(name))
-        ranking = rank(search, less, around, set())
-        own = next((e for e, v in ranking if v[0].effect == name), None)
-        without = prediction_errors(search, less)
-        lost = 1 - errors / without
-        if own is None or not significant(own, len(search.names)) or lost.max() < MATERIAL:
-            hypothesis, linear, errors = less, around, without
+        less = leave_out(search, fit, name)
+        lost = np.max(1 - fit.errors / less.fit.errors)
+        if less.own is None or not significant(less.own, len(search.names)) or lost < MATERIAL:
+            fit, seen = less.fit, {}
             continue
-        rival, variant = ranking[0]
-        if variant[0].effect != name and rival.gain > own.gain + LEAST_GAIN:
-            other, refined = search.refine(search.with_candidate(less, variant, rival))
-            new = prediction_errors(search, other)
-            if np.log(new / errors).sum() < 0:
-                hypothesis, linear, errors = other, refined, new
-    return hypothesis, linear, errors
+        seen[name] = less
+        rival, variant = less.ranking[0]
+        if variant[0].effect != name and rival.gain > less.own.gain + LEAST_GAIN:
+            other = fitted(search, search.with_candidate(less.fit.hypothesis, variant, rival))
+            if np.log(other.errors / fit.errors).sum() < 0:
+                fit, seen = other, {}
+    return fit, seen
 
 
 def simplified(
-    search: Search, hypothesis: Hypothesis, linear: Linear, errors: np.ndarray, ranking: list[dict], progress
-):
-    """One effect in place of several, where it does as well: the first steps of a search may have split it up."""
-    rivals = [item["name"] for item in ranking if item["name"] not in hypothesis.present][:RIVALS]
-    nothing = search.nothing()
-    own, around = search.refine(nothing)
+    search: Search, nothing: Fit, fit: Fit, ranking: list[dict], progress: Callable[[str], None]
+) -> Fit | None:
+    """One effect in place of several, where it does as well: the first steps of a search may have split it up.
+
+    Args:
+        search: over the fit flights.
+        nothing: the declared model.
+        fit: what the search came to.
+        ranking: of the first round.
+        progress: told what happens.
+    """
+    candidates = {variant[0].effect: (found, variant) for found, variant in rank(search, nothing, set())}
+    rivals = [item["name"] for item in ranking if item["name"] not in fit.hypothesis.present][:RIVALS]
     for name in rivals:
-        if name not in KNOWN:
+        if name not in KNOWN or name not in candidates:
             continue
-        progress(f"trying {name} in place of {', '.join(hypothesis.present)}")
-        pair = next((p for p in rank(search, own, around, set()) if p[1][0].effect == name), None)
-        if pair is None:
-            continue
-        single, refined = search.refine(search.with_candidate(own, pair[1], pair[0]))
-        new = prediction_errors(search, single)
-        if np.isfinite(new).all() and np.max(new / errors - 1) < AS_GOOD:
-            return single, refined, new
-    return hypothesis, linear, errors
+        progress(f"trying {name} in place of {', '.join(fit.hypothesis.present)}")
+        found, variant = candidates[name]
+        single = fitted(search, search.with_candidate(nothing.hypothesis, variant, found))
+        if np.isfinite(single.errors).all() and np.max(single.errors / fit.errors - 1) < AS_GOOD:
+            return single
+    return None
 
 
-def _summary(search: Search, hypothesis: Hypothesis, linear: Linear, errors: np.ndarray, name: str) -> Found:
-    less, around = search.refine(hypothesis.without(name))
-    ranking = rank(search, less, around, set())
-    own, _ = next((pair for pair in ranking if pair[1][0].effect == name), (None, None))
-    buys = float(np.max(1 - errors / prediction_errors(search, less)))
+def _summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
+    hypothesis, linear = fit.hypothesis, fit.linear
     columns = search.own_columns(hypothesis)
     index = [1, *linear.index(columns)]
-    values = solve(linear.pooled.sum(0), index, linear.scale)
-    known = (linear.scale[1] / LEAD_SPREAD) ** 2
-    spread = covariance(linear.pooled, index, linear.scale, values, known)
+    values = solve(linear.blocks.sum(0), index, linear.scale)
+    spread = covariance(linear.blocks, index, linear.scale, values, (linear.scale[1] / LEAD_SPREAD) ** 2)
     deviation = np.sqrt(np.diag(spread)) * linear.scale[index]
     parameters, uncertainty = {}, {}
     for column, std in zip(columns, deviation[1:], strict=True):
@@ -257,9 +303,10 @@ def _summary(search: Search, hypothesis: Hypothesis, linear: Linear, errors: np.
         else:
             parameters[column.field] = value.tolist()
             uncertainty.setdefault(column.field, []).append(float(std))
-    gain = own.gain if own else 0.0
-    rivals = [v[0].effect for e, v in ranking if v[0].effect != name and e.gain > (1 - CLOSE) * gain]
-    return Found(name, own.p_value if own else 1.0, gain, buys, parameters, uncertainty, rivals, less)
+    gain, p_value = (less.own.gain, less.own.p_value) if less.own else (0.0, 1.0)
+    rivals = [v[0].effect for e, v in less.ranking if v[0].effect != name and e.gain > (1 - CLOSE) * gain]
+    buys = float(np.max(1 - fit.errors / less.fit.errors))
+    return Found(name, p_value, gain, buys, parameters, uncertainty, rivals, less.fit.hypothesis)
 
 
 def _line(variant: list[Column], found: Evidence) -> dict:

@@ -21,7 +21,6 @@ from cfb_mjx.sysid.replay import replay
 
 BLOCK = 512
 """Rows that stay together: about two seconds at 250 Hz. A filter starts anew in every block."""
-DOMAINS = {"torque": slice(0, 3), "force": slice(3, 6), "rotor": slice(6, 10)}
 CHANNELS = 10
 MOTOR_LAG = 0.05
 
@@ -53,24 +52,32 @@ class Signals(eqx.Module):
 def predicted(model: Quadrotor, flight: Flight, driven: Array, lead: Array) -> Signals:
     """What the model says the sensors read, accumulated from its accelerations (so only changes mean something)."""
     found = replay(model, flight, driven, lead)
+    gravity = model.parameters.gravity
+    return accumulated(flight, found.angular_acceleration, found.specific_force, found.rotor_speed, gravity)
+
+
+def accumulated(
+    flight: Flight,
+    angular_acceleration: Float[Array, "n 3"],
+    specific_force: Float[Array, "n 3"],
+    rotor_speed: Float[Array, "n 4"],
+    gravity: Float[Array, ""],
+) -> Signals:
+    """Signals of accelerations in body axes; ``gravity`` is zero for what comes on top of others."""
     dt = flight.interval[:, None]
-    force = Vec.unstack(found.specific_force)
+    force = Vec.unstack(specific_force)
     following = jnp.concatenate([flight.quaternion[1:], flight.quaternion[-1:]])
     middle = 0.5 * (flight.quaternion + following)
     middle = middle / jnp.linalg.norm(middle, axis=1, keepdims=True)
     world = rotate(Vec.unstack(middle), force).stack()
-    gravity = jnp.array([0.0, 0.0, 1.0]) * model.parameters.gravity
+    up = jnp.array([0.0, 0.0, 1.0]) * gravity
 
-    def accumulated(rate):
+    def summed(rate):
         return jnp.concatenate([jnp.zeros((1, 3)), jnp.cumsum(rate * dt, axis=0)[:-1]])
 
     before = jnp.concatenate([world[:1], world[:-1]])
-    return Signals(
-        jnp.concatenate(
-            [accumulated(found.angular_acceleration), accumulated(world - gravity), found.rotor_speed], axis=1
-        ),
-        0.5 * (before + world),
-    )
+    quantity = jnp.concatenate([summed(angular_acceleration), summed(world - up), rotor_speed], axis=1)
+    return Signals(quantity, 0.5 * (before + world))
 
 
 def measured(flight: Flight) -> Signals:
@@ -164,11 +171,6 @@ def _walk(block: Blocks, levels: Levels):
     return jax.lax.scan(row, (wide, wide, zero, zero, zero, zero), inputs)[1]
 
 
-def domain_of_channel() -> np.ndarray:
-    """(13,) index into `DOMAINS` of every innovation channel."""
-    return np.array([0] * 3 + [1] * 3 + [2] * 4 + [1] * 3)
-
-
 _LOWEST = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-1] * 4)
 
 
@@ -220,6 +222,6 @@ def fit_levels(blocks: Blocks, noise: dict[str, np.ndarray], start: np.ndarray =
         method="L-BFGS-B",
         bounds=list(zip(low, high, strict=True)),
         # From levels found before, a few steps are enough.
-        options={"maxiter": 40 if start is FIRST else 15, "ftol": 1e-7},
+        options={"maxiter": 40 if start is FIRST else 15, "ftol": 1e-6},
     )
     return found.x
