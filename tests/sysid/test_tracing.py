@@ -220,7 +220,7 @@ def test_terms_of_formulas_are_the_derivatives_by_their_numbers(closed, axis):
 @pytest.mark.parametrize("value", ["fast", None, float("nan"), True])
 def test_a_sensor_fault_without_a_sensible_number_is_refused(value):
     item = {"name": "sensor_delay", "parameters": {"delay": value}}
-    with pytest.raises(CfbError, match="drone.yaml: effects.sensor_delay.parameters.delay"):
+    with pytest.raises(CfbError, match=r"drone\.yaml: effects\.sensor_delay\.parameters\.delay"):
         SensorFaults.from_mappings([item], "drone.yaml")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from cfb_mjx.cli.demo import simulated_log
-from cfb_mjx.model.effects import CATALOGUE, RotorDrag
+from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS, RotorDrag
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
