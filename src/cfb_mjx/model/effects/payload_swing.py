@@ -1,12 +1,12 @@
-"""A load slung on a string from the rotors' centre, near hover:
+"""A load slung on a string from the rotors' centre: a spherical pendulum whose pivot flies.
 
-    r'' = -(g / length) r - a_xy - 2 * 0.05 sqrt(g / length) r'
-    F_world = mass ((g / length) r_x, (g / length) r_y, -g)
+    n'' = -(1 - n n^T) (a + g e_z) / length - |n'|^2 n - 2 damping_ratio sqrt(g / length) n'
+    F_world = T n,  T = max(length |n'|^2 - n . F / M, 0) m M / (m + M)
 
-r is where the load hangs from the drone in the world's horizontal plane, a the drone's acceleration: a pendulum of
-small angles whose pivot accelerates, lightly damped by the air. The load's weight is carried in full at all times: that
-the string pulls more while the drone accelerates upwards is left out. Remembered are r and r'; at the start the load
-hangs still.
+n is the unit vector from the drone to the load, a the drone's acceleration, M its mass and F the force (world) of all
+that comes before this effect: the tension T follows from the string keeping its length. A string does not push; where
+it would go slack the load is still carried along on its sphere. Remembered are n and n'; at the start the load hangs
+still.
 """
 
 from __future__ import annotations
@@ -19,52 +19,65 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Condition, Effect, Memory, Wrench
 from cfb_mjx.model.effects.fields import number
-from cfb_mjx.model.vector import Vec, rotate_inverse
+from cfb_mjx.model.vector import Vec, rotate, rotate_inverse
 from cfb_mjx.parameters.parameters import Parameters
-
-DAMPING_RATIO = 0.05
-"""Of the swing, against critical damping."""
 
 
 class PayloadSwing(Effect):
-    """A pendulum of small angles under the rotors' centre."""
+    """A load on a string under the rotors' centre."""
 
     name: ClassVar[str] = "payload_swing"
-    units: ClassVar[dict[str, str]] = {"mass": "kg", "length": "m"}
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "length": "m", "damping_ratio": "1"}
     source: ClassVar[str] = (
-        "I. Palunko, R. Fierro, P. Cruz, Trajectory generation for swing-free maneuvers of a quadrotor with "
-        "suspended payload, ICRA 2012"
+        "K. Sreenath, T. Lee, V. Kumar, Geometric control and differential flatness of a quadrotor UAV with a "
+        "cable-suspended load, CDC 2013"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"mass": (0.0, 0.015), "length": (0.05, 0.5)}
+    prior: ClassVar[dict[str, tuple[float, float]]] = {
+        "mass": (0.0, 0.015),
+        "length": (0.05, 0.5),
+        "damping_ratio": (0.002, 0.4),
+    }
     strengths: ClassVar[tuple[str, ...]] = ("mass",)
-    probes: ClassVar[tuple[dict[str, float], ...]] = ({"length": 0.1}, {"length": 0.15}, {"length": 0.2})
+    # Strongly damped ones hang on their length little: they are found from afar.
+    probes: ClassVar[tuple[dict[str, float], ...]] = (
+        {"length": 0.1, "damping_ratio": 0.2},
+        {"length": 0.15, "damping_ratio": 0.2},
+        {"length": 0.25, "damping_ratio": 0.2},
+    )
 
     mass: Float[Array, "*batch"] = eqx.field(converter=number)
     """Of the load."""
     length: Float[Array, "*batch"] = eqx.field(converter=number)
     """Of the string."""
+    damping_ratio: Float[Array, "*batch"] = eqx.field(converter=number, default=0.02)
+    """Of the swing, against critical damping."""
 
     @classmethod
     def neutral(cls) -> PayloadSwing:
-        return cls(mass=0.0, length=0.15)
+        return cls(mass=0.0, length=0.15, damping_ratio=0.02)
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
-        still = jnp.zeros_like(rotor_speed[0])
-        return Vec(still, still), Vec(still, still)
+        zero = jnp.zeros_like(rotor_speed[0])
+        return Vec(zero, zero, zero - 1.0), Vec(zero, zero, zero)
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
-        (x, y), _ = condition.memory
-        weight = self.mass * condition.parameters.gravity
-        force = Vec(weight / self.length * x, weight / self.length * y, -weight)
-        return Wrench(wrench.force + rotate_inverse(condition.quaternion, force), wrench.torque)
+        along, turning = condition.memory
+        mass, own = self.mass, condition.parameters.mass
+        force = rotate(condition.quaternion, wrench.force)
+        tension = jnp.maximum(self.length * turning.dot(turning) - along.dot(force) / own, 0.0)
+        tension = tension * mass * own / (mass + own)
+        return Wrench(wrench.force + rotate_inverse(condition.quaternion, along * tension), wrench.torque)
 
     def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
-        place, velocity = condition.memory
-        stiffness = condition.parameters.gravity / self.length
+        along, turning = condition.memory
+        gravity = condition.parameters.gravity
+        felt = acceleration + Vec(0.0, 0.0, gravity)
+        across = felt - along * along.dot(felt)
         # Without gravity there is no swing; the square root has no derivative there.
-        swings = stiffness > 0
-        damping = jnp.where(swings, 2 * DAMPING_RATIO * jnp.sqrt(jnp.where(swings, stiffness, 1.0)), 0.0)
-        pull = -stiffness * place - damping * velocity - Vec(*acceleration[:2])
+        swings = gravity > 0
+        damping = 2 * self.damping_ratio * jnp.sqrt(jnp.where(swings, gravity / self.length, 1.0)) * swings
         # Semi-implicit, as the body itself: the swing neither grows nor dies by the numbers.
-        velocity = velocity + pull * dt
-        return place + velocity * dt, velocity
+        turning = turning - (across * (1 / self.length) + turning * damping) * dt
+        along = along + turning * dt
+        along = along * (1 / jnp.sqrt(along.dot(along)))
+        return along, turning - along * along.dot(turning)

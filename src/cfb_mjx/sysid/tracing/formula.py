@@ -13,7 +13,15 @@ from cfb_mjx.sysid.tracing.evidence import covariance, evidence, solve
 from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Search
 
 PER_AXIS = 3
-"""Terms along one axis at most."""
+"""Terms or families along one axis at most."""
+_QUADRATIC = ("n_roll^2", "n_pitch^2", "n_roll n_pitch")
+FAMILIES = {"body_terms": [_QUADRATIC], "place": [(p, f"{p}^2") for p in ("x", "y", "z")]}
+"""Terms that describe one thing only together: a force that grows towards a wall is badly told by its slope alone, and
+what one term describes badly does not stand against chance."""
+OF_FAMILY = 0.9
+"""A single term is preferred if it gains this share of what a family gains."""
+NEEDLESS = 2.0
+"""A term that gains fewer nats beside the others is left out again."""
 ALPHA, LEAST_GAIN = 1e-3, 8.0
 _WIDTH = 64
 
@@ -66,18 +74,40 @@ def propose(
     for axis, linear in enumerate(search.linearise_terms(hypothesis, own)):
         library = term_columns(axis)
         base, picked = linear.index(own), []
+        families = [[c] for c in library] + _families(library)
+
+        def gaining(columns, beside, linear=linear, base=base):
+            return evidence(linear.blocks, base + linear.index(beside), linear.index(columns), linear.scale)
+
         for _ in range(PER_AXIS):
-            rest = [c for c in library if c not in picked]
-            found = [
-                (evidence(linear.blocks, base + linear.index(picked), linear.index([c]), linear.scale), c) for c in rest
-            ]
-            best, column = max(found, key=lambda pair: pair[0].gain)
-            if best.p_value * tried > ALPHA or best.gain < LEAST_GAIN:
+            rest = [[c for c in family if c not in picked] for family in families]
+            found = [(gaining(columns, picked), columns) for columns in rest if columns]
+            passing = [pair for pair in found if pair[0].p_value * tried < ALPHA and pair[0].gain > LEAST_GAIN]
+            if not passing:
                 break
-            picked.append(column)
-            gains[column] = best.gain
+            most = max(e.gain for e, _ in passing)
+            best, columns = min(
+                (pair for pair in passing if pair[0].gain >= OF_FAMILY * most),
+                key=lambda pair: (len(pair[1]), -pair[0].gain),
+            )
+            picked += columns
+            gains |= dict.fromkeys(columns, best.gain)
+        for column in list(picked):
+            others = [c for c in picked if c != column]
+            if others and gaining([column], others).gain < NEEDLESS:
+                picked = others
         chosen += picked
     return chosen, gains
+
+
+def _families(library: list[Column]) -> list[list[Column]]:
+    """`FAMILIES` among the terms of one axis."""
+    found = []
+    for field, groups in FAMILIES.items():
+        signals = list(TERMS if field == "body_terms" else PLACES)
+        named = {signals[c.index[1]]: c for c in library if c.field == field}
+        found += [[named[s] for s in group] for group in groups if set(group) <= set(named)]
+    return found
 
 
 def fit_formula(search: Search, hypothesis: Hypothesis, terms: list[Column]) -> tuple[Hypothesis, np.ndarray]:

@@ -14,6 +14,7 @@ from cfb_mjx.sysid.evaluation import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import SHIFT, Column
+from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
 from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Linear, Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
@@ -24,6 +25,8 @@ LEAST_GAIN = 5.0
 """And it must gain so many nats of log-likelihood on blocks left out."""
 MATERIAL = 0.05
 """And lower at least one prediction error (four quantities, two horizons) by this share."""
+CONTENDERS, CONTENDER = 3, 0.5
+"""So many effects of a ranking are fitted, if they gain this share of the first."""
 PARSIMONY = 0.02
 """A rival with fewer numbers is preferred if it gains all but this share."""
 RIVALS, AS_GOOD = 3, 0.03
@@ -158,10 +161,8 @@ def trace(
         passing = [(e, v) for e, v in ranking if significant(e, len(search.names))]
         if not passing:
             break
-        best, variant = simplest(passing)
-        name = variant[0].effect
-        progress(f"trying {name} beside {', '.join(fit.hypothesis.present) or 'nothing'}")
-        richer = fitted(search, search.with_candidate(fit.hypothesis, variant, best))
+        name, richer, stretched = best_fit(search, fit, passing, progress)
+        refused |= stretched - {name}
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))}
         if worth_it(name, fit, richer, nothing.errors):
             vain = 0
@@ -203,16 +204,41 @@ def implausible(hypothesis: Hypothesis, name: str) -> bool:
     return any(np.any((v > 2 * kind.prior[f][1]) | (v < 2 * kind.prior[f][0])) for f, v in values.items())
 
 
-def simplest(ranking: list[tuple[Evidence, list[Column]]]) -> tuple[Evidence, list[Column]]:
-    """Of the candidates that gain about as much as the best, the one with the fewest numbers."""
-    close = [pair for pair in ranking if pair[0].gain > (1 - PARSIMONY) * ranking[0][0].gain]
-    best = min(close, key=lambda pair: len(pair[1]))
-    if best[1][0].effect == SHIFT and best[0].values[0] < 0:
+def best_fit(
+    search: Search, fit: Fit, ranking: list[tuple[Evidence, list[Column]]], progress: Callable[[str], None]
+) -> tuple[str, Fit, set[str]]:
+    """The candidate that explains the flights best, fitted beside what is there.
+
+    The ranking rests on slopes at neutral, which say little of effects whose shape is still to be fitted: those that
+    come near the best there are fitted too. Of those that gain about the same, the one with the fewest numbers is
+    taken.
+
+    Returns:
+        Its name, the fit with it, and the names of those that would have to be implausibly strong.
+    """
+    contenders, stretched = [], set()
+    for found, variant in ranking[:CONTENDERS]:
+        if found.gain < CONTENDER * ranking[0][0].gain:
+            break
+        name = variant[0].effect
+        progress(f"trying {name} beside {', '.join(fit.hypothesis.present) or 'nothing'}")
+        richer = fitted(search, search.with_candidate(fit.hypothesis, variant, found))
+        gain = confirm(search, fit.hypothesis, richer.hypothesis).gain
+        if implausible(richer.hypothesis, name) or not np.isfinite(gain):
+            stretched.add(name)
+        else:
+            contenders.append((gain, len(variant), name, richer))
+    if not contenders:
+        return name, richer, stretched
+    most = max(gain for gain, *_ in contenders)
+    close = [entry for entry in contenders if entry[0] > (1 - PARSIMONY) * most]
+    gain, _, name, richer = min(close, key=lambda entry: entry[1])
+    if name == SHIFT and richer.hypothesis.shift < 0:
         # Commands logged early and commands that act late look the same unless rotor speeds were logged: the
         # physical cause comes first, and the report names both.
-        near = [pair for pair in ranking if pair[0].gain > (1 - CLOSE) * best[0].gain]
-        return next((pair for pair in near if pair[1][0].effect == "command_delay"), best)
-    return best
+        near = (entry for entry in contenders if entry[2] == "command_delay" and entry[0] > (1 - CLOSE) * gain)
+        _, _, name, richer = next(near, (0, 0, name, richer))
+    return name, richer, stretched
 
 
 def significant(found: Evidence, tried: int) -> bool:
