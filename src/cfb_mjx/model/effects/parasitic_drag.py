@@ -9,30 +9,44 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
-from cfb_mjx.model.effects.fields import vector
+from cfb_mjx.model.effects.fields import number, vector
 from cfb_mjx.model.vector import Vec
 
 
 class ParasiticDrag(Effect):
-    """F = -(linear + quadratic |v_i|) v_i on each body axis i, with v the velocity in body axes."""
+    """F_i = -(linear_i + quadratic_i sqrt(v_i^2 + cross (|v|^2 - v_i^2))) v_i along each body axis i.
+
+    v is the velocity in body axes. With ``cross`` 0 the axes do not know of each other; with 1 the force grows with the
+    speed |v|, as that of a bluff body.
+    """
 
     name: ClassVar[str] = "parasitic_drag"
-    units: ClassVar[dict[str, str]] = {"linear": "N s/m", "quadratic": "N s^2/m^2"}
+    units: ClassVar[dict[str, str]] = {"linear": "N s/m", "quadratic": "N s^2/m^2", "cross": "1"}
     source: ClassVar[str] = (
         "linear part: drone-models cf21B_500 (drag matrix); quadratic part: bluff-body drag, 0.5 rho C_d A"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"linear": (0.0, 0.05), "quadratic": (0.0, 0.02)}
+    prior: ClassVar[dict[str, tuple[float, float]]] = {
+        "linear": (0.0, 0.05),
+        "quadratic": (0.0, 0.02),
+        "cross": (0.0, 1.0),
+    }
     # The linear part is what `rotor_drag` does at hover; tracing looks for it there.
     strengths: ClassVar[tuple[str, ...]] = ("quadratic",)
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({"cross": 0.0}, {"cross": 1.0})
 
     linear: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
     quadratic: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
+    cross: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
+    """Share of the speed across an axis in the drag along it."""
 
     @classmethod
     def neutral(cls) -> ParasiticDrag:
-        return cls(linear=0.0, quadratic=0.0)
+        return cls(linear=0.0, quadratic=0.0, cross=0.0)
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         velocity = condition.velocity_body
-        coefficient = Vec.unstack(self.linear) + Vec.unstack(self.quadratic) * velocity.map(jnp.abs)
+        square = velocity.dot(velocity)
+        # A square root has no slope at rest; what is added is far below what any drag can show.
+        speed = velocity.map(lambda v: jnp.sqrt(v * v + self.cross * (square - v * v) + 1e-12))
+        coefficient = Vec.unstack(self.linear) + Vec.unstack(self.quadratic) * speed
         return Wrench(wrench.force - coefficient * velocity, wrench.torque)

@@ -1,9 +1,9 @@
-"""A payload fixed to the body on its z axis, ``height`` above the rotors' centre (negative: below).
+"""A payload fixed to the body, ``height`` above the rotors' centre (negative: below) and ``offset`` beside it.
 
 It adds its mass, draws the centre of gravity towards itself and adds m M / (m + M) (|d|^2 - d_k^2) to the moment of
 inertia about axis k, d being the way from the old centre of gravity to the payload (parallel axes, about the common
-centre). The payload's own moment of inertia and, where the centre of gravity lies beside the z axis, products of
-inertia are left out.
+centre). The payload's own moment of inertia and, where the payload lies beside the z axis, products of inertia are left
+out.
 """
 
 from __future__ import annotations
@@ -15,35 +15,43 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect
-from cfb_mjx.model.effects.fields import number
+from cfb_mjx.model.effects.fields import number, vector
 from cfb_mjx.parameters.parameters import Parameters
 
 
 class Payload(Effect):
-    """A point mass on the body's z axis."""
+    """A point mass fixed to the body."""
 
     name: ClassVar[str] = "payload"
-    units: ClassVar[dict[str, str]] = {"mass": "kg", "height": "m"}
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "height": "m", "offset": "m"}
     source: ClassVar[str] = (
         "J. L. Meriam, L. G. Kraige, Engineering Mechanics: Dynamics, app. B (parallel-axis theorem)"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"mass": (0.0, 0.02), "height": (-0.05, 0.05)}
+    prior: ClassVar[dict[str, tuple[float, float]]] = {
+        "mass": (0.0, 0.02),
+        "height": (-0.05, 0.05),
+        "offset": (-0.02, 0.02),
+    }
     strengths: ClassVar[tuple[str, ...]] = ("mass",)
-    probes: ClassVar[tuple[dict[str, float], ...]] = ({"height": -0.02}, {"height": 0.02})
+    probes: ClassVar[tuple[dict[str, float], ...]] = (
+        {"height": -0.02, "offset": 0.0},
+        {"height": 0.02, "offset": 0.0},
+    )
 
     mass: Float[Array, "*batch"] = eqx.field(converter=number)
     """Of the payload, as a point."""
     height: Float[Array, "*batch"] = eqx.field(converter=number)
     """Above the rotors' centre."""
+    offset: Float[Array, "*batch 2"] = eqx.field(converter=vector(2), default=0.0)
+    """Beside it, along the body's x and y axes."""
 
     @classmethod
     def neutral(cls) -> Payload:
-        return cls(mass=0.0, height=-0.02)
+        return cls(mass=0.0, height=-0.02, offset=0.0)
 
     def change(self, parameters: Parameters) -> Parameters:
         total = parameters.mass + self.mass
-        height = self.height[..., None]
-        place = jnp.concatenate([0 * height, 0 * height, height], axis=-1)
+        place = jnp.concatenate([self.offset, self.height[..., None]], axis=-1)
         way = place - parameters.center_of_gravity
         center = parameters.center_of_gravity + way * (self.mass / total)[..., None]
         squares = way * way

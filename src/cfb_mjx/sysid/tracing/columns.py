@@ -18,7 +18,9 @@ SHIFT = "sensor_time_shift"
 """Not an effect of the catalogue but a fault of the recording: command and rotor-speed columns late or early."""
 FORMULA = ResidualFormula.name
 TORQUE_UNIT, FORCE_UNIT = 3e-5, 4e-3
-"""Coefficients of a formula are counted in these: about 1 rad/s^2 and 0.1 m/s^2 on this drone."""
+"""What a term of a formula typically adds, N m and N: about 1 rad/s^2 and 0.1 m/s^2 on this drone."""
+LEAST_SIZE = 1e-4
+"""Signals smaller than this, in their units, were not excited."""
 _COARSE = {"esc_rate_limit": 0.125, "command_delay": 0.2, "motor_second_order": 0.3}
 """Effects whose slope at zero says little are looked for at this share of their prior range."""
 
@@ -83,12 +85,16 @@ def moved(effect: Effect, column: Column, by: float, present: bool) -> Effect:
     return eqx.tree_at(lambda e: getattr(e, column.field), effect, new)
 
 
-def term_columns(axis: int) -> list[Column]:
-    """Every term of the library along one of the axes torque x, y, z, force x, y, z (0..5)."""
-    scale = TORQUE_UNIT if axis < 3 else FORCE_UNIT
-    found = [Column(FORMULA, "body_terms", (axis, j), (), scale) for j in range(len(TERMS))]
+def term_columns(axis: int, sizes: np.ndarray | None = None) -> list[Column]:
+    """Every term of the library along one of the axes torque x, y, z, force x, y, z (0..5).
+
+    ``sizes`` are the rms of the signals, body terms then places: a number is counted in what makes its term matter.
+    """
+    sizes = np.ones(len(TERMS) + len(PLACES)) if sizes is None else np.maximum(sizes, LEAST_SIZE)
+    scale = (TORQUE_UNIT if axis < 3 else FORCE_UNIT) / sizes
+    found = [Column(FORMULA, "body_terms", (axis, j), (), scale[j]) for j in range(len(TERMS))]
     if axis >= 3:
-        found += [Column(FORMULA, "place", (axis - 3, j), (), FORCE_UNIT) for j in range(len(PLACES))]
+        found += [Column(FORMULA, "place", (axis - 3, j), (), scale[len(TERMS) + j]) for j in range(len(PLACES))]
     return found
 
 

@@ -71,8 +71,8 @@ def propose(
     tried = sum(len(term_columns(axis)) for axis in range(6))
     chosen, gains = [], {}
     progress("looking for structure in what is left")
-    for axis, linear in enumerate(search.linearise_terms(hypothesis, own)):
-        library = term_columns(axis)
+    for linear in search.linearise_terms(hypothesis, own):
+        library = [c for c in linear.columns if c.effect == FORMULA and c not in own]
         base, picked = linear.index(own), []
         families = [[c] for c in library] + _families(library)
 
@@ -173,6 +173,7 @@ def explain(
     hypothesis: Hypothesis,
     errors: Callable[[Search, Hypothesis], np.ndarray],
     material: float,
+    of_first: float,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[Search, Proposal | None]:
     """Look for a formula beside what was found, keep it if it is material, and drop effects it makes needless.
@@ -182,6 +183,7 @@ def explain(
         hypothesis: what the catalogue explains.
         errors: prediction errors of a hypothesis on the flights of a search.
         material: least share by which it must lower one of them.
+        of_first: and least share of what the declared model scores.
         progress: told what happens.
     """
     widened, base = with_library(search, hypothesis)
@@ -189,8 +191,9 @@ def explain(
     if not terms:
         return search, None
     richer, deviation = fit_formula(widened, base, terms)
-    old, new = errors(widened, base), errors(widened, richer)
-    if np.max(1 - new / old) < material or np.log(new / old).sum() > 0:
+    first, old, new = errors(search, search.nothing()), errors(widened, base), errors(widened, richer)
+    slight = np.max(1 - new / old) < material or np.max((old - new) / first) < of_first
+    if slight or np.log(new / old).sum() > 0:
         return search, None
     if "wind" in hypothesis.present and any(c.field == "place" for c in terms):
         # A force that hangs on the place has a constant part, which looked like wind.

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.effects import Wrench
+from cfb_mjx.model.effects import Condition, Wrench
 from cfb_mjx.model.effects.formula import body_signals, place_signals
 from cfb_mjx.model.quadrotor import Quadrotor, at_rotor_center, conditions, prepare, remembering
 from cfb_mjx.model.state import State, unstack
 from cfb_mjx.model.vector import Vec, rotate_inverse
+from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight
 from cfb_mjx.sysid.replay import remembered, smoothed_rotor_speed
 from cfb_mjx.sysid.tracing.whitening import (
@@ -80,13 +81,8 @@ def with_slopes(models: Quadrotor, flight: Flight, driven: Array, leads: Array, 
     return Signals(*(side_by_side(getattr(seen, k), getattr(said, k)) for k in ("quantity", "acceleration")))
 
 
-@eqx.filter_jit
-def term_slopes(model: Quadrotor, flight: Flight, driven: Array, axis: Array) -> Signals:
-    """What each term of the formulas' library (c: body terms, then places) along one axis (0..5) adds.
-
-    The same as the derivatives by a `ResidualFormula`'s numbers, without replaying the model for every one of them:
-    a wrench on the body does not change how the rotors run.
-    """
+def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, Condition]:
+    """The parameters, and the flight condition in the middle of every interval."""
 
     def between(x):
         return 0.5 * (x + jnp.concatenate([x[1:], x[-1:]]))
@@ -95,10 +91,29 @@ def term_slopes(model: Quadrotor, flight: Flight, driven: Array, axis: Array) ->
     middle = (flight.position, flight.velocity, flight.quaternion, flight.body_rate, driven)
     at = unstack(State(*map(between, middle)), prepared.parameters.center_of_gravity)
     (seen,) = conditions(prepared, remembering(at, ((),)), at.rotor_speed)
+    return prepared.parameters, seen
+
+
+@eqx.filter_jit
+def term_squares(model: Quadrotor, flight: Flight, driven: Array) -> Float[Array, "c"]:
+    """Mean squares of the signals of the formulas' library over a flight: body terms, then places."""
+    _, seen = _seen(model, flight, driven)
+    signals = jnp.stack([*body_signals(seen), *place_signals(seen)], axis=-1)
+    return flight.valid @ signals**2 / jnp.maximum(jnp.sum(flight.valid), 1.0)
+
+
+@eqx.filter_jit
+def term_slopes(model: Quadrotor, flight: Flight, driven: Array, axis: Array) -> Signals:
+    """What each term of the formulas' library (c: body terms, then places) along one axis (0..5) adds.
+
+    The same as the derivatives by a `ResidualFormula`'s numbers, without replaying the model for every one of them:
+    a wrench on the body does not change how the rotors run.
+    """
+    parameters, seen = _seen(model, flight, driven)
     along = [jnp.where(axis == i, 1.0, 0.0) for i in range(6)]
 
     def signals(force: Vec, torque: Vec) -> Signals:
-        spin, push = at_rotor_center(prepared.parameters, Wrench(force, torque), Vec(0.0, 0.0, 0.0))
+        spin, push = at_rotor_center(parameters, Wrench(force, torque), Vec(0.0, 0.0, 0.0))
         still = jnp.zeros((flight.time.shape[0], 4))
         return accumulated(flight, spin.stack(), push.stack(), still, jnp.zeros(()))
 

@@ -25,6 +25,8 @@ from cfb_mjx.sysid.tracing.trace import Found, Trace, prediction_errors, trace
 
 STRUCTURE = 0.06
 """A formula counts when it lowers at least one prediction error by this share."""
+OF_FIRST_FORMULA = 0.05
+"""And by this share of what the declared model scores: an effect of slightly another shape leaves crumbs."""
 SURE = 3.0
 """And when its statistic on held-out flights is above this."""
 DOUBTFUL = 2.3
@@ -165,7 +167,7 @@ def close_loop(
     delays = {log.observation_delay for log in fit} - {None}
     delay = float(np.median(list(delays))) if delays else float(parameters.observation_delay)
     found = trace(fit, parameters, delay, progress, declared, checkpoint)
-    search, proposal = explain(found.search, found.hypothesis, prediction_errors, STRUCTURE, progress)
+    search, proposal = explain(found.search, found.hypothesis, prediction_errors, STRUCTURE, OF_FIRST_FORMULA, progress)
     progress("judging on held-out flights")
     nothing = found.search.nothing()
     before = evaluate(nothing.model(parameters), held_out)

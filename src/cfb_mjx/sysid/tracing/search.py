@@ -19,7 +19,14 @@ from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing import columns as cols
 from cfb_mjx.sysid.tracing.columns import LEAD, Column
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, evidence, solve
-from cfb_mjx.sysid.tracing.gram import driven_by, inner_products, residual_blocks, term_slopes, with_slopes
+from cfb_mjx.sysid.tracing.gram import (
+    driven_by,
+    inner_products,
+    residual_blocks,
+    term_slopes,
+    term_squares,
+    with_slopes,
+)
 from cfb_mjx.sysid.tracing.noise import sensor_noise
 from cfb_mjx.sysid.tracing.sensors import SensorCheck
 from cfb_mjx.sysid.tracing.whitening import FIRST, Blocks, Signals, fit_levels, levels_from
@@ -157,9 +164,11 @@ class Search:
         model, lead = hypothesis.model(self.parameters), hypothesis.lead
         beside, columns, scale = self._slopes(hypothesis, own, 0)
         driven = [driven_by(model, flight, lead) for flight in self.flights(hypothesis)]
+        squares = [term_squares(model, *pair) for pair in zip(self.flights(hypothesis), driven, strict=True)]
+        sizes = np.sqrt(np.mean(squares, axis=0))
         found = []
         for axis in range(6):
-            library = cols.term_columns(axis)
+            library = cols.term_columns(axis, sizes)
             # Columns of the padding have to be passed over by name: any that is asked for comes first.
             names = columns + [columns[0]] * (len(scale) - 1 - len(columns)) + library
             signals = []

@@ -39,7 +39,7 @@ SMALLEST_SHIFT = 0.0015
 """Motor columns less late or early than this, s, are commands between rows rather than a fault."""
 LARGEST = 6
 """Effects at most."""
-PATIENCE = 4
+PATIENCE = 3
 """Candidates in a row that stand against chance but lower no error: then the search ends."""
 ERRORS = tuple(
     f"{q}@{h}s"
@@ -166,6 +166,8 @@ def trace(
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))}
         if worth_it(name, fit, richer, nothing.errors):
             vain = 0
+            # What was too slight beside a large error may matter now.
+            refused = set()
             fit, left_out = re_examined(search, richer, progress)
         else:
             refused.add(name)
@@ -231,7 +233,7 @@ def best_fit(
     if not contenders:
         return name, richer, stretched
     most = max(gain for gain, *_ in contenders)
-    close = [entry for entry in contenders if entry[0] > (1 - PARSIMONY) * most]
+    close = [entry for entry in contenders if entry[0] >= most - PARSIMONY * abs(most)]
     gain, _, name, richer = min(close, key=lambda entry: entry[1])
     if name == SHIFT and richer.hypothesis.shift < 0:
         # Commands logged early and commands that act late look the same unless rotor speeds were logged: the
