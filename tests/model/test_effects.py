@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.model import CATALOGUE, Effect, ParasiticDrag, Quadrotor, State, begin, rollout, step
+from cfb_mjx.model import CATALOGUE, Effect, ParasiticDrag, Quadrotor, State, begin, rollout, specific_force, step
 from cfb_mjx.model.effects import Reading, effect_from_mapping, effect_to_mapping
 from cfb_mjx.model.vector import Vec
 
@@ -234,6 +234,17 @@ def test_linear_drag_relaxes_to_terminal_velocity(fall):
     flown = fall(c, 0.0)
     t = 0.004 * np.arange(1, 1001)
     np.testing.assert_allclose(flown[:, 5], -weight / c * (1 - np.exp(-c * t / 0.044)), rtol=1e-8)
+
+
+@pytest.mark.parametrize("cross", [0.0, 1.0])
+def test_drag_across_the_axes(guards, cross):
+    """Of a bluff body against the velocity as a whole; with axes on their own along each."""
+    model = Quadrotor(guards, (ParasiticDrag(0.0, [0.01, 0.01, 0.01], cross),))
+    y = np.zeros(17)
+    y[3:6], y[6] = (3.0, -4.0, 0.0), 1.0
+    felt = np.asarray(specific_force(model, helpers.state_of(y)))
+    wanted = -0.01 * (5.0 * y[3:6] if cross else np.abs(y[3:6]) * y[3:6]) / 0.044
+    np.testing.assert_allclose(felt, wanted, rtol=1e-9, atol=1e-9)
 
 
 def test_quadratic_drag_relaxes_to_terminal_velocity(fall):

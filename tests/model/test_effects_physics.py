@@ -215,6 +215,19 @@ def test_payload_is_two_bodies_in_one(guards):
     np.testing.assert_allclose(changed.inertia[2], guards.inertia[2], rtol=1e-14)
 
 
+def test_payload_beside_the_axis_is_two_bodies_in_one(guards):
+    """The moments about each axis of two point masses about their common centre, and of the drone about its own."""
+    place, m, extra = np.array([0.004, -0.006, -0.02]), 0.044, 0.01
+    changed = Quadrotor(guards, (Payload(extra, place[2], place[:2]),)).changed_parameters()
+    center = extra * place / (m + extra)
+    np.testing.assert_allclose(changed.center_of_gravity, center, rtol=1e-12)
+    added = np.zeros(3)
+    for mass, at in ((m, np.zeros(3)), (extra, place)):
+        x, y, z = at - center
+        added += mass * np.array([y**2 + z**2, x**2 + z**2, x**2 + y**2])
+    np.testing.assert_allclose(changed.inertia, np.asarray(guards.inertia) + added, rtol=1e-12)
+
+
 # Commands and motors.
 
 
