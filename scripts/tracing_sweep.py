@@ -63,6 +63,8 @@ def cases(nulls: int, seed: int) -> list[Case]:
 
 def run(wanted: list[Case], results: Path) -> None:
     """Fly, trace and append one line per campaign."""
+    import jax
+
     from cfb_mjx.sysid.evaluation import evaluate
     from cfb_mjx.sysid.tracing.outcome import close_loop
 
@@ -96,6 +98,8 @@ def run(wanted: list[Case], results: Path) -> None:
                 line["perfect"] = _pick(twin.metrics("commands_in"))
             with results.open("a") as file:
                 file.write(json.dumps(line, default=float) + "\n")
+            # Programs of every shape met would pile up until the process may map no more memory; they are kept on disk.
+            jax.clear_caches()
             names = [item.name for item in outcome.reported]
             print(f"{campaign.case.name}: {names} unexplained={bool(outcome.unexplained)} {seconds:.0f} s", flush=True)
 

@@ -29,6 +29,8 @@ OF_FIRST_FORMULA = 0.05
 """And by this share of what the declared model scores: an effect of slightly another shape leaves crumbs."""
 SURE = 3.0
 """And when its statistic on held-out flights is above this."""
+ENOUGH, SAME_LINE = 3, 0.1
+"""Held-out flights from which lines are looked for there too, and Hz by which the two may differ."""
 DOUBTFUL = 2.3
 """An effect whose statistic on held-out flights is below this is not reported."""
 
@@ -169,17 +171,34 @@ def close_loop(
     found = trace(fit, parameters, delay, progress, declared, checkpoint)
     search, proposal = explain(found.search, found.hypothesis, prediction_errors, STRUCTURE, OF_FIRST_FORMULA, progress)
     progress("judging on held-out flights")
-    nothing = found.search.nothing()
-    before = evaluate(nothing.model(parameters), held_out)
+    before = evaluate(found.search.nothing().model(parameters), held_out)
     # Biases of the held-out sensors come from their own kinematics; no model is fitted.
     check = replace(check_sensors(held_out, delay), faults=found.sensors.faults)
-    judge = found.search.beside(held_out, check)
-    if proposal is not None:
-        wide = search.beside(held_out, check)
-        verdict = confirm(wide, proposal.without, proposal.hypothesis)
-        if verdict.t < SURE or _change(wide, proposal.without, proposal.hypothesis) > 0:
-            proposal = None
-    hypothesis, reported, unconfirmed = proposal.hypothesis if proposal else found.hypothesis, [], []
+    judge, wide = found.search.beside(held_out, check), search.beside(held_out, check)
+    if proposal is not None and not _borne_out(wide, proposal):
+        proposal, search, wide = None, found.search, judge
+    hypothesis, reported, unconfirmed = _judged(judge, found, proposal)
+    unexplained = _unexplained(search, wide, proposal, proposal.hypothesis if proposal else found.hypothesis)
+    faults = replace(found.sensors.faults, motor_shift=hypothesis.shift)
+    after = evaluate(hypothesis.model(parameters), held_out, faults=faults)
+    return Outcome(found, base, reported, unconfirmed, hypothesis, faults, before, after, unexplained)
+
+
+def _borne_out(wide: Search, proposal: Proposal) -> bool:
+    """Whether held-out flights confirm a formula."""
+    verdict = confirm(wide, proposal.without, proposal.hypothesis)
+    return verdict.t >= SURE and _change(wide, proposal.without, proposal.hypothesis) <= 0
+
+
+def _judged(
+    judge: Search, found: Trace, proposal: Proposal | None
+) -> tuple[Hypothesis, list[Reported], list[Reported]]:
+    """What held-out flights leave of the hypothesis; what they confirm, sensor faults first; what they do not."""
+    hypothesis = proposal.hypothesis if proposal else found.hypothesis
+    reported, unconfirmed = [], []
+    for fault in found.sensors.findings:
+        key = SENSOR_FAULTS[fault.name].parameter
+        reported.append(Reported(fault.name, fault.p_value, {key: fault.value}, {key: fault.std}))
     for item in found.found:
         verdict = confirm(judge, item.without, found.hypothesis)
         entry = Reported(item.name, verdict.p_value, item.parameters, item.uncertainty, item, verdict)
@@ -189,17 +208,22 @@ def close_loop(
             hypothesis = hypothesis.without(item.name)
         else:
             reported.append(entry)
-    best = proposal.hypothesis if proposal else found.hypothesis
-    lines = find_lines(residual_rows(search if proposal else found.search, best))
-    elsewhere = find_lines(residual_rows(wide if proposal else judge, best)) if len(held_out) >= 3 else lines
-    lines = [a for a in lines if any(a.axis == b.axis and abs(a.frequency - b.frequency) < 0.1 for b in elsewhere)]
-    unexplained = Unexplained(proposal, lines) if proposal or lines else None
-    for fault in found.sensors.findings:
-        field = SENSOR_FAULTS[fault.name].parameter
-        reported.insert(0, Reported(fault.name, fault.p_value, {field: fault.value}, {field: fault.std}))
-    faults = replace(found.sensors.faults, motor_shift=hypothesis.shift)
-    after = evaluate(hypothesis.model(parameters), held_out, faults=faults)
-    return Outcome(found, base, reported, unconfirmed, hypothesis, faults, before, after, unexplained)
+    return hypothesis, reported, unconfirmed
+
+
+def _unexplained(search: Search, wide: Search, proposal: Proposal | None, hypothesis: Hypothesis) -> Unexplained | None:
+    """What is left: a formula, and lines that most flights share, held-out ones too where there are enough of them."""
+    lines = find_lines(residual_rows(search, hypothesis))
+    if len(wide.logs) >= ENOUGH:
+        again = find_lines(residual_rows(wide, hypothesis))
+        lines = [
+            a for a in lines if any(a.axis == b.axis and abs(a.frequency - b.frequency) < SAME_LINE for b in again)
+        ]
+    return Unexplained(proposal, lines) if proposal or lines else None
+
+
+def _same(a: Line, b: Line) -> bool:
+    return a.axis == b.axis and abs(a.frequency - b.frequency) < SAME_LINE
 
 
 def _per_log(evaluation: Evaluation) -> list[dict[str, float] | None]:
