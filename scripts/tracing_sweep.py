@@ -25,7 +25,7 @@ from cfb_mjx.files import write_text  # noqa: E402
 from cfb_mjx.parameters import load_model_file  # noqa: E402
 from cfb_mjx.sysid.tracing.trace import ERRORS  # noqa: E402
 
-BATCH = 12
+BATCH = 8
 WEAK = 0.35
 MIXTURES = [
     ("rotor_drag", "cog_offset"),
@@ -77,6 +77,8 @@ def run(wanted: list[Case], results: Path) -> None:
         twins = [Case(case.name, case.seed, ()) for case in batch if case.effects]
         flown = fly_campaigns(batch + twins)
         perfect = {c.case.name: c for c in flown[len(batch) :]}
+        # Programs of every shape met would pile up until the process may map no more memory; they are kept on disk.
+        jax.clear_caches()
         for campaign in flown[: len(batch)]:
             began = time.perf_counter()
             outcome = close_loop(campaign.fit, campaign.held_out, base)
@@ -98,8 +100,6 @@ def run(wanted: list[Case], results: Path) -> None:
                 line["perfect"] = _pick(twin.metrics("commands_in"))
             with results.open("a") as file:
                 file.write(json.dumps(line, default=float) + "\n")
-            # Programs of every shape met would pile up until the process may map no more memory; they are kept on disk.
-            jax.clear_caches()
             names = [item.name for item in outcome.reported]
             print(f"{campaign.case.name}: {names} unexplained={bool(outcome.unexplained)} {seconds:.0f} s", flush=True)
 
