@@ -19,6 +19,6 @@ def test_output_folder_is_made_with_those_above_it(tmp_path):
 def test_a_file_in_the_way_of_a_folder_is_named(tmp_path, below):
     file = tmp_path / "taken"
     file.write_text("mine")
-    with pytest.raises(CfbError, match="there is a file in the way"):
+    with pytest.raises(CfbError, match="taken: this is a file"):
         output_folder(file / below)
     assert file.read_text() == "mine"

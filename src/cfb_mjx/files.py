@@ -63,21 +63,33 @@ def require_folder(*paths: str | os.PathLike | None) -> None:
 
 
 def output_folder(path: str | os.PathLike) -> Path:
-    """Make the folder a command writes its files into, with those above it, before any work is done.
+    """Make the folder a command writes its files into, with those above it.
 
     Raises:
         CfbError: a file is in the way, or the folder cannot be made.
     """
     path = Path(path)
+    require_no_file(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise CfbError(f"{path}: there is a file in the way; give the name of a folder for the results.") from None
     except OSError as error:
         raise CfbError(
             f"{path}: this folder cannot be made ({error.strerror or error}); choose another place."
         ) from None
     return path
+
+
+def require_no_file(path: str | os.PathLike) -> None:
+    """Refuse, before any work is done, a folder for results where a file is, or below one.
+
+    Raises:
+        CfbError: names the file.
+    """
+    for place in (Path(path), *Path(path).parents):
+        if place.exists():
+            if not place.is_dir():
+                raise CfbError(f"{place}: this is a file; give the name of a folder for the results.")
+            return
 
 
 def read_bytes(path: str | os.PathLike, count: int = -1) -> bytes:

@@ -36,7 +36,7 @@ class _Problem:
         for name, value in nudge.items():
             parameters = eqx.tree_at(lambda p, n=name: getattr(p, n), parameters, jnp.asarray(value))
         # Fast enough that no component of the velocity passes zero, where |v| v has its kink.
-        drag = ParasiticDrag(linear=[0.02, 0.03, 0.025], quadratic=[0.01, 0.005, 0.008])
+        drag = ParasiticDrag(linear=[0.02, 0.03, 0.025], quadratic=[0.01, 0.005, 0.008], cross=0.4)
         model = Quadrotor(parameters, (drag,), body=body, integrator=integrator, rotor_loads=rotor_loads)
         q = np.array([0.95, 0.1, -0.2, 0.15])
         y = np.concatenate(

@@ -85,7 +85,7 @@ def batch(model, flight):
     models = eqx.tree_at(
         lambda m: (m.parameters, m.effects),
         model,
-        (parameters, jax.tree.map(lambda x: x * jnp.arange(1.0, 5.0)[:, None], model.effects)),
+        (parameters, jax.tree.map(lambda x: x * jnp.arange(1.0, 5.0).reshape(4, *[1] * x.ndim), model.effects)),
     )
     states = jax.tree.map(lambda x: x + 0.1 * jnp.arange(4.0)[:, None], flight[0])
     commands = jnp.asarray(np.random.default_rng(0).uniform(0, 1, (4, STEPS, 4)))

@@ -8,7 +8,7 @@ from pathlib import Path
 from cfb_mjx.cli.fitted_model import provenance
 from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import output_folder, write_json
+from cfb_mjx.files import output_folder, require_no_file, write_json
 from cfb_mjx.logs import FlightLog, read_log, require_own_names
 
 LEAST_SECONDS = 10.0
@@ -22,7 +22,7 @@ def run_close_loop(fit: list[Path], held_out: list[Path], output: Path, model: s
         CfbError: bad logs, a log on both sides, a bad model, or a folder that cannot be written.
     """
     logs, judged = _read(fit, held_out)
-    output_folder(output)
+    require_no_file(output)
     configure_jax(x64=True)
     from cfb_mjx.cli.evaluating import changed_model
     from cfb_mjx.parameters import save_model_file
@@ -31,6 +31,7 @@ def run_close_loop(fit: list[Path], held_out: list[Path], output: Path, model: s
     from cfb_mjx.view.closing import write_report
 
     base = changed_model(model, changes)
+    output_folder(output)
     checkpoint = Checkpoint.open(output / "search.json", fit, base)
     outcome = close_loop(logs, judged, base, _say, checkpoint)
     story = provenance("close-loop", base.name, "fit_logs_sha256", fit, held_out=[path.name for path in held_out])

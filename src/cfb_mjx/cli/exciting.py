@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import output_folder, require_folder, write_json, write_text
+from cfb_mjx.files import output_folder, require_folder, require_no_file, write_json, write_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -58,12 +58,12 @@ def run_excite(
     Raises:
         CfbError: impossible limits, parameters or outputs.
     """
+    require_no_file(output)
     require_folder(json)
     if not 1 <= repetitions <= MOST_REPETITIONS:
         raise CfbError(f"--repetitions {repetitions}: repeat the manoeuvre 1 to {MOST_REPETITIONS} times.")
     if not 0 <= disturbance < float("inf"):
         raise CfbError(f"--disturbance {disturbance:g}: the disturbance is an rms in rad/s^2, zero or more.")
-    output_folder(output)
     configure_jax(x64=True)
     from cfb_mjx.sysid.excitation.conditions import Conditions
     from cfb_mjx.sysid.excitation.manoeuvres import Limits
@@ -206,6 +206,7 @@ def _write(folder: Path, chosen: Trial, result: dict, limits, title: str) -> Non
     from cfb_mjx.sysid.excitation.manoeuvres import STEP
     from cfb_mjx.view.excitation import excitation_figure
 
+    output_folder(folder)
     rows = np.column_stack([STEP * np.arange(len(chosen.commands)), chosen.commands])
     lines = ["t,u1,u2,u3,u4", *(f"{t:.3f}," + ",".join(f"{u:.6f}" for u in command) for t, *command in rows)]
     write_text(folder / "commands.csv", "\n".join(lines) + "\n")
