@@ -238,11 +238,10 @@ def main() -> None:
     parser.add_argument("--page-only", action="store_true")
     arguments = parser.parse_args()
     configure_jax(x64=True)
-    planned = len(cases(arguments.null, arguments.seed))
+    planned = cases(arguments.null, arguments.seed)
     if not arguments.page_only:
-        wanted = [case for case in cases(arguments.null, arguments.seed) if arguments.only in case.name]
-        run(wanted, arguments.results)
-    write_text(ROOT / "docs" / "tracing.md", page(arguments.results, planned))
+        run([case for case in planned if arguments.only in case.name], arguments.results)
+    write_text(ROOT / "docs" / "tracing.md", page(arguments.results, len(planned)))
 
 
 if __name__ == "__main__":

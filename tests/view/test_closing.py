@@ -75,7 +75,7 @@ def outcome(logs):
         Reported("rotor_drag", 1e-7, values, stds, found),
     ]
     return Outcome(
-        Trace(hypothesis, sensors, [found], tried, search),
+        Trace(hypothesis, sensors, [found], tried, search, np.ones(8), np.ones(8)),
         base,
         reported,
         [],

@@ -31,6 +31,16 @@ from cfb_mjx.model.vector import Vec, rotate
 from cfb_mjx.sysid.flight import Flight
 
 
+def next_row(x: Array) -> Array:
+    """(n, ...) what the following row holds; the last row stays."""
+    return jnp.concatenate([x[1:], x[-1:]])
+
+
+def between(x: Array) -> Array:
+    """(n, ...) in the middle of the interval after each row."""
+    return 0.5 * (x + next_row(x))
+
+
 class Replay(eqx.Module):
     """What a model predicts along a flight."""
 
@@ -63,13 +73,6 @@ def remembered(model: Quadrotor, flight: Flight, lead: Float[Array, ""]) -> tupl
 
 def _scan(model: Quadrotor, flight: Flight, driven, lead):
     center = Vec.unstack(model.changed_parameters().center_of_gravity)
-
-    def next_row(x):
-        return jnp.concatenate([x[1:], x[-1:]])
-
-    def between(x):
-        return 0.5 * (x + next_row(x))
-
     command = flight.command + lead * (next_row(flight.command) - flight.command)
     middle = State(
         between(flight.position),

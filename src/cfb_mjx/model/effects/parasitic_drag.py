@@ -41,7 +41,7 @@ class ParasiticDrag(Effect):
 
     @classmethod
     def neutral(cls) -> ParasiticDrag:
-        return cls(linear=0.0, quadratic=0.0, cross=0.0)
+        return cls(linear=0.0, quadratic=0.0)
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         velocity = condition.velocity_body

@@ -47,7 +47,7 @@ class Payload(Effect):
 
     @classmethod
     def neutral(cls) -> Payload:
-        return cls(mass=0.0, height=-0.02, offset=0.0)
+        return cls(mass=0.0, height=-0.02)
 
     def change(self, parameters: Parameters) -> Parameters:
         total = parameters.mass + self.mass

@@ -54,7 +54,7 @@ class PayloadSwing(Effect):
 
     @classmethod
     def neutral(cls) -> PayloadSwing:
-        return cls(mass=0.0, length=0.15, damping_ratio=0.02)
+        return cls(mass=0.0, length=0.15)
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
         zero = jnp.zeros_like(rotor_speed[0])

@@ -11,7 +11,12 @@ from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS, ResidualFormula
 from cfb_mjx.sysid.tracing.columns import FORMULA, Column, term_columns
 from cfb_mjx.sysid.tracing.evidence import covariance, evidence, solve
 from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Search
+from cfb_mjx.sysid.tracing.trace import Trace, prediction_errors
 
+STRUCTURE = 0.06
+"""A formula counts when it lowers at least one prediction error by this share."""
+OF_FIRST = 0.05
+"""And by this share of what the declared model scores: an effect of slightly another shape leaves crumbs."""
 PER_AXIS = 3
 """Terms or families along one axis at most."""
 _QUADRATIC = ("n_roll^2", "n_pitch^2", "n_roll n_pitch")
@@ -131,7 +136,7 @@ def terms_of(hypothesis: Hypothesis, deviation: np.ndarray, gains: dict[Column, 
     for column, std in zip(hypothesis.terms, deviation, strict=True):
         axis, signal, unit = describe(column)
         value = float(np.asarray(getattr(effect, column.field))[column.index])
-        found.append(Term(axis, signal, unit, value, float(std), gains[column]))
+        found.append(Term(axis, signal, unit, value, float(std), gains.get(column, 0.0)))
     return sorted(found, key=lambda term: -term.gain)
 
 
@@ -168,55 +173,43 @@ def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Colu
     return bool(said > 0.5 * np.trace(total[np.ix_(effect, effect)]))
 
 
-def explain(
-    search: Search,
-    hypothesis: Hypothesis,
-    errors: Callable[[Search, Hypothesis], np.ndarray],
-    material: float,
-    of_first: float,
-    progress: Callable[[str], None] = lambda _: None,
-) -> tuple[Search, Proposal | None]:
+def explain(found: Trace, progress: Callable[[str], None] = lambda _: None) -> tuple[Search, Proposal | None]:
     """Look for a formula beside what was found, keep it if it is material, and drop effects it makes needless.
 
-    Args:
-        search: over the fit flights.
-        hypothesis: what the catalogue explains.
-        errors: prediction errors of a hypothesis on the flights of a search.
-        material: least share by which it must lower one of them.
-        of_first: and least share of what the declared model scores.
-        progress: told what happens.
+    Returns:
+        The search over the fit flights, widened by the formula if there is one, and the formula.
     """
+    search, hypothesis = found.search, found.hypothesis
     widened, base = with_library(search, hypothesis)
     terms, gains = propose(widened, base, progress)
     if not terms:
         return search, None
     richer, deviation = fit_formula(widened, base, terms)
-    first, old, new = errors(search, search.nothing()), errors(widened, base), errors(widened, richer)
-    slight = np.max(1 - new / old) < material or np.max((old - new) / first) < of_first
+    old, new = found.errors, prediction_errors(widened, richer)
+    slight = np.max(1 - new / old) < STRUCTURE or np.max((old - new) / found.declared_errors) < OF_FIRST
     if slight or np.log(new / old).sum() > 0:
         return search, None
-    if "wind" in hypothesis.present and any(c.field == "place" for c in terms):
-        # A force that hangs on the place has a constant part, which looked like wind.
-        constants = [c for c in term_columns(3) + term_columns(4) + term_columns(5) if c.field == "place"]
-        terms = terms + [c for c in constants if c.index[1] == 0 and c not in terms]
-        gains = {c: 0.0 for c in terms} | gains
-        progress("looking at wind again, beside the formula")
-        less, spread = fit_formula(widened, richer.without("wind"), terms)
-        without = errors(widened, less)
-        if np.max(1 - new / without) < material:
-            richer, deviation, new = less, spread, without
-    for name in hypothesis.present:
-        if name not in richer.present or mimicked(widened, richer, name, terms):
+    # A force that hangs on the place has a constant part, which looked like wind.
+    windy = "wind" in hypothesis.present and any(c.field == "place" for c in terms)
+    for name in sorted(hypothesis.present, key=lambda name: not (windy and name == "wind")):
+        instead = windy and name == "wind"
+        if not instead and mimicked(widened, richer, name, terms):
             continue
         progress(f"looking at {name} again, beside the formula")
-        less, spread = fit_formula(widened, richer.without(name), terms)
-        without = errors(widened, less)
-        if np.max(1 - new / without) < material:
-            richer, deviation, new = less, spread, without
-    kept = [name for name in hypothesis.present if name in richer.present]
+        wider = terms + _constant_forces(terms) if instead else terms
+        less, spread = fit_formula(widened, richer.without(name), wider)
+        without = prediction_errors(widened, less)
+        if np.max(1 - new / without) < STRUCTURE:
+            richer, deviation, new, terms = less, spread, without, wider
     plain = base
-    for name in hypothesis.present:
-        plain = plain if name in kept else plain.without(name)
+    for name in set(hypothesis.present) - set(richer.present):
+        plain = plain.without(name)
     plain, _ = widened.refine(plain)
-    buys = float(np.max(1 - new / errors(widened, plain)))
+    buys = float(np.max(1 - new / prediction_errors(widened, plain)))
     return widened, Proposal(terms_of(richer, deviation, gains), buys, richer, plain)
+
+
+def _constant_forces(terms: list[Column]) -> list[Column]:
+    """Constant forces along the world's axes that are not among the terms."""
+    places = [c for axis in (3, 4, 5) for c in term_columns(axis) if c.field == "place"]
+    return [c for c in places if c.index[1] == 0 and c not in terms]

@@ -14,7 +14,7 @@ from cfb_mjx.model.state import State, unstack
 from cfb_mjx.model.vector import Vec, rotate_inverse
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight
-from cfb_mjx.sysid.replay import remembered, smoothed_rotor_speed
+from cfb_mjx.sysid.replay import between, remembered, smoothed_rotor_speed
 from cfb_mjx.sysid.tracing.whitening import (
     Blocks,
     Levels,
@@ -83,10 +83,6 @@ def with_slopes(models: Quadrotor, flight: Flight, driven: Array, leads: Array, 
 
 def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, Condition]:
     """The parameters, and the flight condition in the middle of every interval."""
-
-    def between(x):
-        return 0.5 * (x + jnp.concatenate([x[1:], x[-1:]]))
-
     prepared = prepare(model)
     middle = (flight.position, flight.velocity, flight.quaternion, flight.body_rate, driven)
     at = unstack(State(*map(between, middle)), prepared.parameters.center_of_gravity)
@@ -110,7 +106,7 @@ def term_slopes(model: Quadrotor, flight: Flight, driven: Array, axis: Array) ->
     a wrench on the body does not change how the rotors run.
     """
     parameters, seen = _seen(model, flight, driven)
-    along = [jnp.where(axis == i, 1.0, 0.0) for i in range(6)]
+    along = jnp.arange(6) == axis
 
     def signals(force: Vec, torque: Vec) -> Signals:
         spin, push = at_rotor_center(parameters, Wrench(force, torque), Vec(0.0, 0.0, 0.0))

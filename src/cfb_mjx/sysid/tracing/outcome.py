@@ -23,12 +23,8 @@ from cfb_mjx.sysid.tracing.search import Hypothesis, Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.trace import Found, Trace, prediction_errors, trace
 
-STRUCTURE = 0.06
-"""A formula counts when it lowers at least one prediction error by this share."""
-OF_FIRST_FORMULA = 0.05
-"""And by this share of what the declared model scores: an effect of slightly another shape leaves crumbs."""
 SURE = 3.0
-"""And when its statistic on held-out flights is above this."""
+"""A formula counts when its statistic on held-out flights is above this."""
 ENOUGH, SAME_LINE = 3, 0.1
 """Held-out flights from which lines are looked for there too, and Hz by which the two may differ."""
 DOUBTFUL = 2.3
@@ -169,7 +165,7 @@ def close_loop(
     delays = {log.observation_delay for log in fit} - {None}
     delay = float(np.median(list(delays))) if delays else float(parameters.observation_delay)
     found = trace(fit, parameters, delay, progress, declared, checkpoint)
-    search, proposal = explain(found.search, found.hypothesis, prediction_errors, STRUCTURE, OF_FIRST_FORMULA, progress)
+    search, proposal = explain(found, progress)
     progress("judging on held-out flights")
     before = evaluate(found.search.nothing().model(parameters), held_out)
     # Biases of the held-out sensors come from their own kinematics; no model is fitted.

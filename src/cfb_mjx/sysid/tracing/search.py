@@ -82,13 +82,20 @@ class Hypothesis:
 
 @dataclass
 class Linear:
-    """A hypothesis with its residual and derivatives, as inner products."""
+    """A residual and its derivatives at a hypothesis, as inner products.
 
-    hypothesis: Hypothesis
+    Attributes:
+        columns: one fewer than c: the residual itself comes first. Of columns that occur twice the first counts.
+        blocks: (b, c, c).
+        scale: (c,) unit of each.
+    """
+
     columns: list[Column]
     blocks: np.ndarray
-    """(b, c, c)."""
-    scale: np.ndarray
+    scale: np.ndarray = field(init=False)
+
+    def __post_init__(self):
+        self.scale = np.array([1.0] + [c.scale for c in self.columns])
 
     def index(self, wanted: list[Column]) -> list[int]:
         """Positions of columns in the inner products."""
@@ -139,7 +146,7 @@ class Search:
         return residual_blocks(model, flight, driven, jnp.asarray(hypothesis.lead)), driven
 
     def beside(self, logs: list[FlightLog], sensors: SensorCheck) -> Search:
-        """The same search, with its noise levels, on other flights of the drone."""
+        """The same search on other flights of the drone."""
         return replace(self, logs=[sensors.corrected(log) for log in logs], _flights={})
 
     def nothing(self) -> Hypothesis:
@@ -156,28 +163,28 @@ class Search:
 
     def linearise(self, hypothesis: Hypothesis, wanted: list[Column], width: int = 0) -> Linear:
         """Residual and derivatives by ``wanted`` at a hypothesis, padded to ``width`` columns at least."""
-        signals, columns, scale = self._slopes(hypothesis, wanted, width)
-        return Linear(hypothesis, columns, self._products(hypothesis, signals), scale)
+        signals, columns = self._slopes(hypothesis, wanted, self._driven(hypothesis), width)
+        return Linear(columns, self._products(hypothesis, signals))
 
     def linearise_terms(self, hypothesis: Hypothesis, own: list[Column]) -> list[Linear]:
         """`linearise` by ``own`` and the library of formulas, for each axis (`formula.AXES`)."""
-        model, lead = hypothesis.model(self.parameters), hypothesis.lead
-        beside, columns, scale = self._slopes(hypothesis, own, 0)
-        driven = [driven_by(model, flight, lead) for flight in self.flights(hypothesis)]
+        model, driven = hypothesis.model(self.parameters), self._driven(hypothesis)
+        beside, columns = self._slopes(hypothesis, own, driven)
         squares = [term_squares(model, *pair) for pair in zip(self.flights(hypothesis), driven, strict=True)]
         sizes = np.sqrt(np.mean(squares, axis=0))
         found = []
         for axis in range(6):
             library = cols.term_columns(axis, sizes)
-            # Columns of the padding have to be passed over by name: any that is asked for comes first.
-            names = columns + [columns[0]] * (len(scale) - 1 - len(columns)) + library
             signals = []
             for flight, speed, some in zip(self.flights(hypothesis), driven, beside, strict=True):
                 terms = term_slopes(model, flight, speed, jnp.asarray(axis))
                 signals.append(jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=-1), some, terms))
-            unit = np.concatenate([scale, [c.scale for c in library]])
-            found.append(Linear(hypothesis, names, self._products(hypothesis, signals), unit))
+            found.append(Linear(columns + library, self._products(hypothesis, signals)))
         return found
+
+    def _driven(self, hypothesis: Hypothesis) -> list[Array]:
+        model = hypothesis.model(self.parameters)
+        return [driven_by(model, flight, hypothesis.lead) for flight in self.flights(hypothesis)]
 
     def _products(self, hypothesis: Hypothesis, signals: list[Signals]) -> np.ndarray:
         levels = levels_from(jnp.asarray(hypothesis.levels), self.noise)
@@ -185,9 +192,9 @@ class Search:
         return np.concatenate([np.asarray(inner_products(flight, one, levels)) for flight, one in pairs])
 
     def _slopes(
-        self, hypothesis: Hypothesis, wanted: list[Column], width: int
-    ) -> tuple[list[Signals], list[Column], np.ndarray]:
-        """Residuals and derivatives of every flight, the columns they belong to, and the units of all."""
+        self, hypothesis: Hypothesis, wanted: list[Column], driven: list[Array], width: int = 0
+    ) -> tuple[list[Signals], list[Column]]:
+        """Residuals and derivatives of every flight, and the (padded) columns they belong to."""
         lead = Column(LEAD, LEAD, None, (), 0.25)
         columns = [lead, *wanted]
         padded = columns + [lead] * max(-(len(columns) + 1) % PAD, width - 1 - len(columns))
@@ -195,11 +202,8 @@ class Search:
         model = hypothesis.model(self.parameters)
         models = eqx.tree_at(lambda m: m.effects, model, moves.effects)
         steps = [jnp.asarray(x) for x in (moves.lead, moves.shift, moves.step)]
-        found = [
-            with_slopes(models, flight, driven_by(model, flight, hypothesis.lead), *steps)
-            for flight in self.flights(hypothesis)
-        ]
-        return found, columns, np.array([1.0] + [c.scale for c in padded])
+        pairs = zip(self.flights(hypothesis), driven, strict=True)
+        return [with_slopes(models, *pair, *steps) for pair in pairs], padded
 
     # -- one hypothesis -------------------------------------------------------------------------------------------
 

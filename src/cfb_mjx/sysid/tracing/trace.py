@@ -75,6 +75,10 @@ class Trace:
     tried: list[dict]
     """What was looked at in every round, for the report."""
     search: Search
+    declared_errors: np.ndarray
+    """`prediction_errors` of the declared model."""
+    errors: np.ndarray
+    """Of the hypothesis."""
 
     @property
     def faults(self) -> SensorFaults:
@@ -162,7 +166,7 @@ def trace(
         if not passing:
             break
         name, richer, stretched = best_fit(search, fit, passing, progress)
-        refused |= stretched - {name}
+        refused |= stretched
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))}
         if worth_it(name, fit, richer, nothing.errors):
             vain = 0
@@ -181,7 +185,7 @@ def trace(
         for name in fit.hypothesis.present
     ]
     found.sort(key=lambda f: -f.buys)
-    return Trace(fit.hypothesis, sensors, found, tried, search)
+    return Trace(fit.hypothesis, sensors, found, tried, search, nothing.errors, fit.errors)
 
 
 def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, list[Column]]]:
@@ -218,29 +222,31 @@ def best_fit(
     Returns:
         Its name, the fit with it, and the names of those that would have to be implausibly strong.
     """
-    contenders, stretched = [], set()
+    fits = {}
     for found, variant in ranking[:CONTENDERS]:
         if found.gain < CONTENDER * ranking[0][0].gain:
             break
         name = variant[0].effect
         progress(f"trying {name} beside {', '.join(fit.hypothesis.present) or 'nothing'}")
-        richer = fitted(search, search.with_candidate(fit.hypothesis, variant, found))
-        gain = confirm(search, fit.hypothesis, richer.hypothesis).gain
-        if implausible(richer.hypothesis, name) or not np.isfinite(gain):
-            stretched.add(name)
-        else:
-            contenders.append((gain, len(variant), name, richer))
-    if not contenders:
-        return name, richer, stretched
-    most = max(gain for gain, *_ in contenders)
-    close = [entry for entry in contenders if entry[0] >= most - PARSIMONY * abs(most)]
-    gain, _, name, richer = min(close, key=lambda entry: entry[1])
-    if name == SHIFT and richer.hypothesis.shift < 0:
+        fits[name] = fitted(search, search.with_candidate(fit.hypothesis, variant, found))
+    plausible = [name for name, richer in fits.items() if not implausible(richer.hypothesis, name)]
+    if len(plausible) > 1:
+        gains = {name: confirm(search, fit.hypothesis, fits[name].hypothesis).gain for name in plausible}
+        plausible = [name for name in plausible if np.isfinite(gains[name])]
+    stretched = set(fits) - set(plausible)
+    if len(plausible) < 2:
+        name = (plausible or list(fits))[-1]
+        return name, fits[name], stretched
+    numbers = {variant[0].effect: len(variant) for _, variant in ranking}
+    most = max(gains[name] for name in plausible)
+    close = [name for name in plausible if gains[name] >= most - PARSIMONY * abs(most)]
+    name = min(close, key=numbers.get)
+    delayed = "command_delay"
+    if name == SHIFT and fits[name].hypothesis.shift < 0 and delayed in plausible:
         # Commands logged early and commands that act late look the same unless rotor speeds were logged: the
         # physical cause comes first, and the report names both.
-        near = (entry for entry in contenders if entry[2] == "command_delay" and entry[0] > (1 - CLOSE) * gain)
-        _, _, name, richer = next(near, (0, 0, name, richer))
-    return name, richer, stretched
+        name = delayed if gains[delayed] > (1 - CLOSE) * gains[name] else name
+    return name, fits[name], stretched
 
 
 def significant(found: Evidence, tried: int) -> bool:

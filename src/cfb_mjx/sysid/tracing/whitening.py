@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.vector import Vec, rotate
 from cfb_mjx.sysid.flight import Flight
-from cfb_mjx.sysid.replay import replay
+from cfb_mjx.sysid.replay import between, replay
 
 BLOCK = 512
 """Rows that stay together: about two seconds at 250 Hz. A filter starts anew in every block."""
@@ -66,8 +66,7 @@ def accumulated(
     """Signals of accelerations in body axes; ``gravity`` is zero for what comes on top of others."""
     dt = flight.interval[:, None]
     force = Vec.unstack(specific_force)
-    following = jnp.concatenate([flight.quaternion[1:], flight.quaternion[-1:]])
-    middle = 0.5 * (flight.quaternion + following)
+    middle = between(flight.quaternion)
     middle = middle / jnp.linalg.norm(middle, axis=1, keepdims=True)
     world = rotate(Vec.unstack(middle), force).stack()
     up = jnp.array([0.0, 0.0, 1.0]) * gravity
