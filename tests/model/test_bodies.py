@@ -12,6 +12,9 @@ import pytest
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import MjxBody, Quadrotor, RigidBody, rollout
 
+# They share fixtures and compiled programs.
+pytestmark = pytest.mark.xdist_group("bodies")
+
 CENTER = 0.014  # height of the rotors' centre above the floor when the drone stands on its feet, m
 
 

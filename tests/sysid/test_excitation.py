@@ -30,6 +30,9 @@ from cfb_mjx.sysid.excitation.safety import attained
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.unknowns import choose
 
+# They share fixtures and compiled programs.
+pytestmark = pytest.mark.xdist_group("excitation")
+
 MODEL = Quadrotor.from_file("cfb-guards")
 NAMES = "inertia,rotor_inertia,motor_time_constant,motor_gain"
 UNKNOWNS = choose(NAMES, MODEL.parameters)

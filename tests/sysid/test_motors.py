@@ -18,6 +18,9 @@ from cfb_mjx.sysid.rotors.motor_replay import replay
 from cfb_mjx.sysid.rotors.motor_tracks import ROWS, gather, record_of
 from cfb_mjx.sysid.rotors.motors import chi_square_tail, fit_motors
 
+# They share fixtures and compiled programs.
+pytestmark = pytest.mark.xdist_group("motors")
+
 NOMINAL = load_model_file("cfb-guards").parameters()
 REAL = Path(__file__).resolve().parents[3] / "shared" / "real" / "fit"
 LAGS = ("spin_up_time_constant", "spin_down_time_constant", "dead_time")

@@ -15,6 +15,9 @@ from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.observer import Observer, fit_observer, observe
 
+# They share fixtures and compiled programs.
+pytestmark = pytest.mark.xdist_group("observer")
+
 DELAY = 0.008
 VALIDATION = Path(__file__).resolve().parents[3] / "shared" / "real" / "validation"
 GUARDS = Quadrotor.from_file("cfb-guards")

@@ -14,6 +14,9 @@ from plants.simulation import Lane, simulate
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+# They share fixtures and compiled programs.
+pytestmark = pytest.mark.xdist_group("plants")
+
 GRAVITY = np.array([0, 0, -c.GRAVITY])
 OFF_CENTRE = {"mass": 0.05, "cog": np.array([0.003, -0.002, -0.004])}
 

@@ -28,6 +28,9 @@ from cfb_mjx.sysid.tracing.trace import Found, Trace
 from cfb_mjx.view import closing_words as words
 from cfb_mjx.view.closing import write_report
 
+# They share fixtures and compiled programs.
+pytestmark = pytest.mark.xdist_group("view_closing")
+
 DRAG = 0.01
 
 

@@ -10,6 +10,9 @@ from cfb_mjx.cli import demo
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import write_tabular
 
+# They share fixtures and compiled programs.
+pytestmark = pytest.mark.xdist_group("demo")
+
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
