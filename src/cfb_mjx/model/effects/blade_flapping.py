@@ -2,11 +2,13 @@
 
 The disc tilts or, on stiff blades, the hub is twisted:
 
-    tau = coefficient (Omega / 1594 rad/s) (1 + climb v_z) e_z x v
+    tau_x = -(1 - anisotropy) c v_y,  tau_y = (1 + anisotropy) c v_x
+    c = coefficient (Omega / 1594 rad/s) (1 + climb v_z)
 
-in body axes with the mean rotor speed: tau_x = -c v_y, tau_y = c v_x. The sign is free, because stiffness and the
-height of the discs over the rotors' centre pull in opposite directions. ``climb`` lets the moment depend on the flow
-through the discs.
+in body axes with the mean rotor speed. The sign is free, because stiffness and the height of the discs over the rotors'
+centre pull in opposite directions. ``climb`` lets the moment depend on the flow through the discs; with ``anisotropy``
+flow along the body twists it more than flow from the side, for what sits between the rotors (battery, decks) is longer
+than wide.
 """
 
 from __future__ import annotations
@@ -22,22 +24,30 @@ from cfb_mjx.model.vector import Vec
 
 
 class BladeFlapping(Effect):
-    """tau = coefficient (Omega / 1594) (1 + climb v_z) e_z x v."""
+    """tau = coefficient (Omega / 1594) (1 + climb v_z) (-(1 - anisotropy) v_y, (1 + anisotropy) v_x, 0)."""
 
     name: ClassVar[str] = "blade_flapping"
-    units: ClassVar[dict[str, str]] = {"coefficient": "N s", "climb": "s/m"}
+    units: ClassVar[dict[str, str]] = {"coefficient": "N s", "climb": "s/m", "anisotropy": "1"}
     source: ClassVar[str] = (
         "R. Mahony, V. Kumar, P. Corke, Multirotor aerial vehicles, IEEE RAM 19(3), 2012; G. Hoffmann, H. Huang, S."
         " Waslander, C. Tomlin, Quadrotor helicopter flight dynamics and control: theory and experiment, AIAA GNC "
         "2007"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (-0.001, 0.001), "climb": (-0.5, 0.5)}
+    prior: ClassVar[dict[str, tuple[float, float]]] = {
+        "coefficient": (-0.001, 0.001),
+        "climb": (-0.5, 0.5),
+        "anisotropy": (-0.5, 0.5),
+    }
     strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
+    # Both are looked for at zero, and fitted once the moment is there.
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({"climb": 0.0, "anisotropy": 0.0},)
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
     """Of the four rotors together at hover speed."""
     climb: Float[Array, "*batch"] = eqx.field(converter=number)
     """Relative change of the moment per velocity along body z."""
+    anisotropy: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
+    """By which share pitching moments exceed, and rolling moments fall short of, their mean."""
 
     @classmethod
     def neutral(cls) -> BladeFlapping:
@@ -46,4 +56,4 @@ class BladeFlapping(Effect):
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         vx, vy, vz = condition.velocity_body
         c = self.coefficient * mean_hover_ratio(condition) * (1 + self.climb * vz)
-        return Wrench(wrench.force, wrench.torque + Vec(-c * vy, c * vx, 0.0))
+        return Wrench(wrench.force, wrench.torque + Vec(-(1 - self.anisotropy) * c * vy, (1 + self.anisotropy) * c * vx, 0.0))
