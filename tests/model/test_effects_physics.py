@@ -93,7 +93,7 @@ def _wrench(constants, y, on):
     if "parasitic_drag" in on:
         force -= 0.01 * np.abs(v) * v
     if "blade_flapping" in on:
-        torque += 8e-4 * speed.mean() / 1594 * (1 + 0.3 * v[2]) * np.array([-0.8 * v[1], 1.2 * v[0], 0.0])
+        torque += 8e-4 * speed.mean() / 1594 * np.exp(0.3 * v[2]) * np.array([-0.8 * v[1], 1.2 * v[0], 0.0])
     if "wind" in on:
         force += matrix.T @ (0.03 * np.array([2.0, -1.0, 0.5]))
     return force, torque

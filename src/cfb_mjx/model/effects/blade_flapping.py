@@ -3,12 +3,12 @@
 The disc tilts or, on stiff blades, the hub is twisted:
 
     tau_x = -(1 - anisotropy) c v_y,  tau_y = (1 + anisotropy) c v_x
-    c = coefficient (Omega / 1594 rad/s) (1 + climb v_z)
+    c = coefficient (Omega / 1594 rad/s) exp(climb v_z)
 
 in body axes with the mean rotor speed. The sign is free, because stiffness and the height of the discs over the rotors'
-centre pull in opposite directions. ``climb`` lets the moment depend on the flow through the discs; with ``anisotropy``
-flow along the body twists it more than flow from the side, for what sits between the rotors (battery, decks) is longer
-than wide.
+centre pull in opposite directions. ``climb`` lets the moment depend on the flow through the discs, without ever turning
+it round. With ``anisotropy`` flow along the body twists it more than flow from the side, for what sits between the
+rotors (battery, decks) is longer than wide.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
@@ -24,7 +25,7 @@ from cfb_mjx.model.vector import Vec
 
 
 class BladeFlapping(Effect):
-    """tau = coefficient (Omega / 1594) (1 + climb v_z) (-(1 - anisotropy) v_y, (1 + anisotropy) v_x, 0)."""
+    """tau = coefficient (Omega / 1594) exp(climb v_z) (-(1 - anisotropy) v_y, (1 + anisotropy) v_x, 0)."""
 
     name: ClassVar[str] = "blade_flapping"
     units: ClassVar[dict[str, str]] = {"coefficient": "N s", "climb": "s/m", "anisotropy": "1"}
@@ -55,5 +56,7 @@ class BladeFlapping(Effect):
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         vx, vy, vz = condition.velocity_body
-        c = self.coefficient * mean_hover_ratio(condition) * (1 + self.climb * vz)
-        return Wrench(wrench.force, wrench.torque + Vec(-(1 - self.anisotropy) * c * vy, (1 + self.anisotropy) * c * vx, 0.0))
+        c = self.coefficient * mean_hover_ratio(condition) * jnp.exp(self.climb * vz)
+        return Wrench(
+            wrench.force, wrench.torque + Vec(-(1 - self.anisotropy) * c * vy, (1 + self.anisotropy) * c * vx, 0.0)
+        )
