@@ -19,6 +19,7 @@ SUMMARY = {
     "fit-rotors": "fit motors and rotor maps, from flights or a bench",
     "excite": "design a manoeuvre that identifies the drone, and predict what a fit will know",
     "close-loop": "find the physical effect a model lacks, and add it",
+    "refine": "fit the numbers of named effects, to innovations or to predictions",
     "bench": "measure throughput, compile time and memory",
     "demo": "evaluate a flight, fly 4096 randomised drones, write a page",
     "version": "print versions",

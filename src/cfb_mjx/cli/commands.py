@@ -265,6 +265,43 @@ def close_loop(
     run_close_loop(list(fit), list(held_out), output, model, list(set))
 
 
+def refine(
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")],
+    output: Output,
+    effects: str | None = None,
+    held_out: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG...")] = (),
+    model: Model = "cfb-guards",
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    estimator: Literal["predictions", "innovations"] = "predictions",
+    predictor: bool = False,
+    weight: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+) -> None:
+    """Fit the numbers of effects you name, where close-loop would search for them.
+
+    Innovations are not biased by feedback. Predictions over half a second are what a model is used for, and feedback
+    biases them: every number stays within what is plausible, inertia within 25 %.
+
+    Args:
+        logs: flight logs to fit.
+        output: model YAML to write.
+        effects: names, comma separated (docs/effects.md); by default those the model has.
+        held_out: other flights, to be judged on.
+        model: preset or model YAML to start from.
+        set: parameters to change, for instance mass=0.045.
+        estimator: what is fitted.
+        predictor: leave inertia and inflow free; the result predicts better, is a wrong plant, and is marked so.
+        weight: what flights whose names begin with NAME count against the others (predictions only).
+        json: write the results here.
+    """
+    if not logs:
+        raise CfbError("refine needs at least one log; see 'cfb refine --help'.")
+    from cfb_mjx.cli.refining import run_refine
+
+    paths = list(logs), list(held_out)
+    run_refine(*paths, output, model, list(set), effects, estimator, predictor, list(weight), json)
+
+
 def bench(
     drones: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N...")] = (1, 64, 1024, 8192, 65536),
     json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
@@ -316,6 +353,7 @@ COMMANDS = {
     "fit-rotors": fit_rotors,
     "excite": excite,
     "close-loop": close_loop,
+    "refine": refine,
     "bench": bench,
     "demo": demo,
     "version": version,

@@ -17,7 +17,8 @@ from cfb_mjx.files import shipped, write_text
 from cfb_mjx.parameters.parameters import DEFAULTS, SPECIFICATIONS, Parameters
 
 FORMAT = "cfb_mjx model 1"
-_TOP_LEVEL = {"format", "name", "description", "parameters", "effects", "provenance"}
+_TOP_LEVEL = {"format", "kind", "name", "description", "parameters", "effects", "provenance"}
+_KINDS = ("plant", "predictor")
 _ENTRY_KEYS = {"value", "unit", "std", "source"}
 
 
@@ -32,13 +33,34 @@ class Entry:
 
 @dataclass(frozen=True)
 class ModelFile:
-    """What a model YAML holds. ``effects`` are kept as read; `cfb_mjx.model.Quadrotor.from_file` builds them."""
+    """What a model YAML holds. ``effects`` are kept as read; `cfb_mjx.model.Quadrotor.from_file` builds them.
+
+    ``kind`` is "plant", or "predictor" for a model whose numbers were left free beyond what is physical: it foretells
+    flights like those it was fitted to, and answers commands as the drone does not.
+    """
 
     name: str
     entries: Mapping[str, Entry]
     description: str = ""
     effects: tuple[Mapping[str, Any], ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    kind: str = "plant"
+
+    def require_plant(self, purpose: str, how: str) -> None:
+        """Refuse a predictor where the drone itself is needed.
+
+        Args:
+            purpose: what for, a sentence's subject ("training").
+            how: how to insist.
+
+        Raises:
+            CfbError: it is a predictor.
+        """
+        if self.kind != "plant":
+            raise CfbError(
+                f"model {self.name} is a predictor, not a plant: its inertia was left free, so {purpose} with it would "
+                f"learn a drone that does not exist; take a plant, or insist with {how}."
+            )
 
     def parameters(self) -> Parameters:
         """The parameter pytree, in the current default float precision."""
@@ -80,6 +102,9 @@ def load_model_file(name_or_path: str | Path) -> ModelFile:
     _refuse_unknown(document, _TOP_LEVEL, path, "")
     if document.get("format") != FORMAT:
         raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
+    kind = document.get("kind", "plant")
+    if kind not in _KINDS:
+        raise CfbError(f"{path}: 'kind' must be one of {', '.join(_KINDS)}, found {kind!r}.")
     raw = document.get("parameters")
     if not isinstance(raw, dict):
         raise CfbError(f"{path}: 'parameters' must be a mapping of names to {{value, unit, source}}.")
@@ -103,6 +128,7 @@ def load_model_file(name_or_path: str | Path) -> ModelFile:
         entries=entries,
         effects=tuple(effects),
         provenance=provenance,
+        kind=kind,
     )
 
 
@@ -118,7 +144,8 @@ def save_model_file(model: ModelFile, path: str | Path) -> None:
         if entry.std is not None:
             item["std"] = _plain(entry.std)
         parameters[key] = item
-    document = {"format": FORMAT, "name": model.name, "description": model.description, "parameters": parameters}
+    document = {"format": FORMAT} | ({} if model.kind == "plant" else {"kind": model.kind})
+    document |= {"name": model.name, "description": model.description, "parameters": parameters}
     if model.effects:
         document["effects"] = [dict(e) for e in model.effects]
     if model.provenance:

@@ -1,0 +1,183 @@
+"""``cfb refine``."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from cfb_mjx.cli.evaluating import changed_model, print_table
+from cfb_mjx.cli.fitted_model import provenance, require_model_path
+from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import require_folder, write_json
+from cfb_mjx.logs import FlightLog, read_log, require_own_names
+
+if TYPE_CHECKING:
+    from cfb_mjx.parameters import ModelFile
+
+
+def run_refine(
+    paths: list[Path],
+    held_out: list[Path],
+    output: Path,
+    model: str,
+    changes: list[str],
+    effects: str | None,
+    estimator: str,
+    predictor: bool,
+    weights: list[str],
+    json: Path | None,
+) -> None:
+    """Fit, print, write the model.
+
+    Raises:
+        CfbError: bad logs, model, effects, weights or outputs.
+    """
+    require_folder(output, json)
+    require_model_path(output)
+    logs, judged = [read_log(path) for path in paths], [read_log(path) for path in held_out]
+    for group in (logs, judged):
+        require_own_names(group)
+    shares = _weights(weights, logs)
+    configure_jax(x64=True)
+    from cfb_mjx.model.effects import CATALOGUE
+    from cfb_mjx.parameters import save_model_file
+
+    base = changed_model(model, changes)
+    names = effects.split(",") if effects else [e["name"] for e in base.effects if e["name"] in CATALOGUE]
+    if not names:
+        raise CfbError(f"model {base.name} has no effects; name some to fit, for instance --effects rotor_drag.")
+    if predictor and estimator == "innovations":
+        raise CfbError("--predictor: only predictions make a predictor; leave out --estimator innovations.")
+    fit = by_innovations if estimator == "innovations" else by_predictions
+    extra = {} if estimator == "innovations" else {"predictor": predictor, "weights": shares}
+    refined, report = fit(base, logs, names, progress=_say, **extra)
+    origin = provenance("refine", base.name, "fit_logs_sha256", paths, held_out=[path.name for path in held_out])
+    refined = replace(refined, name=output.stem, provenance=origin)
+    save_model_file(refined, output)
+    _print(report)
+    print(f"model: {output}" + (" (a predictor, not a plant)" if predictor else ""))
+    if judged:
+        report |= {"held_out": {"before": judge(base, judged), "after": judge(refined, judged)}}
+        for result in report["held_out"].values():
+            print_table(result)
+    if json is not None:
+        write_json(json, report | {"model": refined.name, "estimator": estimator, "environment": environment()})
+        print(f"results: {json}")
+
+
+def by_innovations(base: ModelFile, logs: list[FlightLog], names: list[str], progress) -> tuple[ModelFile, dict]:
+    """The model with some effects fitted to innovations, and what to report."""
+    from cfb_mjx.model import Quadrotor
+    from cfb_mjx.model.effects import effect_to_mapping
+    from cfb_mjx.sysid.tracing.given import fit_given
+
+    parameters = base.parameters()
+    delays = {log.observation_delay for log in logs} - {None}
+    delay = float(np.median(list(delays))) if delays else float(parameters.observation_delay)
+    found = fit_given(logs, parameters, names, Quadrotor.from_file(base).effects, delay, progress)
+    rows, mappings = {}, []
+    for effect in found.effects:
+        mapping = effect_to_mapping(effect)
+        std = found.uncertainty.get(mapping["name"])
+        for field, value in mapping["parameters"].items() if std else ():
+            for name, (v, s) in _pairs(f"{mapping['name']}.{field}", value, std.get(field)).items():
+                rows[name] = {"value": v, "std": s, "at_bound": False}
+        mappings.append(mapping | ({"uncertainty": std} if std else {}))
+    effects = (*mappings, *found.faults.to_mappings())
+    return replace(base, effects=effects, description=_description(base, names)), {"numbers": rows}
+
+
+def by_predictions(
+    base: ModelFile,
+    logs: list[FlightLog],
+    names: list[str],
+    predictor: bool = False,
+    weights: dict[str, float] | None = None,
+    progress=lambda _: None,
+) -> tuple[ModelFile, dict]:
+    """The model with some effects fitted to its predictions, and what to report."""
+    from cfb_mjx.model import Quadrotor
+    from cfb_mjx.model.effects import effect_to_mapping
+    from cfb_mjx.sysid.refinement import free_numbers, plausible_numbers, refine
+    from cfb_mjx.sysid.sensor_faults import SensorFaults
+
+    start = Quadrotor.from_file(base)
+    numbers = free_numbers(names) if predictor else plausible_numbers(start.parameters, names)
+    faults = SensorFaults.from_mappings(base.effects, f"model {base.name}")
+    found = refine(start, logs, numbers, faults, weights=weights, progress=progress)
+    rows, uncertainty = {}, {}
+    for number, value, std in zip(found.numbers, found.values, found.deviations, strict=True):
+        known = float(std) if np.isfinite(std) else None
+        rows[number.name] = {"value": float(value), "std": known, "at_bound": found.at_bound(number)}
+        own = uncertainty.setdefault(number.effect, {})
+        own[number.field] = known if number.index is None else [*own.get(number.field, []), known]
+    mappings = []
+    for effect in found.model.effects:
+        mapping = effect_to_mapping(effect)
+        std = uncertainty.get(mapping["name"])
+        mappings.append(mapping | ({"uncertainty": std} if std else {}))
+    kind = "predictor" if predictor else base.kind
+    effects = (*mappings, *faults.to_mappings())
+    report = {
+        "numbers": rows,
+        "loss": {"before": found.cost[0], "after": found.cost[1]},
+        "trim_torque_nm": {name: trim.tolist() for name, trim in found.trims.items()},
+    }
+    return replace(base, effects=effects, kind=kind, description=_description(base, names)), report
+
+
+def judge(model: ModelFile, logs: list[FlightLog]) -> dict:
+    """The evaluation of a model file, as in ``cfb evaluate --json``."""
+    from cfb_mjx.model import Quadrotor
+    from cfb_mjx.sysid import evaluate
+    from cfb_mjx.sysid.sensor_faults import SensorFaults
+
+    faults = SensorFaults.from_mappings(model.effects, f"model {model.name}")
+    return evaluate(Quadrotor.from_file(model), logs, faults=faults).to_json() | {"model": model.name}
+
+
+def _description(base: ModelFile, names: list[str]) -> str:
+    return f"{base.name} with {', '.join(names)} refined"
+
+
+def _pairs(name: str, value, std) -> dict[str, tuple[float, float | None]]:
+    if not isinstance(value, list):
+        return {name: (value, std)}
+    stds = std if isinstance(std, list) else [None] * len(value)
+    return {f"{name}[{i}]": pair for i, pair in enumerate(zip(value, stds, strict=True))}
+
+
+def _weights(texts: list[str], logs: list[FlightLog]) -> dict[str, float]:
+    found = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        chosen = [log.name for log in logs if log.name.startswith(name)] if name else []
+        try:
+            number = float(value)
+        except ValueError:
+            number = float("nan")
+        if not number > 0 or not np.isfinite(number):
+            raise CfbError(f"--weight {text}: write NAME=VALUE with a positive number.")
+        if not chosen:
+            raise CfbError(f"--weight {text}: no flight's name begins with '{name}'.")
+        found |= dict.fromkeys(chosen, number)
+    return found
+
+
+def _say(text: str) -> None:
+    print(f"... {text}", file=sys.stderr, flush=True)
+
+
+def _print(report: dict) -> None:
+    print(f"{'number':<36}{'value':>12}{'std':>11}")
+    for name, row in report["numbers"].items():
+        std = "" if row["std"] is None else f"{row['std']:.2g}"
+        print(f"{name:<36}{row['value']:>12.4g}{std:>11}" + ("  at its bound" if row["at_bound"] else ""))
+    if "loss" in report:
+        before, after = report["loss"].values()
+        print(f"mean loss {before:.4f} -> {after:.4f}")

@@ -1,0 +1,99 @@
+"""Which numbers of a model a refinement may move, and how far."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.model.effects import KNOWN, Effect
+from cfb_mjx.parameters import Parameters
+
+INERTIA = 0.25
+"""Largest plausible change of a moment of inertia, as a share: what decks and another battery bring about."""
+RATE_DAMPING = 2.0
+"""Largest plausible damping of roll and pitch by axial inflow, 1/s: measured ones are about 1 to 2."""
+
+
+@dataclass(frozen=True)
+class Number:
+    """One component of a field of an effect, and where it may lie."""
+
+    effect: str
+    field: str
+    index: int | None
+    low: float
+    high: float
+
+    @property
+    def scale(self) -> float:
+        """Half the range: the unit the fit counts in."""
+        return (self.high - self.low) / 2
+
+    @property
+    def name(self) -> str:
+        """For reports."""
+        at = "" if self.index is None else f"[{self.index}]"
+        return f"{self.effect}.{self.field}{at}"
+
+    def of(self, model: Quadrotor) -> float:
+        """Its value in a model."""
+        value = np.asarray(getattr(_effect(model, self.effect), self.field))
+        return float(value if self.index is None else value[self.index])
+
+
+def plausible_numbers(parameters: Parameters, effects: Sequence[str]) -> tuple[Number, ...]:
+    """Every number of some effects within its prior range; inertia and rate damping within `INERTIA`, `RATE_DAMPING`.
+
+    Raises:
+        CfbError: an effect the catalogue does not have.
+    """
+    # Four rotors half a spacing from the axis: a rolling drone is damped by coefficient * spacing^2 / inertia.
+    spacing, inertia = float(parameters.rotor_spacing), float(jnp.min(parameters.inertia[:2]))
+    damping = RATE_DAMPING * inertia / spacing**2
+    bounds = {("inertia", "relative"): (-INERTIA, INERTIA), ("inflow_thrust", "coefficient"): (0.0, damping)}
+    return _numbers(effects, bounds)
+
+
+def free_numbers(effects: Sequence[str]) -> tuple[Number, ...]:
+    """The same with inertia and inflow free: for predictors.
+
+    Raises:
+        CfbError: an effect the catalogue does not have.
+    """
+    bounds = {("inertia", "relative"): (-0.7, 4.0), ("inflow_thrust", "coefficient"): (-0.05, 0.2)}
+    return _numbers(effects, bounds)
+
+
+def _numbers(effects: Sequence[str], bounds: dict) -> tuple[Number, ...]:
+    found = []
+    for name in effects:
+        if name not in KNOWN:
+            raise CfbError(f"{name}: no such effect; the catalogue has {', '.join(sorted(KNOWN))}.")
+        neutral = KNOWN[name].neutral()
+        for field, prior in KNOWN[name].prior.items():
+            low, high = bounds.get((name, field), prior)
+            value = np.asarray(getattr(neutral, field))
+            found += [Number(name, field, i, low, high) for i in (range(value.size) if value.ndim else [None])]
+    return tuple(found)
+
+
+def with_values(model: Quadrotor, numbers: tuple[Number, ...], values: Any) -> Quadrotor:
+    effects = list(model.effects)
+    order = {type(e).name: i for i, e in enumerate(effects)}
+    for i, number in enumerate(numbers):
+        at = order[number.effect]
+        old = getattr(effects[at], number.field)
+        new = values[i] * jnp.ones_like(old) if number.index is None else old.at[number.index].set(values[i])
+        effects[at] = eqx.tree_at(lambda e, f=number.field: getattr(e, f), effects[at], new)
+    return eqx.tree_at(lambda m: m.effects, model, tuple(effects))
+
+
+def _effect(model: Quadrotor, name: str) -> Effect:
+    return next(e for e in model.effects if type(e).name == name)

@@ -1,0 +1,277 @@
+"""Predictions of many windows from many flights, their errors, and what these say of a model's numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model import Quadrotor, State
+from cfb_mjx.model.effects import Condition, Effect, Wrench
+from cfb_mjx.model.vector import Vec
+from cfb_mjx.sysid.flight import MEASURED_SHARE
+from cfb_mjx.sysid.metrics import BLOCK
+from cfb_mjx.sysid.prediction import hold, predict_one, start_of_windows
+from cfb_mjx.sysid.refinement.numbers import Number, with_values
+from cfb_mjx.sysid.windows import Windows, find_windows
+
+HORIZONS = (0.1, 0.2, 0.3, 0.4, 0.5)
+TRIM = 2e-4
+"""Standard deviation of a flight's trim torque, N m: a battery half a millimetre off its place."""
+NO_MEAN = 1e4
+"""Weight of the trims' mean, in units of `TRIM`, against that of one window."""
+HUBER = 0.3
+"""Errors count squared up to this share of what `hold` errs, linearly beyond."""
+AT_BOUND = 1e-3
+"""A number this near to a bound, in its scale, stands at it."""
+CHUNK = 128
+_STEPS = 128
+
+
+class Trim(Effect):
+    """A constant torque of one flight; a nuisance of the fit, not in the catalogue."""
+
+    name: ClassVar[str] = "trim"
+    units: ClassVar[dict[str, str]] = {"torque": "N m"}
+    source: ClassVar[str] = "estimated beside a refinement (cfb_mjx.sysid.refinement)"
+    prior: ClassVar[dict[str, tuple[float, float]]] = {}
+    strengths: ClassVar[tuple[str, ...]] = ()
+
+    torque: Array
+
+    def body(self, wrench: Wrench, condition: Condition) -> Wrench:
+        return Wrench(wrench.force, wrench.torque + Vec(*(self.torque[..., i] for i in range(3))))
+
+
+@dataclass(frozen=True)
+class Normal:
+    """Normal equations in units of the scales: shared numbers first, then three trims of every flight."""
+
+    matrix: np.ndarray
+    gradient: np.ndarray
+    scatter: np.ndarray
+    """Sum over blocks of windows of the outer product of their gradients."""
+    count: int
+    """Of shared numbers."""
+    share: np.ndarray
+    """(F,) what flights count."""
+
+    def _whole(self, offset: np.ndarray, trims: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # A prior of one scale (one TRIM), as strong as a single window: it decides where flights say nothing.
+        at = np.concatenate([offset, trims.ravel()])
+        prior = np.eye(len(at))
+        mean = self.share / len(trims)
+        prior[self.count :, self.count :] += NO_MEAN * np.kron(np.outer(mean, mean), np.eye(3))
+        return self.matrix + prior, self.gradient + prior @ at
+
+    def _free(self, gradient: np.ndarray, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        free = np.ones(len(gradient), dtype=bool)
+        own = gradient[: self.count]
+        free[: self.count] = ~((values <= low) & (own > 0) | (values >= high) & (own < 0))
+        return free
+
+    def step(self, damping, offset, trims, values, low, high) -> tuple[np.ndarray, np.ndarray]:
+        matrix, gradient = self._whole(offset, trims)
+        free = self._free(gradient, values, low, high)
+        change = np.zeros(len(gradient))
+        inner = matrix[np.ix_(free, free)]
+        change[free] = -np.linalg.solve(inner + damping * np.diag(np.diag(inner)), gradient[free])
+        return change[: self.count], change[self.count :].reshape(-1, 3)
+
+    def deviations(self, values, low, high, scale) -> np.ndarray:
+        matrix, gradient = self._whole(np.zeros(self.count), np.zeros(((len(self.gradient) - self.count) // 3, 3)))
+        free = self._free(gradient, values, low, high)
+        inverse = np.linalg.inv(matrix[np.ix_(free, free)])
+        spread = np.full(len(gradient), np.nan)
+        spread[free] = np.sqrt(np.diag(inverse @ self.scatter[np.ix_(free, free)] @ inverse))
+        margin = AT_BOUND * scale
+        inside = (values > low + margin) & (values < high - margin)
+        return np.where(inside, spread[: self.count] * scale, np.nan)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The windows of all flights that are predicted from commands, or those predicted from measured rotor speeds."""
+
+    measured: bool
+    chunks: list[dict[str, Any]]
+    """Of one shape."""
+    flight: np.ndarray
+    """(W,) which flight a window is of."""
+    weight: np.ndarray
+    """(W,) what it counts."""
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Everything that is predicted."""
+
+    parts: list[_Part]
+    share: np.ndarray
+    """(F,) what flights count, 1 on average."""
+    sizes: Array
+    """(H, 2) what `hold` errs: attitude rad, velocity m/s."""
+
+    @classmethod
+    def of(cls, model: Quadrotor, logs: Sequence[FlightLog], share: np.ndarray) -> Predictions:
+        flights = []
+        for log in logs:
+            delay = log.observation_delay
+            delay = float(model.parameters.observation_delay) if delay is None else delay
+            windows = find_windows(log, HORIZONS, delay)
+            flights.append((windows, *(start_of_windows(model, log, windows, delay) if len(windows) else ((), ()))))
+        held = [_norms(hold(windows, HORIZONS), windows) for windows, _, _ in flights if len(windows)]
+        if not held:
+            names = ", ".join(log.name for log in logs)
+            raise CfbError(f"{names}: no prediction window fits; a log must fly at least 1.2 s without a gap.")
+        sizes = jnp.asarray(np.concatenate(held).mean(axis=0))
+        parts = [part for part in (_part(flights, share, measured) for measured in (False, True)) if part is not None]
+        return cls(parts, share, sizes)
+
+    def cost(self, model: Quadrotor, trims: np.ndarray) -> float:
+        """Mean loss of a window and horizon; the trims' prior belongs to it."""
+        own, total, count = jnp.asarray(trims), 0.0, 0
+        for part in self.parts:
+            found = [np.asarray(_scaled(model, c, own, self.sizes, part.measured)) for c in part.chunks]
+            norm = np.linalg.norm(np.concatenate(found)[: len(part.flight)], axis=-1)
+            loss = np.where(norm < HUBER, 0.5 * norm**2 / HUBER, norm - 0.5 * HUBER)
+            total, count = total + np.sum(part.weight[:, None, None] * loss), count + loss.size
+        prior = np.sum((trims / TRIM) ** 2) + NO_MEAN * np.sum((self.share @ trims / TRIM / len(trims)) ** 2)
+        mean = float((total + 0.5 * prior) / count)
+        return mean if np.isfinite(mean) else np.inf
+
+    def normal_equations(
+        self, model: Quadrotor, numbers: tuple[Number, ...], values: np.ndarray, trims: np.ndarray
+    ) -> Normal:
+        """Of the loss at some values, without priors."""
+        count, flights = len(numbers), len(trims)
+        width = count + 3 * flights
+        matrix, gradient, scatter = np.zeros((width, width)), np.zeros(width), np.zeros((width, width))
+        here = jnp.asarray(values), jnp.asarray([n.scale for n in numbers])
+        for part in self.parts:
+            found = [
+                _linearised(model, numbers, *here, chunk, jnp.asarray(trims), self.sizes, part.measured)
+                for chunk in part.chunks
+            ]
+            error, slope = (np.concatenate([np.asarray(f[k]) for f in found])[: len(part.flight)] for k in (0, 1))
+            heavy = part.weight[:, None, None, None] / np.maximum(np.linalg.norm(error, axis=-1, keepdims=True), HUBER)
+            flat = slope.reshape(len(slope), -1, count + 3)
+            pull = (heavy * error).reshape(len(error), -1)
+            push = np.broadcast_to(heavy, error.shape).reshape(len(error), -1)
+            for i in np.unique(part.flight):
+                mine = np.flatnonzero(part.flight == i)
+                at = np.concatenate([np.arange(count), count + 3 * i + np.arange(3)])
+                matrix[np.ix_(at, at)] += np.einsum("wri,wr,wrj->ij", flat[mine], push[mine], flat[mine], optimize=True)
+                each = np.einsum("wri,wr->wi", flat[mine], pull[mine])
+                gradient[at] += each.sum(axis=0)
+                sums = np.add.reduceat(each, np.arange(0, len(mine), BLOCK))
+                scatter[np.ix_(at, at)] += sums.T @ sums
+        return Normal(matrix, gradient, scatter, count, self.share)
+
+
+def _part(flights: list[tuple], share: np.ndarray, measured: bool) -> _Part | None:
+    """Windows of one kind; None if no flight has any."""
+    parts, owner = [], []
+    for i, (windows, start, memory) in enumerate(flights):
+        if not len(windows) or (measured and not _has_rotor_speed(windows)):
+            continue
+        whole = np.isfinite(windows.rotor_speed).all(axis=(1, 2)) if measured else np.ones(len(windows), dtype=bool)
+        inputs = _inputs(windows, start, memory, measured)
+        parts.append(jax.tree.map(lambda x, keep=whole: np.asarray(x)[keep], inputs))
+        owner.append(np.full(whole.sum(), i))
+    flight = np.concatenate(owner) if owner else np.zeros(0, dtype=int)
+    if not len(flight):
+        return None
+    every = jax.tree.map(lambda *x: np.concatenate(x), *parts) | {"flight": flight}
+    counts = np.bincount(flight, minlength=len(share))
+    weight = share[flight] * len(flight) / (np.count_nonzero(counts) * counts[flight])
+    chunks = []
+    for first in range(0, len(flight), CHUNK):
+        # The last chunk repeats its last window: one compiled program serves all.
+        rows = np.minimum(np.arange(first, first + CHUNK), len(flight) - 1)
+        chunks.append(jax.tree.map(lambda x, r=rows: jnp.asarray(x[r]), every))
+    return _Part(measured, chunks, flight, weight)
+
+
+def _has_rotor_speed(windows: Windows) -> bool:
+    return windows.rotor_speed.size > 0 and bool(np.isfinite(windows.rotor_speed).mean() > MEASURED_SHARE)
+
+
+def _inputs(windows: Windows, start: np.ndarray, memory: tuple, measured: bool) -> dict[str, Any]:
+    pad = _STEPS * -(-windows.step.shape[1] // _STEPS) - windows.step.shape[1]
+    fed = windows.rotor_speed[:, 1:] if measured else windows.command
+    state = (windows.position, windows.velocity, windows.quaternion, windows.body_rate)
+    return {
+        "state": (*state, windows.rotor_speed[:, 0] if measured else start, memory),
+        "step": np.pad(windows.step, ((0, 0), (0, pad))),
+        "fed": np.pad(fed, ((0, 0), (0, pad), (0, 0)), mode="edge"),
+        "at": windows.at,
+        "quaternion": windows.true_quaternion,
+        "velocity": windows.true_velocity,
+    }
+
+
+def _norms(predicted: State, windows: Windows) -> np.ndarray:
+    """(W, H, 2) errors of attitude, rad, and velocity, m/s."""
+    turn = _rotation_vector(jnp.asarray(windows.true_quaternion), jnp.asarray(predicted.quaternion))
+    drift = predicted.velocity - windows.true_velocity
+    return np.stack([np.linalg.norm(np.asarray(x), axis=-1) for x in (turn, drift)], axis=-1)
+
+
+def _rotation_vector(frm: Array, to: Array) -> Array:
+    """(..., 3) rotation that turns one attitude into another, rad."""
+    scalar = jnp.sum(frm * to, axis=-1)
+    vector = frm[..., :1] * to[..., 1:] - to[..., :1] * frm[..., 1:] - jnp.cross(frm[..., 1:], to[..., 1:])
+    length = jnp.sqrt(jnp.sum(vector**2, axis=-1) + 1e-24)
+    angle = 2 * jnp.arctan2(length, jnp.abs(scalar)) * jnp.where(scalar < 0, -1.0, 1.0)
+    return (angle / length)[..., None] * vector
+
+
+def _error(model: Quadrotor, window: dict, trim: Array, sizes: Array, measured: bool) -> Array:
+    """(H, 2, 3) errors of attitude and velocity of one window over what `hold` errs."""
+    model = eqx.tree_at(lambda m: m.effects[-1].torque, model, trim)
+    flown = predict_one(model, State(*window["state"]), window["step"], window["fed"], measured)
+    turn = _rotation_vector(window["quaternion"], flown.quaternion[window["at"]])
+    drift = flown.velocity[window["at"]] - window["velocity"]
+    return jnp.stack([turn, drift], axis=1) / sizes[:, :, None]
+
+
+@eqx.filter_jit
+def _scaled(model: Quadrotor, chunk: dict, trims: Array, sizes: Array, measured: bool) -> Array:
+    """(W, H, 2, 3) errors of all windows of a chunk."""
+    own = trims[chunk["flight"]]
+    return jax.vmap(lambda window, trim: _error(model, window, trim, sizes, measured))(chunk, own)
+
+
+@eqx.filter_jit
+def _linearised(
+    model: Quadrotor,
+    numbers: tuple[Number, ...],
+    values: Array,
+    scale: Array,
+    chunk: dict,
+    trims: Array,
+    sizes: Array,
+    measured: bool,
+) -> tuple[Array, Array]:
+    """`_scaled`, and its derivatives (W, H, 2, 3, N + 3) by numbers and by the window's own trim, in their scales."""
+
+    def one(window, trim):
+        def moved(by):
+            shared, own = by[:-3], by[-3:]
+            return _error(
+                with_values(model, numbers, values + shared * scale), window, trim + own * TRIM, sizes, measured
+            )
+
+        here = jnp.zeros(len(numbers) + 3)
+        return moved(here), jax.jacfwd(moved)(here)
+
+    return jax.vmap(one)(chunk, trims[chunk["flight"]])
