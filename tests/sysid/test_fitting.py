@@ -19,6 +19,8 @@ from cfb_mjx.sysid.identification.uncertainty import assess
 from cfb_mjx.sysid.identification.unknowns import choose
 
 NOMINAL = load_model_file("cfb-guards").parameters()
+# They share compiled programs.
+pytestmark = pytest.mark.xdist_group("fitting")
 
 
 def test_the_plant_of_these_tests_follows_scipy():

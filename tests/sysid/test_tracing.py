@@ -21,6 +21,7 @@ from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import term_columns
 from cfb_mjx.sysid.tracing.evidence import evidence
 from cfb_mjx.sysid.tracing.formula import with_library
+from cfb_mjx.sysid.tracing.given import fit_given
 from cfb_mjx.sysid.tracing.lines import find_lines
 from cfb_mjx.sysid.tracing.outcome import close_loop
 from cfb_mjx.sysid.tracing.residuals import residual_rows
@@ -134,10 +135,10 @@ def test_a_line_in_every_flight_is_found_and_noise_has_none(campaigns, base):
 
 @pytest.fixture(scope="module")
 def closed(campaigns, base, tmp_path_factory):
-    """The loop closed on drag, with a checkpoint."""
+    """The loop closed on drag, with a checkpoint; six flights are enough for it."""
     path = tmp_path_factory.mktemp("search") / "search.json"
     campaign = campaigns["drag"]
-    return close_loop(campaign.fit, campaign.held_out, base, checkpoint=Checkpoint(path, "key")), path
+    return close_loop(campaign.fit[:6], campaign.held_out, base, checkpoint=Checkpoint(path, "key")), path
 
 
 def test_drag_is_named_measured_and_bought(closed, campaigns):
@@ -185,6 +186,19 @@ def test_an_interrupted_search_goes_on(closed, base):
     np.testing.assert_array_equal(given_up.effect("rotor_drag").coefficient, 0.0)
     other = Checkpoint(path, "another", None)
     assert other.restore(nothing) is None
+
+
+def test_named_effects_are_fitted_to_innovations(campaigns, base):
+    campaign = campaigns["drag"]
+    found = fit_given(campaign.fit, base.parameters(), ("rotor_drag", "thrust_scale"))
+    drag, thrust = found.effects
+    total = 4 * np.mean(campaign.truth["effects"]["rotor_drag"]["rotor_drag"])
+    assert 0.6 * total < float(drag.coefficient) < 1.05 * total
+    assert abs(float(thrust.relative)) < 0.02
+    assert 0 < found.uncertainty["rotor_drag"]["coefficient"] < 0.1 * total
+    assert found.faults.healthy
+    with pytest.raises(CfbError, match="warp"):
+        fit_given(campaign.fit, base.parameters(), ("warp",))
 
 
 def test_nothing_is_reported_on_a_clean_drone(campaigns, base):

@@ -20,7 +20,9 @@ CORNER = 6.0
 """Hz. Above, the gyro's derivative is noise."""
 RATE = 100.0
 LONGEST_SHIFT = 6.0
-"""Flights of one reference are moved against each other by this at most, s."""
+"""Flights of one reference are moved against each other by this at most, s, and by a third of the shorter at most."""
+SHORTEST = 6.0
+"""Flights shorter than this, s, say nothing."""
 EDGE = 1.0
 """s at both ends that filters need."""
 
@@ -70,10 +72,10 @@ def repeated(model: Quadrotor, one: FlightLog, other: FlightLog) -> Repeated:
         CfbError: flights too short.
     """
     (_, a, path_a), (_, b, path_b) = (residual_angular_acceleration(model, log) for log in (one, other))
-    least = int((2 * LONGEST_SHIFT + 2 * EDGE) * RATE)
-    if min(len(a), len(b)) < least:
-        raise CfbError(f"{one.name}, {other.name}: too short to compare; {least / RATE:g} s are needed.")
-    reach = int(LONGEST_SHIFT * RATE)
+    shorter = min(len(a), len(b))
+    if shorter < SHORTEST * RATE:
+        raise CfbError(f"{one.name}, {other.name}: too short to compare; {SHORTEST:g} s are needed.")
+    reach = int(min(LONGEST_SHIFT * RATE, shorter / 3))
     pairs = {shift: _overlap(len(a), len(b), shift) for shift in range(-reach, reach + 1)}
     apart = {shift: np.mean((path_a[i] - path_b[j]) ** 2) for shift, (i, j) in pairs.items()}
     best = min(apart, key=apart.get)

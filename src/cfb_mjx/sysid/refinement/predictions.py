@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -156,6 +156,8 @@ class Predictions:
         width = count + 3 * flights
         matrix, gradient, scatter = np.zeros((width, width)), np.zeros(width), np.zeros((width, width))
         here = jnp.asarray(values), jnp.asarray([n.scale for n in numbers])
+        # Other bounds are no reason to compile anew.
+        numbers = tuple(replace(n, low=-1.0, high=1.0) for n in numbers)
         for part in self.parts:
             found = [
                 _linearised(model, numbers, *here, chunk, jnp.asarray(trims), self.sizes, part.measured)

@@ -1,0 +1,382 @@
+"""Close the loop on real flights in the IDSIA layout, and write docs/closing-real-flights.md with its figure.
+
+    python scripts/close_real_flights.py FOLDER [--work out/real] [--page-only]
+
+FOLDER holds fit/*.parquet and validation/*.parquet. Nothing is fitted to validation/. Only aggregate numbers are
+written; the flights themselves never enter the project. What a step leaves in the work folder is used again.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.cli.refining import by_predictions
+from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.files import write_json, write_text
+from cfb_mjx.logs import FlightLog, read_log
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.parameters import ModelFile, load_model_file
+from cfb_mjx.sysid import evaluate
+from cfb_mjx.sysid.nanodrone import PUBLISHED, QUANTITIES, benchmark
+from cfb_mjx.sysid.observer import Observer
+from cfb_mjx.sysid.repeatability import repeated
+from cfb_mjx.sysid.sensor_faults import SensorFaults
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "closing-real-flights.md"
+MASS = 0.045
+MOTORS = ("battery_sag", "motor_asymmetry")
+BESIDE = ("blade_flapping", "thrust_scale", "inertia")
+"""Fitted with the motors, so that these do not have to stand in for them."""
+BODY = (
+    *("blade_flapping", "inflow_thrust", "rotor_drag", "thrust_scale"),
+    *("inertia", "cog_offset", "torque_scale", "thrust_tilt"),
+)
+GENTLE = 7
+"""Gentle flights among those fitted: the square counts as much as all of them, for the two are judged side by side."""
+GROUPS = {"gentle": ("random1", "random2", "multisine"), "square": ("square",)}
+VARIANTS = ("commands_in", "rotor_speed_in", "commands_in_observer", "rotor_speed_in_observer", "hold")
+TARGETS = {
+    ("commands_in", "gentle"): (0.40, 0.80),
+    ("commands_in", "square"): (0.45, None),
+    ("rotor_speed_in", "gentle"): (0.31, 0.64),
+    ("rotor_speed_in", "square"): (0.26, None),
+    ("commands_in_observer", "gentle"): (0.32, 0.60),
+    ("commands_in_observer", "square"): (0.42, None),
+    ("rotor_speed_in_observer", "gentle"): (0.22, 0.39),
+    ("rotor_speed_in_observer", "square"): (0.24, None),
+}
+"""What the project set itself: mean errors after 0.5 s, attitude rad and velocity m/s."""
+TITLES = {
+    "commands_in": "commands in",
+    "rotor_speed_in": "rotor speeds in",
+    "commands_in_observer": "commands in, observer",
+    "rotor_speed_in_observer": "rotor speeds in, observer",
+}
+
+
+def steps(folder: Path, work: Path) -> dict[str, list[str]]:
+    """The commands, by the model file they leave in the work folder."""
+    fit = sorted(str(path) for path in (folder / "fit").glob("*.parquet"))
+    made = {name: str(work / f"{name}.yaml") for name in ("rotors", "motors", "plant", "predictor")}
+    refine = ["refine", *fit, "--weight", f"square={GENTLE}"]
+    body = ["--effects", ",".join(BODY)]
+    kept_numbers = {name: ["--json", str(work / f"{name}.json")] for name in ("plant", "predictor")}
+    together = ",".join(MOTORS + BESIDE)
+    options = {
+        "rotors": ["fit-rotors", *fit, "--offset", "--per-motor", "--set", f"mass={MASS}"],
+        "motors": ["refine", *fit, "--model", made["rotors"], "--estimator", "innovations", "--effects", together],
+        "plant": [*refine, "--model", made["motors"], *body, *kept_numbers["plant"]],
+        "predictor": [*refine, "--model", made["plant"], *body, "--predictor", *kept_numbers["predictor"]],
+    }
+    return {name: [*command, "-o", made[name]] for name, command in options.items()}
+
+
+def kept(path: Path, make: Callable[[], dict]) -> dict:
+    """What an earlier run left, else what ``make`` gives."""
+    if not path.exists():
+        write_json(path, make())
+    return json.loads(path.read_text())
+
+
+def group_of(name: str) -> str:
+    """The group of a flight."""
+    return next(group for group, prefixes in GROUPS.items() if name.startswith(prefixes))
+
+
+def errors(described: ModelFile, logs: list[FlightLog], observer: Observer | None = None) -> dict:
+    """Mean attitude, rad, and velocity error, m/s, at 0.2 and 0.5 s, by group and kind of prediction."""
+    faults = SensorFaults.from_mappings(described.effects, described.name)
+    found = {}
+    for group in GROUPS:
+        chosen = [log for log in logs if group_of(log.name) == group]
+        result = evaluate(Quadrotor.from_file(described), chosen, observer=observer, faults=faults)
+        for variant in result.variants:
+            seen = result.metrics(variant)
+            for horizon in ("0.05", "0.1", "0.2", "0.5"):
+                attitude = float(np.radians(seen[f"attitude_mean_deg@{horizon}s"]))
+                found[f"{variant} {group} {horizon}"] = attitude, seen[f"velocity_mean_mps@{horizon}s"]
+    return found
+
+
+def without_each(plant: ModelFile, fit: list[FlightLog], judged: list[FlightLog]) -> dict:
+    """Errors with one effect taken out and the others fitted again."""
+    weights = {log.name: float(GENTLE) for log in fit if group_of(log.name) == "square"}
+    found = {}
+    for name in (*BODY, *MOTORS):
+        less = replace(plant, effects=tuple(e for e in plant.effects if e["name"] != name))
+        print(f"without {name}", flush=True)
+        refitted, _ = by_predictions(less, fit, [n for n in BODY if n != name], weights=weights)
+        found[name] = errors(refitted, judged)
+    return found
+
+
+def sums(models: dict[str, ModelFile], judged: list[FlightLog]) -> dict:
+    """The IDSIA benchmark's sums on the validation flights."""
+    built = {name: (Quadrotor.from_file(m), None) for name, m in models.items()}
+    built |= {f"{name}, observer": (Quadrotor.from_file(m), Observer()) for name, m in models.items()}
+    rows = benchmark(judged, built, 1, lambda *_: None)["rows"]
+    return {name: [row[f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for name, row in rows.items()}
+
+
+def repeats(models: dict[str, ModelFile], logs: list[FlightLog]) -> dict:
+    """Pairs of flights of one reference: what each model misses in both."""
+    found = {}
+    for one, other in combinations(sorted(logs, key=lambda log: log.name), 2):
+        if one.name.split("_")[0] != other.name.split("_")[0]:
+            continue
+        seen = {}
+        for name, described in models.items():
+            faults = SensorFaults.from_mappings(described.effects, described.name)
+            pair = (faults.repaired(one), faults.repaired(other))
+            result = repeated(Quadrotor.from_file(described), *pair)
+            seen[name] = {"correlation": result.correlation.tolist(), "rms": result.rms.tolist()}
+            seen[name] |= {"shared": result.shared.tolist(), "distance": result.distance}
+        found[f"{one.name} {other.name}"] = seen
+    return found
+
+
+def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[str]]) -> str:
+    """The page as Markdown."""
+    facts = ", ".join(f"{name} {value}" for name, value in environment().items())
+    rows = []
+    for variant, title in TITLES.items():
+        for group in GROUPS:
+            cells = [_pair(results["errors"][name][f"{variant} {group} 0.5"]) for name in models]
+            hold = _pair(results["errors"]["declared"][f"hold {group} 0.5"])
+            target = _pair(TARGETS[variant, group])
+            rows.append(f"| {title} | {group} | {hold} | " + " | ".join(cells) + f" | {target} |")
+    return "\n".join(
+        [
+            "# Closing the loop on real flights",
+            "",
+            f"Written by `python scripts/close_real_flights.py FOLDER`; do not edit. {facts}",
+            "",
+            "Flights: the public IDSIA nano-drone system-identification benchmark (Busetto et al., Control Engineering",
+            "Practice 172, 2026), a Crazyflie 2.1 Brushless with AI-deck and flow deck, logged at 100 Hz; weighed mass",
+            f"{MASS} kg. Fitted to: {', '.join(results['fit'])}. Judged on: {', '.join(results['validation'])}.",
+            "",
+            "## Prediction after 0.5 s",
+            "",
+            "Mean error of attitude, rad, / velocity, m/s, of open-loop predictions of the flights nothing was fitted",
+            "to ([protocol](evaluation.md)). *Gentle* are the random and multisine references, *square* is aggressive.",
+            "*Hold* assumes constant velocity and constant body rate.",
+            "",
+            "| prediction | flights | hold | " + " | ".join(models) + " | goal |",
+            "|---|---|---" + "|---" * len(models) + "|---|",
+            *rows,
+            "",
+            "![Errors over the horizon](closing-real-flights.png)",
+            "",
+            "- *declared*: preset `cfb-guards` at the drone's mass.",
+            "- *innovations*: motors from rotor speeds, and the effects fitted to one-step innovations, which feedback",
+            "  does not bias.",
+            "- *plant*: the same effects and a few more fitted to predictions; inertia within 25 %, damping within",
+            "  2 per second.",
+            "- *predictor*: inertia left free. It predicts gentle flights best and is a wrong plant: `cfb refine`",
+            "  marks it so.",
+            "",
+            *_story(results),
+            "",
+            "## The plant, and what each effect buys",
+            "",
+            "Without an effect, everything else fitted again: by how much the worst of the four errors above (without",
+            "observer, attitude after 0.5 s, both groups) grows.",
+            "",
+            "| effect | numbers | error without it | argument |",
+            "|---|---|---:|---|",
+            *_effects(models["plant"], results),
+            "",
+            "## What is missed twice",
+            "",
+            "Measured minus modelled angular acceleration below 6 Hz, in flights of one reference: rms, rad/s^2, and",
+            "correlation between the two flights, roll / pitch / yaw. *Explained* is the share of the declared model's",
+            "common residual (covariance, roll and pitch together) that the plant no longer misses.",
+            "",
+            "| flights | declared | plant | explained |",
+            "|---|---|---|---:|",
+            *_repeats(results),
+            "",
+            "## The nano-drone benchmark on these flights",
+            "",
+            "Sums of mean errors over 50 steps of 10 ms, rotor speeds in ([rules](nanodrone.md)): position m, velocity",
+            "m/s, attitude rad, body rate rad/s, and beside each the share of what *naive* errs. Published rows are on",
+            "the benchmark's own test flights: compare shares, not sums.",
+            "",
+            "| | position | velocity | attitude | body rate |",
+            "|---|---|---|---|---|",
+            *_sums(results),
+            "",
+            "## Commands",
+            "",
+            "```sh",
+            *(" ".join(["cfb", *_short(command)]) for command in commands.values()),
+            "```",
+            "",
+        ]
+    )
+
+
+def _pair(pair) -> str:
+    return " / ".join(f"{x:.3f}" if i == 0 else f"{x:.2f}" for i, x in enumerate(pair) if x is not None)
+
+
+def _short(command: list[str]) -> list[str]:
+    texts = ["fit/*.parquet" if "/fit/" in text and text.endswith(".parquet") else text for text in command]
+    return [Path(t).name if t.endswith((".yaml", ".json")) else t for i, t in enumerate(texts) if t not in texts[:i]]
+
+
+def _story(results: dict) -> list[str]:
+    plant, declared = results["errors"]["plant"], results["errors"]["declared"]
+    missed = []
+    for (variant, group), (attitude, velocity) in TARGETS.items():
+        seen = plant[f"{variant} {group} 0.5"]
+        for what, value, goal in (("attitude", seen[0], attitude), ("velocity", seen[1], velocity)):
+            if goal is not None and value > goal:
+                missed.append(f"{TITLES[variant]}, {group}, {what}: {value:.3f} where {goal:.2f} was the goal")
+    gentle = plant["commands_in gentle 0.5"][0], declared["hold gentle 0.5"][0]
+    hold = "better" if gentle[0] < gentle[1] else "still worse"
+    text = [
+        f"On gentle flights the plant, commands in, is {hold} than hold in attitude ({gentle[0]:.3f} against "
+        f"{gentle[1]:.3f} rad).",
+    ]
+    if missed:
+        text += ["", "**Goals not reached**:", "", *(f"- {line}" for line in missed)]
+    return text
+
+
+ARGUMENTS = {
+    "blade_flapping": "hub moments against the motion; stronger along the body than across, weaker while climbing",
+    "inflow_thrust": "a climbing blade meets the air at a smaller angle: damps heave, roll, pitch; held at 2 / s",
+    "rotor_drag": "induced drag of the discs, linear in speed",
+    "thrust_scale": "hover at a rotor speed at which the paper's curve gives more thrust: decks stand in the flow",
+    "inertia": "decks and another battery; predictions ask for more than innovations do, which is what feedback does",
+    "cog_offset": "the mean place of the batteries; every flight has its own besides",
+    "torque_scale": "less reactive torque; yaw only",
+    "thrust_tilt": "rotors a few milliradians off the vertical",
+    "battery_sag": "rotor speed follows voltage: without it, speeds are off by 2 % over the batteries' range",
+    "motor_asymmetry": "motors are driven up and coast down",
+}
+
+
+def _effects(plant: ModelFile, results: dict) -> list[str]:
+    keys = [f"{variant} {group} 0.5" for variant in ("commands_in", "rotor_speed_in") for group in GROUPS]
+    own, rows = results["errors"]["plant"], []
+    for name, less in results["without"].items():
+        growth = max(less[key][0] / own[key][0] - 1 for key in keys)
+        effect = next((e for e in plant.effects if e["name"] == name), None)
+        numbers = "; ".join(
+            _number(k, v, (effect.get("uncertainty") or {}).get(k)) for k, v in effect["parameters"].items()
+        )
+        rows.append((growth, f"| {name} | {numbers} | {growth:+.0%} | {ARGUMENTS[name]} |"))
+    return [row for _, row in sorted(rows, key=lambda pair: -pair[0])]
+
+
+def _number(name: str, value, std) -> str:
+    values, stds = (x if isinstance(x, list) else [x] for x in (value, std))
+    stds = stds if len(stds) == len(values) else [None] * len(values)
+    return f"{name} " + ", ".join(
+        f"{v:.3g}" + (f" +- {s:.1g}" if s is not None else "") for v, s in zip(values, stds, strict=True)
+    )
+
+
+def _repeats(results: dict) -> list[str]:
+    rows = []
+    for pair, seen in results["repeats"].items():
+        cells = []
+        for name in ("declared", "plant"):
+            rms = " / ".join(f"{x:.1f}" for x in seen[name]["rms"])
+            cells.append(f"{rms}; " + " / ".join(f"{x:.2f}" for x in seen[name]["correlation"]))
+        before, after = (sum(seen[name]["shared"][:2]) for name in ("declared", "plant"))
+        names = " and ".join(f"{n.split('_')[0]} {n[-1]}" for n in pair.split())
+        rows.append(f"| {names} | {cells[0]} | {cells[1]} | {1 - after / before:.0%} |")
+    return rows
+
+
+def _sums(results: dict) -> list[str]:
+    naive = results["sums"]["naive"]
+    rows = [_sum_row(name, row, naive) for name, row in results["sums"].items()]
+    return rows + [_sum_row(f"published: {name}", row, PUBLISHED["naive"]) for name, row in PUBLISHED.items()]
+
+
+def _sum_row(name: str, row, naive) -> str:
+    return f"| {name} | " + " | ".join(f"{x:.3g} ({x / n:.2f})" for x, n in zip(row, naive, strict=True)) + " |"
+
+
+def figure(results: dict, path: Path) -> None:
+    """Attitude error over the horizon, by group and kind of prediction."""
+    from matplotlib.figure import Figure
+
+    horizons = ("0.05", "0.1", "0.2", "0.5")
+    drawing = Figure(figsize=(9, 6), layout="constrained")
+    axes = drawing.subplots(2, 2, sharex=True, sharey="col")
+    for row, variant in enumerate(("commands_in", "rotor_speed_in")):
+        for column, group in enumerate(GROUPS):
+            ax = axes[row][column]
+            for name, seen in {"hold": results["errors"]["declared"], **results["errors"]}.items():
+                key = "hold" if name == "hold" else variant
+                line = [seen[f"{key} {group} {h}"][0] for h in horizons]
+                ax.plot([1e3 * float(h) for h in horizons], line, "k--" if name == "hold" else "-o", label=name, ms=3)
+            ax.set(title=f"{group}, {TITLES[variant]}", xscale="log", yscale="log")
+            ax.set_xticks([1e3 * float(h) for h in horizons], [f"{1e3 * float(h):g}" for h in horizons], minor=False)
+            ax.minorticks_off()
+            ax.grid(alpha=0.3)
+    for ax in axes[1]:
+        ax.set_xlabel("horizon, ms")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("mean attitude error, rad")
+    axes[0][0].legend(fontsize=8)
+    drawing.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Run what is missing, then write the page."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--work", type=Path, default=Path("out/real"))
+    arguments = parser.parse_args()
+    work = arguments.work
+    work.mkdir(parents=True, exist_ok=True)
+    configure_jax(x64=True)
+    logs = {
+        part: [read_log(p) for p in sorted((arguments.folder / part).glob("*.parquet"))]
+        for part in ("fit", "validation")
+    }
+    if not all(logs.values()):
+        sys.exit(f"{arguments.folder}: holds no fit/*.parquet or no validation/*.parquet")
+    commands = steps(arguments.folder, work)
+    for name, command in commands.items():
+        if not (work / f"{name}.yaml").exists():
+            print(f"cfb {command[0]} -> {name}.yaml", flush=True)
+            subprocess.run([sys.executable, "-m", "cfb_mjx.cli", *command], check=True)
+    declared = load_model_file("cfb-guards").with_values("weighed with its decks", mass=MASS)
+    made = {name: load_model_file(work / f"{name}.yaml") for name in ("motors", "plant", "predictor")}
+    models = {
+        "declared": declared,
+        "innovations": made["motors"],
+        "plant": made["plant"],
+        "predictor": made["predictor"],
+    }
+    judged = logs["validation"]
+    results = {part: [log.name for log in some] for part, some in logs.items()}
+    results["errors"] = kept(
+        work / "errors.json", lambda: {name: errors(model, judged, Observer()) for name, model in models.items()}
+    )
+    results["without"] = kept(work / "without.json", lambda: without_each(made["plant"], logs["fit"], judged))
+    both = {name: models[name] for name in ("declared", "plant")}
+    results["repeats"] = kept(work / "repeats.json", lambda: repeats(both, logs["fit"] + judged))
+    chosen = {name: models[name] for name in ("plant", "predictor")}
+    results["sums"] = kept(work / "sums.json", lambda: sums(chosen, judged))
+    figure(results, PAGE.with_suffix(".png"))
+    write_text(PAGE, page(models, results, commands))
+    print(PAGE)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,60 @@
+"""``cfb refine`` from the logs to a model the other commands take."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.parameters import load_model_file, save_model_file
+
+LOGS = Path(__file__).resolve().parents[2] / "data" / "flight_logs"
+LOG = LOGS / "drag.mcap"
+
+
+def test_a_refined_model_is_marked_and_taken_by_other_commands(cfb, tmp_path):
+    model, results = tmp_path / "drone.yaml", tmp_path / "refine.json"
+    request = ["--effects", "rotor_drag", "--predictor", "--held-out", LOGS / "figure8.mcap", "--json", results]
+    done = cfb("refine", LOG, "-o", model, *request)
+    assert done.returncode == 0, done.stderr
+    assert "a predictor, not a plant" in done.stdout
+    found = json.loads(results.read_text())
+    assert found["numbers"]["rotor_drag.coefficient"]["value"] > 0.005
+    assert found["loss"]["after"] < found["loss"]["before"]
+    assert "attitude_rmse_deg@0.2s" in found["held_out"]["after"]["commands_in"]
+    written = load_model_file(model)
+    assert written.kind == "predictor"
+    assert written.provenance["fit_logs_sha256"]
+    assert [e["name"] for e in written.effects] == ["rotor_drag"]
+    with pytest.raises(CfbError, match=r"predictor, not a plant.*--force"):
+        written.require_plant("training", "--force")
+    assert cfb("evaluate", LOG, "--model", model).returncode == 0
+
+
+def test_plants_say_nothing_and_unknown_kinds_are_refused(tmp_path):
+    path = tmp_path / "m.yaml"
+    plant = load_model_file("cfb-guards")
+    plant.require_plant("training", "--force")
+    save_model_file(plant, path)
+    assert "kind" not in path.read_text()
+    path.write_text("kind: oracle\n" + path.read_text())
+    with pytest.raises(CfbError, match="'kind' must be one of plant, predictor"):
+        load_model_file(path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "needles"),
+    [
+        (["--effects", "warp"], ["warp", "rotor_drag"]),
+        ([], ["has no effects", "--effects"]),
+        (["--effects", "rotor_drag", "--weight", "drag=-1"], ["--weight drag=-1", "positive"]),
+        (["--effects", "rotor_drag", "--weight", "square=2"], ["no flight", "square"]),
+        (["--effects", "rotor_drag", "--predictor", "--estimator", "innovations"], ["--predictor"]),
+    ],
+)
+def test_bad_requests_are_refused(cfb, tmp_path, arguments, needles):
+    done = cfb("refine", LOG, "-o", tmp_path / "m.yaml", *arguments)
+    assert done.returncode == 2
+    assert all(needle in done.stderr for needle in needles)
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "m.yaml").exists()

@@ -1,0 +1,129 @@
+"""Numbers fitted to predictions and to innovations, on flights of the independent simulator and on the shipped ones."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from plants import Case, fly_campaigns
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import read_log
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.model.effects import Inertia, RotorDrag
+from cfb_mjx.parameters import load_model_file
+from cfb_mjx.sysid import evaluate
+from cfb_mjx.sysid.refinement import Number, free_numbers, plausible_numbers, refine
+from cfb_mjx.sysid.refinement.fitting import _prepared
+from cfb_mjx.sysid.refinement.numbers import INERTIA, RATE_DAMPING, with_values
+from cfb_mjx.sysid.refinement.predictions import TRIM, Predictions
+from cfb_mjx.sysid.repeatability import repeated
+
+pytestmark = pytest.mark.xdist_group("refinement")
+
+DRAG = Path(__file__).resolve().parents[2] / "data" / "flight_logs" / "drag.mcap"
+GUARDS = load_model_file("cfb-guards").parameters
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    return fly_campaigns([Case("drag", 9002, (("rotor_drag", 1.0),))], duration_scale=0.35)[0]
+
+
+@pytest.fixture(scope="module")
+def refined(campaign):
+    numbers = plausible_numbers(GUARDS(), ("rotor_drag", "inertia"))
+    return refine(Quadrotor(GUARDS()), campaign.fit, numbers)
+
+
+def test_drag_comes_back_and_flights_not_fitted_are_predicted_better(campaign, refined):
+    truth = campaign.truth["effects"]["rotor_drag"]
+    # The plant's drag saturates at speed, so the linear coefficient comes out below its slope at rest.
+    total = 4 * np.mean(truth["rotor_drag"])
+    found = dict(zip([n.name for n in refined.numbers], refined.values, strict=True))
+    assert 0.6 * total < found["rotor_drag.coefficient"] < 1.05 * total
+    assert all(abs(found[f"inertia.relative[{i}]"]) < 0.05 for i in range(2))
+    assert refined.cost[1] < 0.6 * refined.cost[0]
+    key = "velocity_rmse_mps@0.5s"
+    before = evaluate(Quadrotor(GUARDS()), campaign.held_out).metrics("commands_in")[key]
+    assert evaluate(refined.model, campaign.held_out).metrics("commands_in")[key] < 0.5 * before
+
+
+def test_trims_of_healthy_flights_are_small_and_have_no_mean(refined):
+    trims = np.array(list(refined.trims.values()))
+    assert np.abs(trims).max() < 0.3 * TRIM
+    assert np.abs(trims.mean(axis=0)).max() < 0.01 * TRIM
+
+
+def test_the_gradient_is_that_of_the_loss(campaign):
+    numbers = plausible_numbers(GUARDS(), ("rotor_drag", "inertia"))
+    model = _prepared(Quadrotor(GUARDS()), numbers)
+    flights = len(campaign.fit)
+    share = np.linspace(0.5, 1.5, flights)
+    data = Predictions.of(model, campaign.fit, share)
+    count = sum(len(part.flight) for part in data.parts) * 5 * 2
+    values, trims = np.array([n.of(model) for n in numbers]) + 1e-4, np.full((flights, 3), 1e-5)
+    normal = data.normal_equations(model, numbers, values, trims)
+
+    def loss(values, trims):
+        prior = 0.5 * np.sum((trims / TRIM) ** 2) + 0.5e4 * np.sum((share @ trims / TRIM / flights) ** 2)
+        return data.cost(with_values(model, numbers, values), trims) * count - prior
+
+    for i in (0, 2):
+        number = numbers[i]
+        step = 1e-5 * number.scale * np.eye(len(numbers))[i]
+        slope = (loss(values + step, trims) - loss(values - step, trims)) / 2e-5
+        assert normal.gradient[i] == pytest.approx(slope, rel=1e-4, abs=1e-4)
+    turn = np.zeros((flights, 3))
+    turn[1, 0] = 1e-5 * TRIM
+    slope = (loss(values, trims + turn) - loss(values, trims - turn)) / 2e-5
+    assert normal.gradient[len(numbers) + 3] == pytest.approx(slope, rel=1e-4)
+
+
+def test_numbers_stay_within_their_bounds(campaign):
+    drag, *inertia = plausible_numbers(GUARDS(), ("rotor_drag", "inertia"))
+    drag = replace(drag, high=0.002)
+    start = Quadrotor(GUARDS(), (RotorDrag(0.5), Inertia.neutral()))
+    found = refine(start, campaign.fit[:2], [drag, *inertia], iterations=2)
+    assert found.values[0] == 0.002
+    assert found.at_bound(drag)
+    assert not found.at_bound(inertia[0])
+    assert np.isnan(found.deviations[0])
+    assert float(found.model.effects[0].coefficient) == 0.002
+
+
+def test_what_is_plausible():
+    numbers = {n.name: n for n in plausible_numbers(GUARDS(), ("inertia", "inflow_thrust"))}
+    assert numbers["inertia.relative[0]"].high == INERTIA == -numbers["inertia.relative[0]"].low
+    # The damping of a roll by four rotors half a spacing from the axis, by hand.
+    arm = float(GUARDS().rotor_spacing) / 2
+    moment = 4 * numbers["inflow_thrust.coefficient"].high * arm * arm
+    assert moment / float(GUARDS().inertia[0]) == pytest.approx(RATE_DAMPING)
+    free = {n.name: n for n in free_numbers(("inertia",))}
+    assert free["inertia.relative[0]"].high > 1
+    with pytest.raises(CfbError, match="warp"):
+        plausible_numbers(GUARDS(), ("warp",))
+
+
+def test_nothing_to_fit_and_nothing_to_fit_to_are_refused(campaign):
+    with pytest.raises(CfbError, match="at least one number"):
+        refine(Quadrotor(GUARDS()), campaign.fit, [])
+    short = campaign.fit[0].rows(np.arange(len(campaign.fit[0])) < 50)
+    with pytest.raises(CfbError, match="no prediction window"):
+        refine(Quadrotor(GUARDS()), [short], [Number("rotor_drag", "coefficient", None, 0.0, 0.05)])
+
+
+def test_what_is_missed_twice_shows():
+    log = read_log(DRAG)
+    wrong = Quadrotor(replace(GUARDS(), inertia=GUARDS().inertia * jnp.array([2.0, 2.0, 1.0])))
+    later = log.rows(log.time > log.time[0] + 0.5)
+    same = repeated(wrong, log, later)
+    assert same.correlation[:2] == pytest.approx(1.0, abs=0.02)
+    assert same.distance < 0.01
+    right = repeated(Quadrotor(GUARDS()), log, later)
+    assert np.all(right.rms[:2] < 0.5 * same.rms[:2])
+    with pytest.raises(CfbError, match="too short"):
+        repeated(wrong, log, log.rows(log.time < log.time[0] + 5))
