@@ -260,7 +260,7 @@ ARGUMENTS = {
     "cog_offset": "the mean place of the batteries; every flight has its own besides",
     "torque_scale": "less reactive torque; yaw only",
     "thrust_tilt": "rotors a few milliradians off the vertical",
-    "battery_sag": "rotor speed follows voltage: without it, speeds are off by 2 % over the batteries' range",
+    "battery_sag": "rotor speed follows the voltage of the battery",
     "motor_asymmetry": "motors are driven up and coast down",
 }
 
