@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from cfb_mjx.cli.fitted_model import provenance
+from cfb_mjx.cli.fitted_model import provenance, require_apart
 from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, require_no_file, write_json
@@ -50,10 +50,7 @@ def run_close_loop(fit: list[Path], held_out: list[Path], output: Path, model: s
 def _read(fit: list[Path], held_out: list[Path]) -> tuple[list[FlightLog], list[FlightLog]]:
     if not fit or not held_out:
         raise CfbError("close-loop needs --fit LOG... to learn from and --held-out LOG... to be judged on.")
-    both = {path.resolve() for path in fit} & {path.resolve() for path in held_out}
-    if both:
-        names = ", ".join(sorted(path.name for path in both))
-        raise CfbError(f"{names}: given to --fit and to --held-out; nothing may be judged on what it was fitted to.")
+    require_apart(fit, held_out)
     logs, judged = [read_log(path) for path in fit], [read_log(path) for path in held_out]
     for group in (logs, judged):
         require_own_names(group)

@@ -22,6 +22,18 @@ def require_model_path(output: Path) -> None:
         raise CfbError(f"{output}: the output is a model and must end in .yaml.")
 
 
+def require_apart(fit: list[Path], held_out: list[Path]) -> None:
+    """Refuse a log that is to be fitted and judged on.
+
+    Raises:
+        CfbError: a file is on both sides.
+    """
+    both = {path.resolve() for path in fit} & {path.resolve() for path in held_out}
+    if both:
+        names = ", ".join(sorted(path.name for path in both))
+        raise CfbError(f"{names}: given to fit and as --held-out; nothing may be judged on what it was fitted to.")
+
+
 def provenance(command: str, base: str, hashes_name: str, paths: list[Path], **more) -> dict:
     """Command line without folders, model started from, hashes of the fitted files, versions; and ``more``."""
     return {

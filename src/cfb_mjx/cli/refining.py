@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cfb_mjx.cli.evaluating import changed_model, print_table
-from cfb_mjx.cli.fitted_model import provenance, require_model_path
+from cfb_mjx.cli.fitted_model import provenance, require_apart, require_model_path
 from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json
@@ -39,6 +39,9 @@ def run_refine(
     """
     require_folder(output, json)
     require_model_path(output)
+    require_apart(paths, held_out)
+    if estimator == "innovations" and (predictor or weights):
+        raise CfbError("--predictor and --weight are for --estimator predictions; leave them out, or the estimator.")
     logs, judged = [read_log(path) for path in paths], [read_log(path) for path in held_out]
     for group in (logs, judged):
         require_own_names(group)
@@ -51,8 +54,6 @@ def run_refine(
     names = effects.split(",") if effects else [e["name"] for e in base.effects if e["name"] in CATALOGUE]
     if not names:
         raise CfbError(f"model {base.name} has no effects; name some to fit, for instance --effects rotor_drag.")
-    if predictor and estimator == "innovations":
-        raise CfbError("--predictor: only predictions make a predictor; leave out --estimator innovations.")
     fit = by_innovations if estimator == "innovations" else by_predictions
     extra = {} if estimator == "innovations" else {"predictor": predictor, "weights": shares}
     refined, report = fit(base, logs, names, progress=_say, **extra)

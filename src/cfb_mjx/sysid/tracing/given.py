@@ -5,16 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import CATALOGUE, Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.sensor_faults import SensorFaults
-from cfb_mjx.sysid.tracing.evidence import covariance, solve
-from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Search
+from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
+from cfb_mjx.sysid.tracing.trace import deviations
 
 ROUNDS = 3
 """Fits with noise levels learned in between; the third moves nothing by more than a tenth of a standard deviation."""
@@ -62,17 +60,12 @@ def fit_given(
     for number in range(1, ROUNDS):
         progress(f"fitting {', '.join(names)}, round {number + 1}")
         hypothesis, linear = search.refine(hypothesis)
-    columns = search.own_columns(hypothesis)
-    index = [1, *linear.index(columns)]
-    values = solve(linear.blocks.sum(0), index, linear.scale)
-    spread = covariance(linear.blocks, index, linear.scale, values, (linear.scale[1] / LEAD_SPREAD) ** 2)
-    deviation = np.sqrt(np.diag(spread)) * linear.scale[index]
     uncertainty: dict[str, dict] = {name: {} for name in names}
-    for column, std in zip(columns, deviation[1:], strict=True):
+    for column, std in deviations(search, hypothesis, linear).items():
         own = uncertainty[column.effect]
         if column.index is None:
-            own[column.field] = float(std)
+            own[column.field] = std
         else:
-            own.setdefault(column.field, []).append(float(std))
+            own.setdefault(column.field, []).append(std)
     kept = tuple(e for e in declared if type(e).name not in names)
     return Given((*kept, *(hypothesis.effect(name) for name in names)), uncertainty, sensors.faults)

@@ -320,23 +320,28 @@ def simplified(
     return None
 
 
-def _summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
-    hypothesis, linear = fit.hypothesis, fit.linear
+def deviations(search: Search, hypothesis: Hypothesis, linear: Linear) -> dict[Column, float]:
+    """Standard deviation of every number of the effects that are there, fitted together with the lead."""
     columns = search.own_columns(hypothesis)
     index = [1, *linear.index(columns)]
     values = solve(linear.blocks.sum(0), index, linear.scale)
     spread = covariance(linear.blocks, index, linear.scale, values, (linear.scale[1] / LEAD_SPREAD) ** 2)
     deviation = np.sqrt(np.diag(spread)) * linear.scale[index]
+    return dict(zip(columns, deviation[1:].tolist(), strict=True))
+
+
+def _summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
+    hypothesis = fit.hypothesis
     parameters, uncertainty = {}, {}
-    for column, std in zip(columns, deviation[1:], strict=True):
+    for column, std in deviations(search, hypothesis, fit.linear).items():
         if column.effect != name:
             continue
         value = np.asarray(hypothesis.shift if name == SHIFT else getattr(hypothesis.effect(name), column.field))
         if column.index is None:
-            parameters[column.field], uncertainty[column.field] = float(value), float(std)
+            parameters[column.field], uncertainty[column.field] = float(value), std
         else:
             parameters[column.field] = value.tolist()
-            uncertainty.setdefault(column.field, []).append(float(std))
+            uncertainty.setdefault(column.field, []).append(std)
     gain, p_value = (less.own.gain, less.own.p_value) if less.own else (0.0, 1.0)
     rivals = [v[0].effect for e, v in less.ranking if v[0].effect != name and e.gain > (1 - CLOSE) * gain]
     buys = float(np.max(1 - fit.errors / less.fit.errors))
