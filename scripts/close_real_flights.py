@@ -91,7 +91,7 @@ def group_of(name: str) -> str:
 
 
 def errors(described: ModelFile, logs: list[FlightLog], observer: Observer | None = None) -> dict:
-    """Mean attitude, rad, and velocity error, m/s, at 0.2 and 0.5 s, by group and kind of prediction."""
+    """Mean attitude, rad, and velocity error, m/s, by group, horizon and kind of prediction."""
     faults = SensorFaults.from_mappings(described.effects, described.name)
     found = {}
     for group in GROUPS:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from cfb_mjx.cli.fitted_model import provenance, require_apart
-from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.cli.runtime import configure_jax, environment, say
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, require_no_file, write_json
 from cfb_mjx.logs import FlightLog, read_log, require_own_names
@@ -33,12 +32,12 @@ def run_close_loop(fit: list[Path], held_out: list[Path], output: Path, model: s
     base = changed_model(model, changes)
     output_folder(output)
     checkpoint = Checkpoint.open(output / "search.json", fit, base)
-    outcome = close_loop(logs, judged, base, _say, checkpoint)
+    outcome = close_loop(logs, judged, base, say, checkpoint)
     story = provenance("close-loop", base.name, "fit_logs_sha256", fit, held_out=[path.name for path in held_out])
     corrected = outcome.model_file(f"{base.name}-closed", story)
     facts = environment()
     report = {"case": output.resolve().name} | outcome.to_json() | {"model": base.name, "environment": facts}
-    _say("writing the report")
+    say("writing the report")
     save_model_file(corrected, output / "model.yaml")
     write_report(outcome, output, facts, logs, judged)
     # Last, so that a report.json is always one of a whole report.
@@ -57,10 +56,6 @@ def _read(fit: list[Path], held_out: list[Path]) -> tuple[list[FlightLog], list[
     if sum(log.duration for log in logs) < LEAST_SECONDS:
         raise CfbError(f"--fit: less than {LEAST_SECONDS:g} s of flight; give longer or more logs.")
     return logs, judged
-
-
-def _say(text: str) -> None:
-    print(f"... {text}", file=sys.stderr, flush=True)
 
 
 def _print(report: dict, output: Path) -> None:

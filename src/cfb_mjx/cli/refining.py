@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,12 +10,13 @@ import numpy as np
 
 from cfb_mjx.cli.evaluating import changed_model, print_table
 from cfb_mjx.cli.fitted_model import provenance, require_apart, require_model_path
-from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.cli.runtime import configure_jax, environment, say
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json
 from cfb_mjx.logs import FlightLog, read_log, require_own_names
 
 if TYPE_CHECKING:
+    from cfb_mjx.model.effects import Effect
     from cfb_mjx.parameters import ModelFile
 
 
@@ -56,7 +56,7 @@ def run_refine(
         raise CfbError(f"model {base.name} has no effects; name some to fit, for instance --effects rotor_drag.")
     fit = by_innovations if estimator == "innovations" else by_predictions
     extra = {} if estimator == "innovations" else {"predictor": predictor, "weights": shares}
-    refined, report = fit(base, logs, names, progress=_say, **extra)
+    refined, report = fit(base, logs, names, progress=say, **extra)
     origin = provenance("refine", base.name, "fit_logs_sha256", paths, held_out=[path.name for path in held_out])
     refined = replace(refined, name=output.stem, provenance=origin)
     save_model_file(refined, output)
@@ -74,21 +74,18 @@ def run_refine(
 def by_innovations(base: ModelFile, logs: list[FlightLog], names: list[str], progress) -> tuple[ModelFile, dict]:
     """The model with some effects fitted to innovations, and what to report."""
     from cfb_mjx.model import Quadrotor
-    from cfb_mjx.model.effects import effect_to_mapping
+    from cfb_mjx.sysid.flight import usual_delay
     from cfb_mjx.sysid.tracing.given import fit_given
 
     parameters = base.parameters()
-    delays = {log.observation_delay for log in logs} - {None}
-    delay = float(np.median(list(delays))) if delays else float(parameters.observation_delay)
+    delay = usual_delay(logs, parameters)
     found = fit_given(logs, parameters, names, Quadrotor.from_file(base).effects, delay, progress)
-    rows, mappings = {}, []
-    for effect in found.effects:
-        mapping = effect_to_mapping(effect)
-        std = found.uncertainty.get(mapping["name"])
+    rows, mappings = {}, _mappings(found.effects, found.uncertainty)
+    for mapping in mappings:
+        std = mapping.get("uncertainty")
         for field, value in mapping["parameters"].items() if std else ():
             for name, (v, s) in _pairs(f"{mapping['name']}.{field}", value, std.get(field)).items():
                 rows[name] = {"value": v, "std": s, "at_bound": False}
-        mappings.append(mapping | ({"uncertainty": std} if std else {}))
     effects = (*mappings, *found.faults.to_mappings())
     return replace(base, effects=effects, description=_description(base, names)), {"numbers": rows}
 
@@ -103,7 +100,6 @@ def by_predictions(
 ) -> tuple[ModelFile, dict]:
     """The model with some effects fitted to its predictions, and what to report."""
     from cfb_mjx.model import Quadrotor
-    from cfb_mjx.model.effects import effect_to_mapping
     from cfb_mjx.sysid.refinement import free_numbers, plausible_numbers, refine
     from cfb_mjx.sysid.sensor_faults import SensorFaults
 
@@ -117,13 +113,8 @@ def by_predictions(
         rows[number.name] = {"value": float(value), "std": known, "at_bound": found.at_bound(number)}
         own = uncertainty.setdefault(number.effect, {})
         own[number.field] = known if number.index is None else [*own.get(number.field, []), known]
-    mappings = []
-    for effect in found.model.effects:
-        mapping = effect_to_mapping(effect)
-        std = uncertainty.get(mapping["name"])
-        mappings.append(mapping | ({"uncertainty": std} if std else {}))
     kind = "predictor" if predictor else base.kind
-    effects = (*mappings, *faults.to_mappings())
+    effects = (*_mappings(found.model.effects, uncertainty), *faults.to_mappings())
     report = {
         "numbers": rows,
         "loss": {"before": found.cost[0], "after": found.cost[1]},
@@ -140,6 +131,14 @@ def judge(model: ModelFile, logs: list[FlightLog]) -> dict:
 
     faults = SensorFaults.from_mappings(model.effects, f"model {model.name}")
     return evaluate(Quadrotor.from_file(model), logs, faults=faults).to_json() | {"model": model.name}
+
+
+def _mappings(effects: tuple[Effect, ...], uncertainty: dict[str, dict]) -> list[dict]:
+    """Effects as a model file lists them, with what is known of their numbers' standard deviations."""
+    from cfb_mjx.model.effects import effect_to_mapping
+
+    found = [effect_to_mapping(effect) for effect in effects]
+    return [m | ({"uncertainty": uncertainty[m["name"]]} if uncertainty.get(m["name"]) else {}) for m in found]
 
 
 def _description(base: ModelFile, names: list[str]) -> str:
@@ -168,10 +167,6 @@ def _weights(texts: list[str], logs: list[FlightLog]) -> dict[str, float]:
             raise CfbError(f"--weight {text}: no flight's name begins with '{name}'.")
         found |= dict.fromkeys(chosen, number)
     return found
-
-
-def _say(text: str) -> None:
-    print(f"... {text}", file=sys.stderr, flush=True)
 
 
 def _print(report: dict) -> None:

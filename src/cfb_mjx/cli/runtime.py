@@ -50,6 +50,11 @@ def set_up_xla() -> None:
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {XLA_CPU_FLAGS}".strip()
 
 
+def say(text: str) -> None:
+    """A line of progress."""
+    print(f"... {text}", file=sys.stderr, flush=True)
+
+
 def environment() -> dict[str, str]:
     """Date, machine and versions, to stand beside every measured number."""
     import jax

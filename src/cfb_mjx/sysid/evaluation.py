@@ -12,6 +12,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog, require_own_names
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.sysid import metrics
+from cfb_mjx.sysid.flight import delay_of
 from cfb_mjx.sysid.observer import Observer, at_starts, observe, observed_model
 from cfb_mjx.sysid.prediction import hold, predict, select, start_of_windows
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
@@ -111,8 +112,7 @@ def evaluate(
 def _evaluate_log(
     model: Quadrotor, log: FlightLog, horizons: tuple[float, ...], observer: Observer | None, faults: SensorFaults
 ) -> LogEvaluation:
-    delay = log.metadata.get("observation_delay")
-    delay = float(model.parameters.observation_delay) if delay is None else float(delay)
+    delay = delay_of(log, model.parameters)
     recorded = find_windows(log, horizons, delay)
     reached = faults.reached(horizons)
     log = faults.repaired(log)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
@@ -9,6 +11,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import tidy
+from cfb_mjx.parameters import Parameters
 
 LENGTHS = (2560, 4608, 7680)
 """Rows a flight is padded to (beyond, a multiple of the last): few shapes, so that programs come from the cache."""
@@ -43,6 +46,18 @@ class Flight(eqx.Module):
     """1 at the first row and at the first after a gap."""
     valid: Float[Array, "n"]
     """1 where what the model predicts can be compared with the row."""
+
+
+def delay_of(log: FlightLog, parameters: Parameters) -> float:
+    """Age of pose and velocity in a row, s: as the log says, else as the model does."""
+    delay = log.observation_delay
+    return float(parameters.observation_delay) if delay is None else float(delay)
+
+
+def usual_delay(logs: Sequence[FlightLog], parameters: Parameters) -> float:
+    """One `delay_of` for several logs: the median of what they say."""
+    delays = {log.observation_delay for log in logs} - {None}
+    return float(np.median(list(delays))) if delays else float(parameters.observation_delay)
 
 
 def prepare_flight(log: FlightLog, delay: float) -> Flight:

@@ -30,7 +30,7 @@ from cfb_mjx.model.effects import Condition, Effect, Memory, Motors, Wrench
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.flight import MEASURED_SHARE, Flight, prepare_flight
+from cfb_mjx.sysid.flight import MEASURED_SHARE, Flight, delay_of, prepare_flight
 from cfb_mjx.sysid.replay import Replay, replay
 from cfb_mjx.sysid.windows import Windows
 
@@ -154,7 +154,7 @@ def observe(model: Quadrotor, log: FlightLog, delay: float, observer: Observer, 
     Returns:
         NumPy arrays, one row per row of the log.
     """
-    found, _ = _observe(model, *_inputs(log, delay, use_measured), _numbers(observer))
+    found, _ = _observe(model, *replay_inputs(log, delay, use_measured), _numbers(observer))
     return jax.tree.map(lambda x: np.asarray(x)[: len(log)], found)
 
 
@@ -181,9 +181,8 @@ def fit_observer(model: Quadrotor, logs: Sequence[FlightLog], observer: Observer
     first = _numbers(observer or Observer())
     replays = []
     for log in logs:
-        delay = log.observation_delay
-        flight, driven = _inputs(log, float(model.parameters.observation_delay) if delay is None else delay, True)
-        replays.append((model, flight, driven, _replay(model, flight, driven)))
+        flight, driven = replay_inputs(log, delay_of(log, model.parameters))
+        replays.append((model, flight, driven, replayed(model, flight, driven)))
     leaves, structure = jax.tree.flatten(first)
     sizes = [leaf.size for leaf in leaves]
 
@@ -215,7 +214,7 @@ def _numbers(observer: Observer) -> Observer:
     return Observer(**fields)
 
 
-def _inputs(log: FlightLog, delay: float, use_measured: bool) -> tuple[Flight, Array]:
+def replay_inputs(log: FlightLog, delay: float, use_measured: bool = True) -> tuple[Flight, Array]:
     """The flight and the rotor speeds that drive the body; its ``measured`` says whether they do."""
     flight = prepare_flight(log, delay)
     driven = causal_rotor_speed(log) if use_measured else None
@@ -238,7 +237,8 @@ def causal_rotor_speed(log: FlightLog) -> np.ndarray | None:
 
 
 @eqx.filter_jit
-def _replay(model: Quadrotor, flight: Flight, driven: Array) -> Replay:
+def replayed(model: Quadrotor, flight: Flight, driven: Array) -> Replay:
+    """`replay` without a command lead, compiled."""
     return replay(model, flight, driven, jnp.zeros(()))
 
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.sysid.flight import prepare_flight
-from cfb_mjx.sysid.observer import causal_rotor_speed
-from cfb_mjx.sysid.replay import replay
+from cfb_mjx.sysid.flight import delay_of
+from cfb_mjx.sysid.observer import replay_inputs, replayed
 
 CORNER = 6.0
 """Hz. Above, the gyro's derivative is noise."""
@@ -52,13 +49,8 @@ def residual_angular_acceleration(model: Quadrotor, log: FlightLog) -> tuple[np.
     Returns:
         (n,) time, s, evenly spaced; (n, 3) residual, rad/s^2; (n, 3) position, m.
     """
-    delay = log.observation_delay
-    flight = prepare_flight(log, float(model.parameters.observation_delay) if delay is None else delay)
-    speed = causal_rotor_speed(log)
-    used = np.zeros((len(log), 4)) if speed is None else speed
-    used = np.concatenate([used, np.repeat(used[-1:], len(flight.time) - len(log), axis=0)])
-    flight = eqx.tree_at(lambda f: f.measured, flight, np.array(0.0 if speed is None else 1.0))
-    said = np.asarray(_replayed(model, flight, used).angular_acceleration)[: len(log)]
+    said = replayed(model, *replay_inputs(log, delay_of(log, model.parameters)))
+    said = np.asarray(said.angular_acceleration)[: len(log)]
     time = np.arange(log.time[0], log.time[-1], 1 / RATE)
     rate, said, position = (_sampled(time, log.time, x) for x in (log.body_rate, said, log.position))
     low = butter(4, CORNER, fs=RATE, output="sos")
@@ -86,11 +78,6 @@ def repeated(model: Quadrotor, one: FlightLog, other: FlightLog) -> Repeated:
     spread = np.sqrt(np.mean(first**2, axis=0)), np.sqrt(np.mean(second**2, axis=0))
     rms = np.sqrt((spread[0] ** 2 + spread[1] ** 2) / 2)
     return Repeated(shared / (spread[0] * spread[1]), rms, shared, float(np.sqrt(3 * apart[best])))
-
-
-@eqx.filter_jit
-def _replayed(model: Quadrotor, flight, speed):
-    return replay(model, flight, speed, jnp.zeros(()))
 
 
 def _sampled(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray:

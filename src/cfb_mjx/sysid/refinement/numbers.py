@@ -85,6 +85,7 @@ def _numbers(effects: Sequence[str], bounds: dict) -> tuple[Number, ...]:
 
 
 def with_values(model: Quadrotor, numbers: tuple[Number, ...], values: Any) -> Quadrotor:
+    """A model that has the effects of some numbers, with other values of these; differentiable by them."""
     effects = list(model.effects)
     order = {type(e).name: i for i, e in enumerate(effects)}
     for i, number in enumerate(numbers):

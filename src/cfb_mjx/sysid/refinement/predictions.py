@@ -17,8 +17,8 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.model.effects import Condition, Effect, Wrench
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.sysid.flight import MEASURED_SHARE
-from cfb_mjx.sysid.metrics import BLOCK
+from cfb_mjx.sysid.flight import MEASURED_SHARE, delay_of
+from cfb_mjx.sysid.metrics import BLOCK, errors
 from cfb_mjx.sysid.prediction import hold, predict_one, start_of_windows
 from cfb_mjx.sysid.refinement.numbers import Number, with_values
 from cfb_mjx.sysid.windows import Windows, find_windows
@@ -124,8 +124,7 @@ class Predictions:
     def of(cls, model: Quadrotor, logs: Sequence[FlightLog], share: np.ndarray) -> Predictions:
         flights = []
         for log in logs:
-            delay = log.observation_delay
-            delay = float(model.parameters.observation_delay) if delay is None else delay
+            delay = delay_of(log, model.parameters)
             windows = find_windows(log, HORIZONS, delay)
             flights.append((windows, *(start_of_windows(model, log, windows, delay) if len(windows) else ((), ()))))
         held = [_norms(hold(windows, HORIZONS), windows) for windows, _, _ in flights if len(windows)]
@@ -223,9 +222,8 @@ def _inputs(windows: Windows, start: np.ndarray, memory: tuple, measured: bool) 
 
 def _norms(predicted: State, windows: Windows) -> np.ndarray:
     """(W, H, 2) errors of attitude, rad, and velocity, m/s."""
-    turn = _rotation_vector(jnp.asarray(windows.true_quaternion), jnp.asarray(predicted.quaternion))
-    drift = predicted.velocity - windows.true_velocity
-    return np.stack([np.linalg.norm(np.asarray(x), axis=-1) for x in (turn, drift)], axis=-1)
+    found = errors(windows, predicted)
+    return np.stack([np.radians(found["attitude"]), found["velocity"]], axis=-1)
 
 
 def _rotation_vector(frm: Array, to: Array) -> Array:

@@ -15,7 +15,7 @@ from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.trace import deviations
 
 ROUNDS = 3
-"""Fits with noise levels learned in between; the third moves nothing by more than a tenth of a standard deviation."""
+"""Fits, each with the noise levels learned from the one before."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import SENSOR_FAULTS, effect_to_mapping
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
+from cfb_mjx.sysid.flight import usual_delay
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import FORMULA
@@ -162,8 +163,7 @@ def close_loop(
     """
     declared = Quadrotor.from_file(base).effects
     parameters = base.parameters()
-    delays = {log.observation_delay for log in fit} - {None}
-    delay = float(np.median(list(delays))) if delays else float(parameters.observation_delay)
+    delay = usual_delay(fit, parameters)
     found = trace(fit, parameters, delay, progress, declared, checkpoint)
     search, proposal = explain(found, progress)
     progress("judging on held-out flights")
