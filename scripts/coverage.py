@@ -1,6 +1,6 @@
 """How often the intervals of `cfb fit` cover the truth: many flights of an independent plant, each drone drawn anew.
 
-    python scripts/coverage.py [--flights 200] [--seconds 12]
+    python scripts/coverage.py [--flights 200] [--seconds 12] [--resume]
 
 The plant is the tests' own (tests/sysid/plant.py: NumPy, classical RK4, none of the library's model code; checked there
 against SciPy's DOP853), under feedback, pose 8 ms late, sensor noise. Writes docs/coverage.md and
@@ -8,6 +8,7 @@ benchmarks/coverage.json.
 """
 
 import argparse
+import json
 import sys
 import time
 from pathlib import Path
@@ -137,16 +138,29 @@ def _say(done: int, total: int) -> None:
         print(f"{done}/{total}", file=sys.stderr, flush=True)
 
 
+def _finished(options: argparse.Namespace) -> dict:
+    """The cases already written, if by these settings, versions and machine."""
+    kept = json.loads((ROOT / "benchmarks" / "coverage.json").read_text())
+    same = (kept["flights"], kept["seconds"]) == (options.flights, options.seconds)
+    then, now = ({k: v for k, v in facts.items() if k != "date"} for facts in (kept["environment"], environment()))
+    if not same or then != now:
+        raise SystemExit("benchmarks/coverage.json is of other settings, versions or another machine: run without --resume")
+    return kept["cases"]
+
+
 def main() -> None:
     """Run all cases and write the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--flights", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--dry", action="store_true", help="print, write nothing")
+    parser.add_argument("--resume", action="store_true", help="keep the cases an interrupted run of these settings left")
     options = parser.parse_args()
     configure_jax(x64=True)
-    results = {}
+    results = _finished(options) if options.resume else {}
     for case, settings in CASES.items():
+        if case in results:
+            continue
         results[case] = study(options.flights, options.seconds, settings, _say)
         print(case, f"{results[case]['seconds']:.0f} s")
         for name, row in results[case]["parameters"].items():
