@@ -54,7 +54,7 @@ def _batch(models):
 
 AIR = {
     "inflow_thrust": InflowThrust(0.02),
-    "ground_effect": GroundEffect(0.4, 0.15),
+    "ground_effect": GroundEffect(0.15, 0.15),
     "gyroscopic": Gyroscopic(2e-7),
     "thrust_tilt": ThrustTilt([0.04, -0.03]),
     "rotor_drag": RotorDrag(0.04),
@@ -78,7 +78,7 @@ def _wrench(constants, y, on):
             thrust -= 0.02 * speed[i] / 1594 * at_hub[2]
         if "ground_effect" in on:
             height = y[2] + (matrix @ arm)[2]
-            thrust *= 1 + 0.4 / (1 + (height / 0.15) ** 2)
+            thrust *= 1 + 0.15 * (0.15**2 + 0.1**2) / (0.15**2 + height**2)
         lift += thrust
         here = np.array([0.0, 0.0, thrust - plain[i]])
         if "rotor_drag" in on:

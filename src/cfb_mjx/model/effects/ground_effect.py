@@ -1,10 +1,11 @@
 """Ground effect: near the floor (world z = 0) a rotor gives more thrust.
 
-    f_i *= 1 + strength / (1 + (z_i / height)^2)
+    f_i *= 1 + strength (height^2 + d^2) / (height^2 + z_i^2),  d = 0.1 m
 
 with z_i the height of rotor i, from the position of the rotors' centre and the tilt; below the floor it counts as zero.
-Far up the gain falls as 1/z^2, as Cheeseman and Bennett's 1 / (1 - (R / 4 z)^2) does (there strength * height^2 =
-R^2 / 16); unlike theirs it stays finite at the floor.
+Far up the gain falls as 1/z^2, as Cheeseman and Bennett's 1 / (1 - (R / 4 z)^2) does (there strength * (height^2 + d^2)
+= R^2 / 16); unlike theirs it stays finite at the floor. The strength is that at d, where drones do fly: the gain at the
+floor itself is an extrapolation no flight would tell.
 """
 
 from __future__ import annotations
@@ -20,9 +21,12 @@ from cfb_mjx.model.effects.fields import hub_positions, number
 from cfb_mjx.model.rotors import RotorLoads
 from cfb_mjx.model.vector import rotate
 
+REFERENCE = 0.1
+"""Height of the rotors at which the strength is given, m."""
+
 
 class GroundEffect(Effect):
-    """f_i *= 1 + strength / (1 + (z_i / height)^2)."""
+    """f_i *= 1 + strength (height^2 + d^2) / (height^2 + z_i^2), d = 0.1 m."""
 
     name: ClassVar[str] = "ground_effect"
     units: ClassVar[dict[str, str]] = {"strength": "1", "height": "m"}
@@ -30,14 +34,14 @@ class GroundEffect(Effect):
         "I. Cheeseman, W. Bennett, The effect of the ground on a helicopter rotor in forward flight, ARC R&M 3021, "
         "1955; P. Sanchez-Cuevas, G. Heredia, A. Ollero, Int. J. Aerospace Eng. 2017, 1823056"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"strength": (0.0, 0.5), "height": (0.05, 0.3)}
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"strength": (0.0, 0.3), "height": (0.02, 0.3)}
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
-    probes: ClassVar[tuple[dict[str, float], ...]] = ({"height": 0.06}, {"height": 0.12}, {"height": 0.25})
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({"height": 0.05}, {"height": 0.12}, {"height": 0.25})
 
     strength: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Relative gain of thrust at the floor."""
+    """Relative gain of thrust at `REFERENCE` above the floor."""
     height: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Height at which half of the gain is left."""
+    """Height at which half of the gain at the floor is left."""
 
     @classmethod
     def neutral(cls) -> GroundEffect:
@@ -50,6 +54,7 @@ class GroundEffect(Effect):
         center = condition.position[2] - rotate(condition.quaternion, parameters.center_of_gravity)[2]
         # The last row of the rotation matrix: how high a point beside the centre lies.
         above = along * (2 * (x * z - w * y)) + across * (2 * (y * z + w * x)) + center
-        ratio = above.map(lambda h: jnp.where(h > 0, h, 0.0)) / self.height
-        factor = ratio.map(lambda r: 1 + self.strength / (1 + r * r))
+        core = self.height**2
+        gain = self.strength * (core + REFERENCE**2)
+        factor = above.map(lambda z: 1 + gain / (core + jnp.where(z > 0, z, 0.0) ** 2))
         return RotorLoads(loads.thrust * factor, loads.torque, loads.rate)

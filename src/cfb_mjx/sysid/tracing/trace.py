@@ -168,14 +168,17 @@ def trace(
         name, richer, stretched = best_fit(search, fit, passing, progress)
         refused |= stretched
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))}
+        kept, seen = fit, {}
         if worth_it(name, fit, richer, nothing.errors):
+            kept, seen = re_examined(search, fit, richer, progress)
+        if kept is fit:
+            refused.add(name)
+            vain += 1
+        else:
             vain = 0
             # What was too slight beside a large error may matter now.
             refused = set()
-            fit, left_out = re_examined(search, richer, progress)
-        else:
-            refused.add(name)
-            vain += 1
+            fit, left_out = kept, seen
         checkpoint.save(fit.hypothesis, refused, tried)
     if len(fit.hypothesis.present) > 1:
         single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
@@ -272,18 +275,30 @@ def worth_it(name: str, fit: Fit, richer: Fit, first: np.ndarray) -> bool:
     return np.max(1 - richer.errors / fit.errors) >= MATERIAL
 
 
-def re_examined(search: Search, fit: Fit, progress: Callable[[str], None]) -> tuple[Fit, dict[str, LeftOut]]:
+def re_examined(
+    search: Search, poorer: Fit, richer: Fit, progress: Callable[[str], None]
+) -> tuple[Fit, dict[str, LeftOut]]:
     """Drop what the others explain as well by now, and swap what another effect explains better.
 
+    Args:
+        search: over the fit flights.
+        poorer: without the newest effect.
+        richer: with it.
+        progress: told what happens.
+
     Returns:
-        The fit, and what is left of it without each effect looked at since it last changed.
+        The fit, and what is left of it without each effect looked at since it last changed; ``poorer`` itself if the
+        newest effect and an older one explain the same, and the older one predicts better.
     """
+    fit = richer
     seen: dict[str, LeftOut] = {}
     for name in fit.hypothesis.present[:-1]:
         progress(f"looking at {name} again")
         less = leave_out(search, fit, name)
         lost = np.max(1 - fit.errors / less.fit.errors)
         if less.own is None or not significant(less.own, len(search.names)) or lost < MATERIAL:
+            if fit is richer and np.log(poorer.errors / less.fit.errors).sum() < 0:
+                return poorer, {}
             fit, seen = less.fit, {}
             continue
         seen[name] = less
