@@ -60,8 +60,10 @@ def least_squares(residual: Callable[[Array], PyTree], start: Float[Array, "k"])
         damping = jnp.where(better, eased, jnp.maximum(10 * damping, FIRST_DAMPING))
         return jnp.where(better, x + step, x), here, damping, proposed(here[1], here[2], damping), done + 1
 
-    here, undamped = linearised(start), jnp.zeros((), start.dtype)
-    carry = (start, here, undamped, proposed(here[1], here[2], undamped), 0)
-    x, _, _, (step, gain), done = jax.lax.while_loop(unsettled, advance, carry)
+    # Nothing is known at first and the first step leads nowhere, so that the linearisation is compiled once only.
+    zero = jnp.zeros_like(start)
+    unknown = jnp.full_like(zero[0], jnp.inf)
+    carry = (start, (unknown, zero, directions), jnp.zeros_like(unknown), (zero, unknown), 0)
+    x, _, _, (step, gain), _ = jax.lax.while_loop(unsettled, advance, carry)
     # The last step is too short to be worth another linearisation, and is taken on trust.
     return jnp.where(gain <= SETTLED, x + step, x)
