@@ -1,6 +1,6 @@
 """Trace labelled plants nobody tuned to, and write docs/tracing.md: confusion, false positives, recovered improvement.
 
-    python scripts/tracing_sweep.py [--null 100] [--results benchmarks/tracing.jsonl] [--page-only]
+    python scripts/tracing_sweep.py [--null 100] [--results benchmarks/tracing.jsonl] [--page-only] [--from-end]
 
 The plants (tests/plants) are an independent simulator with effects of other functional forms than the catalogue's.
 Results are kept campaign by campaign: an interrupted sweep goes on where it was.
@@ -61,7 +61,7 @@ def cases(nulls: int, seed: int) -> list[Case]:
     return [found[i] for i in np.random.default_rng(seed).permutation(len(found))]
 
 
-def run(wanted: list[Case], results: Path) -> None:
+def run(wanted: list[Case], results: Path, from_end: bool) -> None:
     """Fly, trace and append one line per campaign."""
     import jax
 
@@ -69,10 +69,13 @@ def run(wanted: list[Case], results: Path) -> None:
     from cfb_mjx.sysid.tracing.outcome import close_loop
 
     base = load_model_file("cfb-guards")
-    done = {json.loads(line)["name"] for line in results.read_text().splitlines()} if results.exists() else set()
-    wanted = [case for case in wanted if case.name not in done]
-    for first in range(0, len(wanted), BATCH):
-        batch = wanted[first : first + BATCH]
+    while True:
+        # Read anew: another process may be at the other end.
+        done = {json.loads(line)["name"] for line in results.read_text().splitlines()} if results.exists() else set()
+        rest = [case for case in wanted if case.name not in done]
+        batch = rest[-BATCH:] if from_end else rest[:BATCH]
+        if not batch:
+            return
         # The same flights without the effect: what the declared model scores there, a perfect one would score here.
         twins = [Case(case.name, case.seed, ()) for case in batch if case.effects]
         flown = fly_campaigns(batch + twins)
@@ -231,15 +234,16 @@ def main() -> None:
     """Run what is missing, then write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--null", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=60_000)
+    parser.add_argument("--seed", type=int, default=70_000)
     parser.add_argument("--only", default="", help="campaigns whose name contains this")
     parser.add_argument("--results", type=Path, default=ROOT / "benchmarks" / "tracing.jsonl")
     parser.add_argument("--page-only", action="store_true")
+    parser.add_argument("--from-end", action="store_true", help="begin at the other end: two processes share a sweep")
     arguments = parser.parse_args()
     configure_jax(x64=True)
     planned = cases(arguments.null, arguments.seed)
     if not arguments.page_only:
-        run([case for case in planned if arguments.only in case.name], arguments.results)
+        run([case for case in planned if arguments.only in case.name], arguments.results, arguments.from_end)
     write_text(ROOT / "docs" / "tracing.md", page(arguments.results, len(planned)))
 
 

@@ -33,6 +33,9 @@ RIVALS, AS_GOOD = 3, 0.03
 """So many effects are tried alone in place of several; no error may grow by more than this share."""
 CLOSE = 0.1
 """A rival that gains all but this share of the winner's gain is named as confusable with it."""
+CLEAR = 10.0
+"""An effect whose statistic is above this need only be material in one flight: what few flights excite (yaw, most of
+all) drowns in the errors of the others, and no chance brings such a statistic about."""
 OF_FIRST = 0.02
 """And by this share of what the declared model scores, so that the last crumbs of a large error are not chased."""
 SMALLEST_SHIFT = 0.0015
@@ -86,27 +89,45 @@ class Trace:
         return replace(self.sensors.faults, motor_shift=self.hypothesis.shift)
 
 
-def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
-    """`ERRORS` on the flights of the search."""
-    metrics = evaluate(hypothesis.model(search.parameters), search.logs, faults=hypothesis.faults).metrics(
-        "commands_in"
-    )
+def predicted(search: Search, hypothesis: Hypothesis) -> Evaluation:
+    """The flights of the search, predicted."""
+    return evaluate(hypothesis.model(search.parameters), search.logs, faults=hypothesis.faults)
+
+
+def errors_of(evaluation: Evaluation) -> np.ndarray:
+    """(8,) `ERRORS` over all flights."""
+    metrics = evaluation.metrics("commands_in")
     return np.array([metrics[key] for key in ERRORS])
+
+
+def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
+    """(8,) `ERRORS` on the flights of the search."""
+    return errors_of(predicted(search, hypothesis))
 
 
 @dataclass(frozen=True)
 class Fit:
-    """A hypothesis fitted to the flights, with its derivatives by the whole catalogue and its `prediction_errors`."""
+    """A hypothesis fitted to the flights.
+
+    Attributes:
+        hypothesis: with the values that fit.
+        linear: its derivatives by the whole catalogue.
+        errors: (8,) `ERRORS` over all flights.
+        by_flight: (L, 8) `ERRORS` in each flight that has prediction windows.
+    """
 
     hypothesis: Hypothesis
     linear: Linear
     errors: np.ndarray
+    by_flight: np.ndarray
 
 
 def fitted(search: Search, hypothesis: Hypothesis) -> Fit:
     """Fit everything a hypothesis holds."""
     hypothesis, linear = search.refine(hypothesis)
-    return Fit(hypothesis, linear, prediction_errors(search, hypothesis))
+    evaluation = predicted(search, hypothesis)
+    flights = [replace(evaluation, logs=(log,)) for log in evaluation.logs if len(log.windows)]
+    return Fit(hypothesis, linear, errors_of(evaluation), np.array([errors_of(flight) for flight in flights]))
 
 
 @dataclass(frozen=True)
@@ -166,11 +187,12 @@ def trace(
         if not passing:
             break
         name, richer, stretched = best_fit(search, fit, passing, progress)
+        clear = next(e for e, v in passing if v[0].effect == name).t >= CLEAR
         refused |= stretched
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))}
         kept, seen = fit, {}
-        if worth_it(name, fit, richer, nothing.errors):
-            kept, seen = re_examined(search, fit, richer, progress)
+        if worth_it(name, fit, richer, nothing, clear):
+            kept, seen = re_examined(search, nothing, fit, richer, progress)
         if kept is fit:
             refused.add(name)
             vain += 1
@@ -257,31 +279,42 @@ def significant(found: Evidence, tried: int) -> bool:
     return found.p_value * tried < ALPHA and found.gain > LEAST_GAIN
 
 
-def worth_it(name: str, fit: Fit, richer: Fit, first: np.ndarray) -> bool:
+def worth_it(name: str, fit: Fit, richer: Fit, nothing: Fit, clear: bool) -> bool:
     """Whether an effect that stands against chance also predicts better, and is no other one in disguise.
 
     Args:
         name: the effect.
         fit: without it.
         richer: with it.
-        first: errors of the declared model.
+        nothing: the declared model.
+        clear: whether its statistic is above `CLEAR`.
     """
     if not np.isfinite(richer.errors).all() or implausible(richer.hypothesis, name):
         return False
     if name == SHIFT and abs(richer.hypothesis.shift) < SMALLEST_SHIFT:
         return False
-    if np.max((fit.errors - richer.errors) / first) < OF_FIRST or np.log(richer.errors / fit.errors).sum() > 0:
-        return False
-    return np.max(1 - richer.errors / fit.errors) >= MATERIAL
+    return np.log(richer.errors / fit.errors).sum() <= 0 and material(fit, richer, nothing, clear)
+
+
+def material(fit: Fit, richer: Fit, nothing: Fit, clear: bool) -> bool:
+    """Whether the richer fit lowers an error by a share that matters, of all flights or, if ``clear``, of one."""
+
+    def enough(poorer, better, first):
+        return np.max(1 - better / poorer) >= MATERIAL and np.max((poorer - better) / first) >= OF_FIRST
+
+    if enough(fit.errors, richer.errors, nothing.errors):
+        return True
+    return clear and enough(fit.by_flight, richer.by_flight, nothing.by_flight)
 
 
 def re_examined(
-    search: Search, poorer: Fit, richer: Fit, progress: Callable[[str], None]
+    search: Search, nothing: Fit, poorer: Fit, richer: Fit, progress: Callable[[str], None]
 ) -> tuple[Fit, dict[str, LeftOut]]:
     """Drop what the others explain as well by now, and swap what another effect explains better.
 
     Args:
         search: over the fit flights.
+        nothing: the declared model.
         poorer: without the newest effect.
         richer: with it.
         progress: told what happens.
@@ -295,8 +328,8 @@ def re_examined(
     for name in fit.hypothesis.present[:-1]:
         progress(f"looking at {name} again")
         less = leave_out(search, fit, name)
-        lost = np.max(1 - fit.errors / less.fit.errors)
-        if less.own is None or not significant(less.own, len(search.names)) or lost < MATERIAL:
+        needed = less.own is not None and significant(less.own, len(search.names))
+        if not needed or not material(less.fit, fit, nothing, less.own.t >= CLEAR):
             if fit is richer and np.log(poorer.errors / less.fit.errors).sum() < 0:
                 return poorer, {}
             fit, seen = less.fit, {}
