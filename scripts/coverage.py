@@ -144,7 +144,9 @@ def _finished(options: argparse.Namespace) -> dict:
     same = (kept["flights"], kept["seconds"]) == (options.flights, options.seconds)
     then, now = ({k: v for k, v in facts.items() if k != "date"} for facts in (kept["environment"], environment()))
     if not same or then != now:
-        raise SystemExit("benchmarks/coverage.json is of other settings, versions or another machine: run without --resume")
+        raise SystemExit(
+            "benchmarks/coverage.json is of other settings, versions or another machine: run without --resume"
+        )
     return kept["cases"]
 
 
@@ -154,7 +156,9 @@ def main() -> None:
     parser.add_argument("--flights", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--dry", action="store_true", help="print, write nothing")
-    parser.add_argument("--resume", action="store_true", help="keep the cases an interrupted run of these settings left")
+    parser.add_argument(
+        "--resume", action="store_true", help="keep the cases an interrupted run of these settings left"
+    )
     options = parser.parse_args()
     configure_jax(x64=True)
     results = _finished(options) if options.resume else {}
