@@ -69,8 +69,8 @@ class Noise(eqx.Module):
         middle = jnp.sqrt(_SHORTEST * _LONGEST)
         return Noise(
             gyro=x[0:3] + 1e-4,
-            rate_walk=x[3:6] + 1e-3,
-            disturbance=x[6:9] + 1e-2,
+            rate_walk=x[3:6] + 1e-4,
+            disturbance=x[6:9] + 1e-3,
             correlation_time=middle * jnp.exp(jnp.tanh(vector[9]) * jnp.log(_LONGEST / middle)),
             accelerometer=x[10] + 1e-3,
             accelerometer_lag=x[11] + 1e-5,
