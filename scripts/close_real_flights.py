@@ -11,7 +11,8 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from cfb_mjx.parameters import ModelFile, load_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.nanodrone import PUBLISHED, QUANTITIES, benchmark
 from cfb_mjx.sysid.observer import Observer
+from cfb_mjx.sysid.observer_tuning import tune_observer
 from cfb_mjx.sysid.repeatability import repeated
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 
@@ -117,10 +119,18 @@ def without_each(plant: ModelFile, fit: list[FlightLog], judged: list[FlightLog]
     return found
 
 
-def sums(models: dict[str, ModelFile], judged: list[FlightLog]) -> dict:
+def tuned(plant: ModelFile, fit: list[FlightLog]) -> dict:
+    """Levels of the observer that predict the fit flights best."""
+    groups = {group: [log for log in fit if group_of(log.name) == group] for group in GROUPS}
+    faults = SensorFaults.from_mappings(plant.effects, plant.name)
+    say = partial(print, flush=True)
+    return asdict(tune_observer(Quadrotor.from_file(plant), groups, faults=faults, progress=say))
+
+
+def sums(models: dict[str, ModelFile], judged: list[FlightLog], observer: Observer) -> dict:
     """The IDSIA benchmark's sums on the validation flights."""
     built = {name: (Quadrotor.from_file(m), None) for name, m in models.items()}
-    built |= {f"{name}, observer": (Quadrotor.from_file(m), Observer()) for name, m in models.items()}
+    built |= {f"{name}, observer": (Quadrotor.from_file(m), observer) for name, m in models.items()}
     rows = benchmark(judged, built, 1, lambda *_: None)["rows"]
     return {name: [row[f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for name, row in rows.items()}
 
@@ -192,6 +202,14 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "| effect | numbers | error without it | argument |",
             "|---|---|---:|---|",
             *_effects(models["plant"], results),
+            "",
+            "## The observer",
+            "",
+            "A torque, a force and, where rotor speed was measured, motor errors, estimated from data before each",
+            "window's start; how much they may wander was chosen by predictions of the flights fitted to, gentle and",
+            "square alike (`cfb_mjx.sysid.observer_tuning`):",
+            "",
+            *_levels(results["observer"]),
             "",
             "## What is missed twice",
             "",
@@ -286,6 +304,13 @@ def _number(name: str, value, std) -> str:
     )
 
 
+def _levels(observer: dict) -> list[str]:
+    def text(value) -> str:
+        return " / ".join(f"{x:.3g}" for x in value) if isinstance(value, list | tuple) else f"{value:.3g}"
+
+    return ["| level | value |", "|---|---|", *(f"| `{name}` | {text(value)} |" for name, value in observer.items())]
+
+
 def _repeats(results: dict) -> list[str]:
     rows = []
     for pair, seen in results["repeats"].items():
@@ -365,14 +390,16 @@ def main() -> None:
     }
     judged = logs["validation"]
     results = {part: [log.name for log in some] for part, some in logs.items()}
+    results["observer"] = kept(work / "observer.json", lambda: tuned(made["plant"], logs["fit"]))
+    observer = Observer(**results["observer"])
     results["errors"] = kept(
-        work / "errors.json", lambda: {name: errors(model, judged, Observer()) for name, model in models.items()}
+        work / "errors.json", lambda: {name: errors(model, judged, observer) for name, model in models.items()}
     )
     results["without"] = kept(work / "without.json", lambda: without_each(made["plant"], logs["fit"], judged))
     both = {name: models[name] for name in ("declared", "plant")}
     results["repeats"] = kept(work / "repeats.json", lambda: repeats(both, logs["fit"] + judged))
     chosen = {name: models[name] for name in ("plant", "predictor")}
-    results["sums"] = kept(work / "sums.json", lambda: sums(chosen, judged))
+    results["sums"] = kept(work / "sums.json", lambda: sums(chosen, judged, observer))
     figure(results, PAGE.with_suffix(".png"))
     write_text(PAGE, page(models, results, commands))
     print(PAGE)

@@ -38,35 +38,47 @@ RIDGE = 1e-3
 """Weight of the prior that holds the logarithms of noise levels, per row of a fit: levels the data say nothing about
 stay where they were."""
 
+AGREES = 0.05
+"""For so long, s, what a model misses of its own angular acceleration stays about the same: the motors' lag."""
+STANDARD_GRAVITY = 9.81
+
 
 class Observer(eqx.Module):
-    """Noise levels of the filters: standard deviations and correlation times."""
+    """Noise levels of the filters: standard deviations and correlation times.
 
-    gyro: float = 0.02
+    As they are they predict real flights of the Crazyflie Brushless best half a second ahead (`observer_tuning`, on the
+    flights ``docs/closing-real-flights.md`` learns from).
+    """
+
+    gyro: float = 0.04
     """White noise of a gyro row, rad/s."""
     rate_walk: float = 0.4
     """White angular acceleration, rad/s per square root of a second."""
-    torque: tuple[float, float, float] = (5.0, 5.0, 1.5)
+    rate_share: float = 0.2
+    """What the model may miss of its own angular acceleration, as a share: hard turns tell less of what wanders."""
+    torque: tuple[float, float, float] = (2.0, 2.0, 0.6)
     """Quickly wandering angular acceleration, rad/s^2."""
-    torque_time: float = 0.3
+    torque_time: float = 0.5
     """Its correlation time, s."""
-    trim: tuple[float, float, float] = (2.0, 2.0, 1.0)
+    trim: tuple[float, float, float] = (1.0, 1.0, 0.5)
     """Slowly wandering angular acceleration, rad/s^2."""
-    trim_time: float = 10.0
+    trim_time: float = 100.0
     """Its correlation time, s."""
     accelerometer: float = 0.3
     """White noise of an accelerometer row, m/s^2."""
-    force: float = 0.5
+    force_share: float = 0.7
+    """What the model may miss of its own specific force beyond hover, as a share of it."""
+    force: tuple[float, float, float] = (0.1, 0.1, 0.3)
     """Wandering specific force, m/s^2."""
-    force_time: float = 0.8
+    force_time: float = 0.4
     """Its correlation time, s."""
     rotor: float = 10.0
     """White noise of a rotor speed row, rad/s."""
     rotor_walk: float = 110.0
     """White rotor acceleration, rad/s per square root of a second."""
-    rotor_offset: float = 25.0
+    rotor_offset: float = 15.0
     """Wandering error of the steady rotor speed, rad/s."""
-    rotor_offset_time: float = 0.3
+    rotor_offset_time: float = 0.2
     """Its correlation time, s."""
 
 
@@ -278,7 +290,8 @@ def _body(flight: Flight, said: Replay, o: Observer):
             quick, slow = jnp.exp(-dt / o.torque_time), jnp.exp(-dt / o.trim_time)
             reach = o.torque_time * (1 - quick)
             move = jnp.array([[1.0, reach, dt], [0.0, quick, 0.0], [0.0, 0.0, slow]])
-            noise = jnp.stack([o.rate_walk**2 * dt, torque**2 * (1 - quick**2), trim**2 * (1 - slow**2)])
+            walk = o.rate_walk**2 + (o.rate_share * alpha) ** 2 * AGREES
+            noise = jnp.stack([walk * dt, torque**2 * (1 - quick**2), trim**2 * (1 - slow**2)])
             x = move @ jnp.stack([w, a, b]) + jnp.stack([alpha * dt, 0.0, 0.0])
             p = move @ p @ move.T + jnp.diag(noise)
             variance, error = p[0, 0] + o.gyro**2, gyro - x[0]
@@ -298,7 +311,9 @@ def _body(flight: Flight, said: Replay, o: Observer):
         dt, model_force, measured, fresh = inputs
         keep = jnp.exp(-dt / o.force_time)
         d, p = keep * d, keep**2 * p + o.force**2 * (1 - keep**2)
-        variance, error = p + o.accelerometer**2, measured - model_force - d
+        beyond = model_force - jnp.array([0.0, 0.0, STANDARD_GRAVITY])
+        missed = o.force_share**2 * (beyond @ beyond)
+        variance, error = p + o.accelerometer**2 + missed, measured - model_force - d
         gain = jnp.where(fresh > 0, 0.0, p / variance)
         return (d + gain * error, (1 - gain) * p), (d + gain * error, error, jnp.broadcast_to(variance, (3,)))
 
