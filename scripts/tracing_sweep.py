@@ -23,7 +23,7 @@ from plants import EFFECTS, Case, fly_campaigns, label  # noqa: E402
 from cfb_mjx.cli.runtime import configure_jax, environment  # noqa: E402
 from cfb_mjx.files import write_text  # noqa: E402
 from cfb_mjx.parameters import load_model_file  # noqa: E402
-from cfb_mjx.sysid.tracing.trace import ERRORS  # noqa: E402
+from cfb_mjx.sysid.tracing.fits import ERRORS  # noqa: E402
 
 BATCH = 8
 WEAK = 0.35

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from cfb_mjx.sysid.metrics import QUANTITIES
+from cfb_mjx.sysid.tracing.acceptance import ALPHA, LEAST_GAIN, MATERIAL
 from cfb_mjx.sysid.tracing.outcome import Outcome
-from cfb_mjx.sysid.tracing.trace import ALPHA, LEAST_GAIN, MATERIAL
 from cfb_mjx.view.closing_figures import squared
 from cfb_mjx.view.closing_look import Looked
 from cfb_mjx.view.closing_words import EXPERIMENTS, FOLLOWS, numbers, probability

@@ -10,8 +10,9 @@ import numpy as np
 from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS, ResidualFormula
 from cfb_mjx.sysid.tracing.columns import FORMULA, Column, term_columns
 from cfb_mjx.sysid.tracing.evidence import covariance, evidence, solve
+from cfb_mjx.sysid.tracing.fits import prediction_errors
 from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Search
-from cfb_mjx.sysid.tracing.trace import Trace, prediction_errors
+from cfb_mjx.sysid.tracing.trace import Trace
 
 STRUCTURE = 0.06
 """A formula counts when it lowers at least one prediction error by this share."""

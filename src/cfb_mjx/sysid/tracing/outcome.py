@@ -17,12 +17,13 @@ from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import FORMULA
 from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
+from cfb_mjx.sysid.tracing.fits import prediction_errors
 from cfb_mjx.sysid.tracing.formula import Proposal, explain
 from cfb_mjx.sysid.tracing.lines import Line, find_lines
 from cfb_mjx.sysid.tracing.residuals import residual_rows
 from cfb_mjx.sysid.tracing.search import Hypothesis, Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
-from cfb_mjx.sysid.tracing.trace import Found, Trace, prediction_errors, trace
+from cfb_mjx.sysid.tracing.trace import Found, Trace, trace
 
 SURE = 3.0
 """A formula counts when its statistic on held-out flights is above this."""

@@ -10,21 +10,16 @@ import numpy as np
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import KNOWN, Effect
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.evaluation import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.tracing.acceptance import CLEAR, LEAST_GAIN, implausible, material, significant, worth_it
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import SHIFT, Column
 from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
+from cfb_mjx.sysid.tracing.fits import ERRORS, Fit, fitted
 from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Linear, Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
 
-ALPHA = 1e-2
-"""An effect's p-value, times the number of effects tried, must be below this."""
-LEAST_GAIN = 5.0
-"""And it must gain so many nats of log-likelihood on blocks left out."""
-MATERIAL = 0.05
-"""And lower at least one prediction error (four quantities, two horizons) by this share."""
 CONTENDERS, CONTENDER = 3, 0.5
 """So many effects of a ranking are fitted, if they gain this share of the first."""
 PARSIMONY = 0.02
@@ -33,22 +28,10 @@ RIVALS, AS_GOOD = 3, 0.03
 """So many effects are tried alone in place of several; no error may grow by more than this share."""
 CLOSE = 0.1
 """A rival that gains all but this share of the winner's gain is named as confusable with it."""
-CLEAR = 10.0
-"""An effect whose statistic is above this need only be material in one flight: what few flights excite (yaw, most of
-all) drowns in the errors of the others, and no chance brings such a statistic about."""
-OF_FIRST = 0.02
-"""And by this share of what the declared model scores, so that the last crumbs of a large error are not chased."""
-SMALLEST_SHIFT = 0.0015
-"""Motor columns less late or early than this, s, are commands between rows rather than a fault."""
 LARGEST = 6
 """Effects at most."""
 PATIENCE = 3
 """Candidates in a row that stand against chance but lower no error: then the search ends."""
-ERRORS = tuple(
-    f"{q}@{h}s"
-    for h in ("0.2", "0.5")
-    for q in ("position_rmse_m", "velocity_rmse_mps", "attitude_rmse_deg", "rate_rmse_radps")
-)
 
 
 @dataclass
@@ -87,47 +70,6 @@ class Trace:
     def faults(self) -> SensorFaults:
         """Everything wrong with the recording."""
         return replace(self.sensors.faults, motor_shift=self.hypothesis.shift)
-
-
-def predicted(search: Search, hypothesis: Hypothesis) -> Evaluation:
-    """The flights of the search, predicted."""
-    return evaluate(hypothesis.model(search.parameters), search.logs, faults=hypothesis.faults)
-
-
-def errors_of(evaluation: Evaluation) -> np.ndarray:
-    """(8,) `ERRORS` over all flights."""
-    metrics = evaluation.metrics("commands_in")
-    return np.array([metrics[key] for key in ERRORS])
-
-
-def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
-    """(8,) `ERRORS` on the flights of the search."""
-    return errors_of(predicted(search, hypothesis))
-
-
-@dataclass(frozen=True)
-class Fit:
-    """A hypothesis fitted to the flights.
-
-    Attributes:
-        hypothesis: with the values that fit.
-        linear: its derivatives by the whole catalogue.
-        errors: (8,) `ERRORS` over all flights.
-        by_flight: (L, 8) `ERRORS` in each flight that has prediction windows.
-    """
-
-    hypothesis: Hypothesis
-    linear: Linear
-    errors: np.ndarray
-    by_flight: np.ndarray
-
-
-def fitted(search: Search, hypothesis: Hypothesis) -> Fit:
-    """Fit everything a hypothesis holds."""
-    hypothesis, linear = search.refine(hypothesis)
-    evaluation = predicted(search, hypothesis)
-    flights = [replace(evaluation, logs=(log,)) for log in evaluation.logs if len(log.windows)]
-    return Fit(hypothesis, linear, errors_of(evaluation), np.array([errors_of(flight) for flight in flights]))
 
 
 @dataclass(frozen=True)
@@ -226,15 +168,6 @@ def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, li
     return sorted(best.values(), key=lambda pair: -pair[0].gain)
 
 
-def implausible(hypothesis: Hypothesis, name: str) -> bool:
-    """Whether an effect had to be stretched to twice its plausible strength: then it stands in for another."""
-    if name == SHIFT:
-        return False
-    effect, kind = hypothesis.effect(name), KNOWN[name]
-    values = {field: np.asarray(getattr(effect, field)) for field in kind.strengths}
-    return any(np.any((v > 2 * kind.prior[f][1]) | (v < 2 * kind.prior[f][0])) for f, v in values.items())
-
-
 def best_fit(
     search: Search, fit: Fit, ranking: list[tuple[Evidence, list[Column]]], progress: Callable[[str], None]
 ) -> tuple[str, Fit, set[str]]:
@@ -272,39 +205,6 @@ def best_fit(
         # physical cause comes first, and the report names both.
         name = delayed if gains[delayed] > (1 - CLOSE) * gains[name] else name
     return name, fits[name], stretched
-
-
-def significant(found: Evidence, tried: int) -> bool:
-    """Whether evidence stands after so many tries."""
-    return found.p_value * tried < ALPHA and found.gain > LEAST_GAIN
-
-
-def worth_it(name: str, fit: Fit, richer: Fit, nothing: Fit, clear: bool) -> bool:
-    """Whether an effect that stands against chance also predicts better, and is no other one in disguise.
-
-    Args:
-        name: the effect.
-        fit: without it.
-        richer: with it.
-        nothing: the declared model.
-        clear: whether its statistic is above `CLEAR`.
-    """
-    if not np.isfinite(richer.errors).all() or implausible(richer.hypothesis, name):
-        return False
-    if name == SHIFT and abs(richer.hypothesis.shift) < SMALLEST_SHIFT:
-        return False
-    return np.log(richer.errors / fit.errors).sum() <= 0 and material(fit, richer, nothing, clear)
-
-
-def material(fit: Fit, richer: Fit, nothing: Fit, clear: bool) -> bool:
-    """Whether the richer fit lowers an error by a share that matters, of all flights or, if ``clear``, of one."""
-
-    def enough(poorer, better, first):
-        return np.max(1 - better / poorer) >= MATERIAL and np.max((poorer - better) / first) >= OF_FIRST
-
-    if enough(fit.errors, richer.errors, nothing.errors):
-        return True
-    return clear and enough(fit.by_flight, richer.by_flight, nothing.by_flight)
 
 
 def re_examined(

@@ -1,0 +1,58 @@
+"""A hypothesis fitted to the flights of a search, and how well it predicts them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cfb_mjx.sysid.evaluation import Evaluation, evaluate
+from cfb_mjx.sysid.tracing.search import Hypothesis, Linear, Search
+
+ERRORS = tuple(
+    f"{q}@{h}s"
+    for h in ("0.2", "0.5")
+    for q in ("position_rmse_m", "velocity_rmse_mps", "attitude_rmse_deg", "rate_rmse_radps")
+)
+"""Prediction errors an effect is judged by: four quantities, two horizons."""
+
+
+def predicted(search: Search, hypothesis: Hypothesis) -> Evaluation:
+    """The flights of the search, predicted."""
+    return evaluate(hypothesis.model(search.parameters), search.logs, faults=hypothesis.faults)
+
+
+def errors_of(evaluation: Evaluation) -> np.ndarray:
+    """(8,) `ERRORS` over all flights."""
+    metrics = evaluation.metrics("commands_in")
+    return np.array([metrics[key] for key in ERRORS])
+
+
+def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
+    """(8,) `ERRORS` on the flights of the search."""
+    return errors_of(predicted(search, hypothesis))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A hypothesis fitted to the flights.
+
+    Attributes:
+        hypothesis: with the values that fit.
+        linear: its derivatives by the whole catalogue.
+        errors: (8,) `ERRORS` over all flights.
+        by_flight: (L, 8) `ERRORS` in each flight that has prediction windows.
+    """
+
+    hypothesis: Hypothesis
+    linear: Linear
+    errors: np.ndarray
+    by_flight: np.ndarray
+
+
+def fitted(search: Search, hypothesis: Hypothesis) -> Fit:
+    """Fit everything a hypothesis holds."""
+    hypothesis, linear = search.refine(hypothesis)
+    evaluation = predicted(search, hypothesis)
+    flights = [replace(evaluation, logs=(log,)) for log in evaluation.logs if len(log.windows)]
+    return Fit(hypothesis, linear, errors_of(evaluation), np.array([errors_of(flight) for flight in flights]))
