@@ -25,6 +25,7 @@ VALIDATION = Path(__file__).resolve().parents[3] / "shared" / "real" / "validati
 GUARDS = Quadrotor.from_file("cfb-guards")
 LIKELY = Observer(
     gyro=0.02,
+    accelerometer=0.3,
     rate_share=0.0,
     torque=(5.0, 5.0, 1.5),
     torque_time=0.3,

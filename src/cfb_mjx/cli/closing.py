@@ -59,6 +59,8 @@ def _read(fit: list[Path], held_out: list[Path]) -> tuple[list[FlightLog], list[
 
 
 def _print(report: dict, output: Path) -> None:
+    from cfb_mjx.view.closing_words import separating
+
     if not report["effects"]:
         print("nothing is missing beyond chance")
     for effect in report["effects"]:
@@ -70,6 +72,9 @@ def _print(report: dict, output: Path) -> None:
         print(f"{effect['name']}: {'; '.join(values)} (p = {effect['p_value']:.1g})")
         if effect.get("confusable_with"):
             print(f"  these flights hardly tell it from {', '.join(effect['confusable_with'])}")
+            command = separating([effect["name"], *effect["confusable_with"]], str(output / "model.yaml"))
+            if command is not None:
+                print(f"  what to fly: {command}")
     if report["unexplained"]:
         print(f"unexplained: {report['unexplained_because']}")
     print(f"\n{'held-out RMS error':<28}{'before':>10}{'after':>10}{'hold':>10}")

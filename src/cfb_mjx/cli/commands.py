@@ -189,7 +189,7 @@ def fit_rotors(
 
 
 def excite(
-    manoeuvre: tyro.conf.Positional[Literal["roll-pitch", "single-motor", "optimised"]],
+    manoeuvre: tyro.conf.Positional[Literal["roll-pitch", "single-motor", "optimised", "separate"]],
     output: Output,
     parameters: str | None = None,
     model: Model = "cfb-guards",
@@ -200,6 +200,7 @@ def excite(
     altitude_loss: float = 0.5,
     measured_rotors: bool = False,
     disturbance: float = 4.0,
+    between: Annotated[str | None, tyro.conf.arg(metavar="EFFECT,EFFECT")] = None,
     json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
 ) -> None:
     """Design a manoeuvre that identifies the drone, fly it in simulation, and predict what a fit will know.
@@ -207,9 +208,13 @@ def excite(
     A stabiliser like the firmware's hovers, hands over to open-loop commands and catches the drone. Writes the commands
     (commands.csv), the simulated flight (flight.mcap), a figure and the expected uncertainty (excitation.json).
 
+    separate looks for the path a position controller should fly to tell apart effects that cfb close-loop calls
+    confusable, and writes its set-points (setpoints.csv), a simulated flight and what every path tells
+    (separation.json).
+
     Args:
-        manoeuvre: roll-pitch (doublets, for the inertia about x and y), single-motor (for J_z and J_m), or optimised
-            for the chosen parameters, compared with the other two.
+        manoeuvre: roll-pitch (doublets, for the inertia about x and y), single-motor (for J_z and J_m), optimised
+            for the chosen parameters and compared with the other two, or separate.
         output: folder to write to.
         parameters: what will be fitted, as for cfb fit; by default what cfb fit would choose.
         model: preset or model YAML: the best guess of the drone before the flight.
@@ -220,8 +225,14 @@ def excite(
         altitude_loss: height that may be lost until the drone is caught, m.
         measured_rotors: rotor speed will be logged.
         disturbance: rms of the unmodelled torque over inertia to expect, rad/s^2.
+        between: effects to tell apart (separate); those the model has are taken at its strengths.
         json: write the results here too.
     """
+    if manoeuvre == "separate":
+        from cfb_mjx.cli.separating import run_separate
+
+        run_separate(between, output, model, list(set), measured_rotors, disturbance, json)
+        return
     from cfb_mjx.cli.exciting import run_excite
 
     run_excite(

@@ -10,7 +10,7 @@ from cfb_mjx.model.state import State
 
 
 class PositionHold(eqx.Module):
-    """Start, resume and command a `FirmwarePid`, yaw towards zero."""
+    """Start, resume and command a `FirmwarePid`."""
 
     pid: FirmwarePid
 
@@ -23,7 +23,7 @@ class PositionHold(eqx.Module):
         return resume(self.pid, memory, measurement)
 
     def command(
-        self, memory: PidState, measurement: State, position: Float[Array, "3"]
+        self, memory: PidState, measurement: State, position: Float[Array, "3"], yaw: Float[Array, ""] | float = 0.0
     ) -> tuple[PidState, Float[Array, "4"]]:
-        """New memory and command to hold ``position`` [m, world]; called every `cfb_mjx.control.pid.DT`."""
-        return step(self.pid, memory, measurement, Setpoint.hover(position))
+        """New memory and command to hold ``position`` [m, world] and ``yaw`` [rad]; called every `pid.DT`."""
+        return step(self.pid, memory, measurement, Setpoint.hover(position, yaw))

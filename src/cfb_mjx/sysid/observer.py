@@ -64,11 +64,11 @@ class Observer(eqx.Module):
     """Slowly wandering angular acceleration, rad/s^2."""
     trim_time: float = 100.0
     """Its correlation time, s."""
-    accelerometer: float = 0.3
+    accelerometer: float = 0.6
     """White noise of an accelerometer row, m/s^2."""
     force_share: float = 0.7
     """What the model may miss of its own specific force beyond hover, as a share of it."""
-    force: tuple[float, float, float] = (0.1, 0.1, 0.3)
+    force: tuple[float, float, float] = (0.05, 0.1, 0.6)
     """Wandering specific force, m/s^2."""
     force_time: float = 0.4
     """Its correlation time, s."""

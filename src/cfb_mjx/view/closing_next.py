@@ -7,7 +7,7 @@ from cfb_mjx.sysid.tracing.acceptance import ALPHA, LEAST_GAIN, MATERIAL
 from cfb_mjx.sysid.tracing.outcome import Outcome
 from cfb_mjx.view.closing_figures import squared
 from cfb_mjx.view.closing_look import Looked
-from cfb_mjx.view.closing_words import EXPERIMENTS, FOLLOWS, numbers, probability
+from cfb_mjx.view.closing_words import EXPERIMENTS, FOLLOWS, numbers, probability, separating
 
 UNSURE = 0.2
 """Relative standard deviation above which more flights of an effect's kind are asked for."""
@@ -63,6 +63,9 @@ def next_flights(outcome: Outcome, looked: Looked) -> list[str]:
         for name in [item.name, *rivals] if rivals else []:
             others = ", ".join(other for other in [item.name, *rivals] if other != name)
             fly(EXPERIMENTS.get(name, "flights of another kind"), f"this shows {name}, and not {others}")
+        command = separating([item.name, *rivals], "model.yaml") if rivals else None
+        if command is not None:
+            fly(f"what `{command}` writes", f"it looks for the flight that tells {item.name} from {', '.join(rivals)}")
         main = max(numbers(item), key=lambda number: abs(number.value))
         if main.std > UNSURE * abs(main.value):
             share = 100 * main.std / max(abs(main.value), 1e-300)

@@ -85,6 +85,13 @@ FOLLOWS = {
 _COMPONENTS = {2: ("x", "y"), 3: ("x", "y", "z"), 4: ("M1", "M2", "M3", "M4")}
 
 
+def separating(names: list[str], model: str) -> str | None:
+    """The command that finds the flight to tell some effects apart; None where flying does not."""
+    if not set(names) <= set(CATALOGUE):
+        return None
+    return f"cfb excite separate --between {','.join(names)} --model {model} -o next"
+
+
 def is_fault(name: str) -> bool:
     """Whether a name is one of the recording's faults and not physics."""
     return name in SENSOR_FAULTS

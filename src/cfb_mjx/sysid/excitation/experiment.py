@@ -39,8 +39,8 @@ class Stabiliser(Protocol):
     def resume(self, memory: Any, measurement: State) -> Any:
         """The memory when taking over after the manoeuvre, during which it was not called."""
 
-    def command(self, memory: Any, measurement: State, position: Array) -> tuple[Any, Array]:
-        """New memory and command (4,) to hold ``position`` [m, world]."""
+    def command(self, memory: Any, measurement: State, position: Array, yaw: Array) -> tuple[Any, Array]:
+        """New memory and command (4,) to hold ``position`` [m, world] and ``yaw`` [rad]."""
 
 
 @dataclass(frozen=True)
@@ -102,21 +102,54 @@ def fly(
         phase[start + m + 1 : start + m + brake] = BRAKE
         phase[start + m + catch : start + cycle] = BACK
         fixed[start : start + m] = open_loop
+    flown = _flown(model, stabiliser, model.hover_state((0.0, 0.0, height)), phase, fixed, conditions, seed, name)
+    return Experiment(*flown, starts, m)
+
+
+def follow(
+    model: Quadrotor,
+    stabiliser: Stabiliser,
+    path: np.ndarray,
+    conditions: Conditions = Conditions(),
+    seed: int = 0,
+    name: str = "path",
+) -> Experiment:
+    """Simulate a flight along a path, from hover at its first point.
+
+    Args:
+        model: the drone; stepped at `TICK` with RK4 whatever its own choices.
+        stabiliser: flies it.
+        path: (n, 4) set-points x, y, z [m] and yaw [rad], one per `TICK`.
+        conditions: noise and disturbances.
+        seed: of noise and disturbances.
+        name: of the log.
+    """
+    model = stepped(model, dt=TICK)
+    path = np.asarray(path, dtype=float)
+    start = model.hover_state(tuple(path[0, :3]))
+    phase = np.full(len(path), FOLLOW)
+    flown = _flown(model, stabiliser, start, phase, path, conditions, seed, name)
+    return Experiment(*flown, np.zeros(1, dtype=int), len(path))
+
+
+def _flown(model: Quadrotor, stabiliser: Stabiliser, start: State, phase, fixed, conditions: Conditions, seed, name):
+    """Log, time, true states and commands of a flight in given phases."""
+    n = len(phase)
     rng = np.random.default_rng(seed)
     widths = {"gyro": 3, "pose": 9, "torque": 3, "force": 1, "rotor": 4}
     draws = {name: rng.normal(size=(n, width)) for name, width in widths.items()}
     levels = {k: jnp.asarray(v) for k, v in vars(conditions).items() if not isinstance(v, bool)}
-    start = model.hover_state((0.0, 0.0, height))
     state, measured, command, force = jax.tree.map(
         np.asarray, _simulate(model, stabiliser, start, levels, (phase, fixed, draws))
     )
     time = np.arange(n) * TICK
     log = _log(time, state, measured, command, force, conditions, rng, float(model.parameters.observation_delay), name)
-    return Experiment(log, time, state, command, starts, m)
+    return log, time, state, command
 
 
-OPEN, HANDOVER, BRAKE, BACK = 1, 2, 3, 4
-"""Phases of a flight besides 0, holding a position."""
+OPEN, HANDOVER, BRAKE, BACK, FOLLOW = 1, 2, 3, 4, 5
+"""Phases of a flight besides 0, holding a position. While `OPEN`, what is fixed are commands; while `FOLLOW`,
+set-points."""
 
 
 class _Push(Effect):
@@ -164,7 +197,9 @@ def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs):
         home = start.position - target
         way = jnp.minimum(1.0, _RETURN_SPEED * TICK / jnp.maximum(jnp.linalg.norm(home), 1e-9))
         target = target + jnp.where(phase == BACK, way, 0.0) * home
-        moved, wanted = stabiliser.command(memory, measured, target)
+        follows = phase == FOLLOW
+        target = jnp.where(follows, fixed[:3], target)
+        moved, wanted = stabiliser.command(memory, measured, target, jnp.where(follows, fixed[3], 0.0))
         is_open = phase == OPEN
         memory = jax.tree.map(lambda new, old: jnp.where(is_open, old, new), moved, memory)
         command = jnp.clip(jnp.where(is_open, fixed, wanted), 0.0, 1.0)
@@ -184,7 +219,7 @@ def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs):
     wandering = wander * jnp.concatenate([first["torque"], first["force"], first["rotor"]])
     # The push remembers nothing, but a state has an entry for each effect.
     pushed = eqx.tree_at(lambda q: q.effects, model, (*model.effects, _Push(jnp.zeros(3), jnp.zeros(3))))
-    begun = begin(pushed, start)
+    begun = begin(pushed, eqx.tree_at(lambda s: s.memory, start, (), is_leaf=lambda x: isinstance(x, tuple)))
     carry = (begun, DelayLine.filled(begun, TICK, 0.1), memory, start.position, wandering)
     return jax.lax.scan(tick, carry, jax.tree.map(jnp.asarray, inputs))[1]
 

@@ -1,0 +1,70 @@
+"""Paths a position controller can follow, each of a kind that shows some effects and not others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+SECONDS = 15.0
+"""Of every path."""
+HEIGHT = 1.2
+"""Of those that stay level, m; all keep within 1 m of the origin sideways and below 2.2 m."""
+Path = Float[np.ndarray, "n 4"]
+
+
+def _steps(time: np.ndarray, values: list[float], duration: float) -> np.ndarray:
+    return np.asarray(values)[np.minimum((time // duration).astype(int), len(values) - 1)]
+
+
+def _there_and_back(time: np.ndarray, reach: float, speeds: tuple[float, ...]) -> np.ndarray:
+    """From -reach to reach and back at each of the speeds in turn, then staying."""
+    corners, ends = [0.0], [-reach]
+    for speed in speeds:
+        for end in (reach, -reach):
+            corners.append(corners[-1] + 2 * reach / speed)
+            ends.append(end)
+    return np.interp(time, corners, ends)
+
+
+def _level(time: np.ndarray, x=0.0, y=0.0, z=HEIGHT, yaw=0.0) -> Path:
+    return np.stack([np.broadcast_to(np.asarray(a, float), time.shape) for a in (x, y, z, yaw)], axis=1)
+
+
+PATHS: dict[str, tuple[str, Callable[[np.ndarray], Path]]] = {
+    "passes along x": (
+        "straight passes along x at 0.5, 1 and 2.5 m/s, nose ahead",
+        lambda t: _level(t, x=_there_and_back(t, 0.9, (0.5, 1.0, 2.5))),
+    ),
+    "passes along y": (
+        "straight passes along y at 0.5, 1 and 2.5 m/s, flying sideways",
+        lambda t: _level(t, y=_there_and_back(t, 0.9, (0.5, 1.0, 2.5))),
+    ),
+    "climbs": (
+        "climbs and dives between 0.6 and 2.2 m at 0.5, 1 and 2 m/s",
+        lambda t: _level(t, z=1.4 + _there_and_back(t, 0.8, (0.5, 1.0, 2.0))),
+    ),
+    "heights": (
+        "hover for three seconds each at 0.1, 0.15, 0.25, 0.5 and 1 m",
+        lambda t: _level(t, z=_steps(t, [0.1, 0.15, 0.25, 0.5, 1.0], 3.0)),
+    ),
+    "headings": (
+        "hover with the heading turned by 90 degrees every three seconds",
+        lambda t: _level(t, yaw=0.5 * np.pi * _steps(t, [0.0, 1.0, 2.0, -1.0, 0.0], 3.0)),
+    ),
+    "yaw turns": (
+        "hover with yaw steps of 120 degrees forth and back",
+        lambda t: _level(t, yaw=_steps(t, [0.0, 2.1, 0.0, -2.1] * 4, 1.0)),
+    ),
+    "stops": (
+        "jumps of a metre, ahead and aside in turn, each followed by a hover",
+        lambda t: _level(t, x=_steps(t, [0.0, 1.0, 1.0, 0.0, 0.0], 3.0), y=_steps(t, [0.0, 0.0, 1.0, 1.0, 0.0], 3.0)),
+    ),
+}
+"""What to tell a pilot, and set-points (n, 4) [x, y, z in m, yaw in rad] at given times, s."""
+
+
+def path(name: str, tick: float) -> Path:
+    """Set-points of a path, one per ``tick`` seconds."""
+    return PATHS[name][1](np.arange(round(SECONDS / tick)) * tick)
