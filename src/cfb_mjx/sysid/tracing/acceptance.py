@@ -18,7 +18,7 @@ MATERIAL = 0.05
 """And lower at least one prediction error (four quantities, two horizons) by this share."""
 OF_FIRST = 0.02
 """And by this share of what the declared model scores, so that the last crumbs of a large error are not chased."""
-CLEAR = 10.0
+CLEAR = 8.0
 """An effect whose statistic is above this need only be material in one flight: what few flights excite (yaw, most of
 all) drowns in the errors of the others, and no chance brings such a statistic about."""
 SMALLEST_SHIFT = 0.0015

@@ -134,7 +134,15 @@ def trace(
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))}
         kept, seen = fit, {}
         if worth_it(name, fit, richer, nothing, clear):
-            kept, seen = re_examined(search, nothing, fit, richer, progress)
+            # Taken out again, for the newcomer's turn has also fitted the others anew, and that is not its merit.
+            less = leave_out(search, richer, name)
+            if needed(search, less, richer, nothing):
+                kept, seen = re_examined(search, nothing, less.fit, richer, progress)
+                fit = less.fit
+                if kept is richer:
+                    seen[name] = less
+            else:
+                kept = fit = less.fit
         if kept is fit:
             refused.add(name)
             vain += 1
@@ -207,6 +215,13 @@ def best_fit(
     return name, fits[name], stretched
 
 
+def needed(search: Search, less: LeftOut, fit: Fit, nothing: Fit) -> bool:
+    """Whether a fit without one of its effects shows that the effect is missed."""
+    if less.own is None or not significant(less.own, len(search.names)):
+        return False
+    return material(less.fit, fit, nothing, less.own.t >= CLEAR)
+
+
 def re_examined(
     search: Search, nothing: Fit, poorer: Fit, richer: Fit, progress: Callable[[str], None]
 ) -> tuple[Fit, dict[str, LeftOut]]:
@@ -228,8 +243,7 @@ def re_examined(
     for name in fit.hypothesis.present[:-1]:
         progress(f"looking at {name} again")
         less = leave_out(search, fit, name)
-        needed = less.own is not None and significant(less.own, len(search.names))
-        if not needed or not material(less.fit, fit, nothing, less.own.t >= CLEAR):
+        if not needed(search, less, fit, nothing):
             if fit is richer and np.log(poorer.errors / less.fit.errors).sum() < 0:
                 return poorer, {}
             fit, seen = less.fit, {}
