@@ -23,7 +23,7 @@ from cfb_mjx.sysid.tracing.lines import Line, find_lines
 from cfb_mjx.sysid.tracing.residuals import residual_rows
 from cfb_mjx.sysid.tracing.search import Hypothesis, Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
-from cfb_mjx.sysid.tracing.trace import Found, Trace, trace
+from cfb_mjx.sysid.tracing.trace import Found, Trace, numbers_of, trace
 
 SURE = 3.0
 """A formula counts when its statistic on held-out flights is above this."""
@@ -174,7 +174,7 @@ def close_loop(
     judge, wide = found.search.beside(held_out, check), search.beside(held_out, check)
     if proposal is not None and not _borne_out(wide, proposal):
         proposal, search, wide = None, found.search, judge
-    hypothesis, reported, unconfirmed = _judged(judge, found, proposal)
+    hypothesis, reported, unconfirmed = _judged(search, judge, found, proposal)
     unexplained = _unexplained(search, wide, proposal, proposal.hypothesis if proposal else found.hypothesis)
     faults = replace(found.sensors.faults, motor_shift=hypothesis.shift)
     after = evaluate(hypothesis.model(parameters), held_out, faults=faults)
@@ -188,7 +188,7 @@ def _borne_out(wide: Search, proposal: Proposal) -> bool:
 
 
 def _judged(
-    judge: Search, found: Trace, proposal: Proposal | None
+    search: Search, judge: Search, found: Trace, proposal: Proposal | None
 ) -> tuple[Hypothesis, list[Reported], list[Reported]]:
     """What held-out flights leave of the hypothesis; what they confirm, sensor faults first; what they do not."""
     hypothesis = proposal.hypothesis if proposal else found.hypothesis
@@ -205,6 +205,12 @@ def _judged(
             hypothesis = hypothesis.without(item.name)
         else:
             reported.append(entry)
+    if unconfirmed and reported:
+        # What stays was fitted beside what goes.
+        hypothesis, linear = search.refine(hypothesis)
+        for entry in reported:
+            if entry.found is not None:
+                entry.parameters, entry.uncertainty = numbers_of(search, hypothesis, linear, entry.name)
     return hypothesis, reported, unconfirmed
 
 

@@ -292,10 +292,11 @@ def deviations(search: Search, hypothesis: Hypothesis, linear: Linear) -> dict[C
     return dict(zip(columns, deviation[1:].tolist(), strict=True))
 
 
-def _summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
-    hypothesis = fit.hypothesis
-    parameters, uncertainty = {}, {}
-    for column, std in deviations(search, hypothesis, fit.linear).items():
+def numbers_of(search: Search, hypothesis: Hypothesis, linear: Linear, name: str) -> tuple[dict, dict]:
+    """Values and standard deviations of one effect, by field."""
+    parameters: dict[str, float | list[float]] = {}
+    uncertainty: dict[str, float | list[float]] = {}
+    for column, std in deviations(search, hypothesis, linear).items():
         if column.effect != name:
             continue
         value = np.asarray(hypothesis.shift if name == SHIFT else getattr(hypothesis.effect(name), column.field))
@@ -304,6 +305,11 @@ def _summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
         else:
             parameters[column.field] = value.tolist()
             uncertainty.setdefault(column.field, []).append(std)
+    return parameters, uncertainty
+
+
+def _summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
+    parameters, uncertainty = numbers_of(search, fit.hypothesis, fit.linear, name)
     gain, p_value = (less.own.gain, less.own.p_value) if less.own else (0.0, 1.0)
     rivals = [v[0].effect for e, v in less.ranking if v[0].effect != name and e.gain > (1 - CLOSE) * gain]
     buys = float(np.max(1 - fit.errors / less.fit.errors))
