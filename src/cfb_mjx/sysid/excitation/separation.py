@@ -153,9 +153,9 @@ def _unexplained(
             continue
         # In its place, and beside nothing: what the other effect explains of this flight.
         best: Hypothesis = nothing
-        tried = [search.adding(nothing, linear, v) for v in search.candidates() if v[0].effect == name]
-        variants = [v for v in search.candidates() if v[0].effect == name]
-        sensible = [(e, v) for e, v in zip(tried, variants, strict=True) if e is not None]
+        tried = [(search.adding(nothing, linear, v), v) for v in search.candidates() if v[0].effect == name]
+        # None where the sign the flight asks for makes no sense: then the effect explains nothing of it.
+        sensible = [(e, v) for e, v in tried if e is not None]
         if sensible:
             e, variant = max(sensible, key=lambda pair: pair[0].gain)
             best, _ = search.refine(search.with_candidate(nothing, variant, e))

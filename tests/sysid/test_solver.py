@@ -1,0 +1,47 @@
+"""The least-squares solver against SciPy's, on a problem with a curved valley, a bad start and a scale of its own."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares as scipys
+
+from cfb_mjx.sysid.identification.solver import RIDGE, least_squares
+
+TIME = np.linspace(0.0, 2.0, 200)
+DATA = 3.0 * np.exp(-2.0 * TIME) + 0.5 + 0.01 * np.random.default_rng(0).normal(size=TIME.shape)
+
+
+def decay(x):
+    return [(x[0] * jnp.exp(-jnp.exp(x[1]) * TIME) + x[2] - DATA) / 0.01]
+
+
+def valley(x):
+    """Rosenbrock's."""
+    return {"curve": 1e3 * (x[1:] - x[:1] ** 2), "slope": 1e2 * (1 - x[:1])}
+
+
+@pytest.mark.parametrize(
+    ("residual", "start"), [(decay, [1.0, 0.0, 0.0]), (decay, [-2.0, 2.5, 4.0]), (valley, [-1.2, 1.0])]
+)
+def test_it_finds_what_scipy_finds(residual, start):
+    found = jax.jit(lambda x: least_squares(residual, x))(jnp.asarray(start, float))
+
+    def whole(x):
+        parts = jax.tree.leaves(residual(jnp.asarray(x)))
+        return np.concatenate([*map(np.asarray, parts), RIDGE * x])
+
+    theirs = scipys(whole, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    spread = np.sqrt(np.diag(np.linalg.inv(theirs.jac.T @ theirs.jac)))
+    assert np.abs((np.asarray(found) - theirs.x) / spread).max() < 2e-3
+
+
+def test_a_start_without_a_cost_is_left_alone():
+    start = jnp.asarray([jnp.nan, 1.0])
+    assert np.isnan(np.asarray(least_squares(valley, start))[0])
+    assert np.asarray(least_squares(valley, start))[1] == 1.0
+
+
+def test_a_direction_nobody_sees_stays_where_it_was():
+    found = least_squares(lambda x: 100.0 * (x[:1] - 2.0), jnp.zeros(2))
+    assert np.asarray(found) == pytest.approx([2.0, 0.0], abs=1e-4)
