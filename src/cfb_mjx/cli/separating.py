@@ -44,14 +44,11 @@ def run_separate(
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid.excitation.conditions import Conditions
     from cfb_mjx.sysid.excitation.paths import PATHS
-    from cfb_mjx.sysid.excitation.separation import assumed, separate
+    from cfb_mjx.sysid.excitation.separation import separate
 
     described = changed_model(model, changes)
-    drone = Quadrotor.from_file(described)
-    for name in names:
-        assumed(name, drone.effects)  # refuses unknown names before the work
     conditions = Conditions(measured_rotors=measured_rotors, disturbance=disturbance)
-    told = separate(drone, names, conditions, progress=Progress("flying"))
+    told = separate(Quadrotor.from_file(described), names, conditions, progress=Progress("flying"))
     print(f"what one flight of each path tells about {' against '.join(names)}, in nats (10 settle it):\n")
     for one in told:
         flights = f"{one.flights} flight{'s' * (one.flights != 1)}" if one.flights else "does not tell them"

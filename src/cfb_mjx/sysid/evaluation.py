@@ -12,8 +12,9 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog, require_own_names
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.sysid import metrics
+from cfb_mjx.sysid.disturbance import observed_model
 from cfb_mjx.sysid.flight import delay_of
-from cfb_mjx.sysid.observer import Observer, at_starts, observe, observed_model
+from cfb_mjx.sysid.observer import Observer, at_starts, observe
 from cfb_mjx.sysid.prediction import hold, predict, select, start_of_windows
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 from cfb_mjx.sysid.windows import Windows, find_windows
@@ -59,6 +60,11 @@ class Evaluation:
         parts = [log.errors[variant] for log in self.logs if log.errors[variant] is not None]
         return metrics.intervals(parts, self.horizons) if parts else None
 
+    @property
+    def each(self) -> tuple[Evaluation, ...]:
+        """The same of every log alone."""
+        return tuple(replace(self, logs=(log,)) for log in self.logs)
+
     def to_json(self) -> dict:
         """The structure of ``cfb evaluate --json`` (DESIGN 6), plus ``intervals``."""
 
@@ -70,7 +76,7 @@ class Evaluation:
         return block(self) | {
             "rotor_speed_in_windows": int(sum(log.measured.sum() for log in self.logs)),
             "intervals": {variant: self.intervals(variant) for variant in self.variants},
-            "logs": {log.log.name: block(replace(self, logs=(log,))) for log in self.logs},
+            "logs": {one.logs[0].log.name: block(one) for one in self.each},
         }
 
 

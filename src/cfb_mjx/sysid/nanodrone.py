@@ -23,9 +23,10 @@ from cfb_mjx.logs.rotation import exponential, multiply
 from cfb_mjx.model.quadrotor import Quadrotor, integrate_measured, prepare
 from cfb_mjx.model.state import State, stack, unstack
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.sysid.disturbance import observed_model
 from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.metrics import geodesic_deg
-from cfb_mjx.sysid.observer import Observer, causal_rotor_speed, observe, observed_model
+from cfb_mjx.sysid.observer import Observer, causal_rotor_speed, observe
 from cfb_mjx.sysid.replay import remembered
 
 STEPS = 50

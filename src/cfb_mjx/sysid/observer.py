@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -26,10 +25,8 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import Condition, Effect, Memory, Motors, Wrench
+from cfb_mjx.model.effects import Memory
 from cfb_mjx.model.quadrotor import Quadrotor
-from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import MEASURED_SHARE, Flight, delay_of, prepare_flight
 from cfb_mjx.sysid.replay import Replay, replay
 from cfb_mjx.sysid.windows import Windows
@@ -40,7 +37,6 @@ stay where they were."""
 
 AGREES = 0.05
 """For so long, s, what a model misses of its own angular acceleration stays about the same: the motors' lag."""
-STANDARD_GRAVITY = 9.81
 
 
 class Observer(eqx.Module):
@@ -101,56 +97,8 @@ class Observed(eqx.Module):
     """Error of the steady rotor speed, rad/s; zero where rotor speed was not measured."""
 
     def memory(self, rotors: bool) -> Memory:
-        """Of a `Disturbance`, with or without ``rotors``' offsets."""
+        """Of a `disturbance.Disturbance`, with or without ``rotors``' offsets."""
         return self.torque, self.trim, self.force, self.rotor_offset * rotors
-
-
-class Disturbance(Effect):
-    """Adds what an `Observer` found to a model: no physical effect, so it is not in the catalogue.
-
-    Remembered are the quick and the slow angular acceleration, the specific force and the error of the steady rotor
-    speeds (`Observed.memory`); each fades with its own correlation time.
-    """
-
-    name: ClassVar[str] = "observed_disturbance"
-    units: ClassVar[dict[str, str]] = {"times": "s"}
-    source: ClassVar[str] = "estimated from the flight itself (cfb_mjx.sysid.observer)"
-    prior: ClassVar[dict[str, tuple[float, float]]] = {}
-    strengths: ClassVar[tuple[str, ...]] = ()
-
-    times: tuple[Array, Array, Array, Array]
-
-    @classmethod
-    def of(cls, observer: Observer) -> Disturbance:
-        """With the correlation times of ``observer``."""
-        o = observer
-        times = o.torque_time, o.trim_time, o.force_time, o.rotor_offset_time
-        return cls(tuple(jnp.asarray(t, jnp.result_type(float)) for t in times))
-
-    def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
-        zero = jnp.zeros_like(rotor_speed[0])
-        return (*(Vec(zero, zero, zero) for _ in range(3)), Vec(zero, zero, zero, zero))
-
-    def motors(
-        self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
-    ) -> tuple[Motors, Memory]:
-        return Motors(motors.target + memory[3], motors.time_constant), memory
-
-    def body(self, wrench: Wrench, condition: Condition) -> Wrench:
-        torque, trim, force, _ = condition.memory
-        drone = condition.parameters
-        push = force * drone.mass
-        turn = drone.inertia.map(lambda inertia, a: inertia * a, torque + trim)
-        # The force was seen at the rotors' centre but must not turn the drone: the gyro has told what does.
-        return Wrench(wrench.force + push, wrench.torque + turn + drone.center_of_gravity.cross(push))
-
-    def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
-        return tuple(m * jnp.exp(-dt / time) for m, time in zip(condition.memory, self.times, strict=True))
-
-
-def observed_model(model: Quadrotor, observer: Observer) -> Quadrotor:
-    """The model with a `Disturbance` as its last effect."""
-    return eqx.tree_at(lambda m: m.effects, model, (*model.effects, Disturbance.of(observer)))
 
 
 def observe(model: Quadrotor, log: FlightLog, delay: float, observer: Observer, use_measured: bool = True) -> Observed:
@@ -257,14 +205,14 @@ def replayed(model: Quadrotor, flight: Flight, driven: Array) -> Replay:
 @eqx.filter_jit
 def _observe(model: Quadrotor, flight: Flight, driven: Array, observer: Observer):
     said = replay(model, flight, driven, jnp.zeros(()))
-    body, body_errors = _body(flight, said, observer)
+    body, body_errors = _body(model, flight, said, observer)
     motors, motor_errors = _motors(model, flight, driven, said, observer)
     return Observed(*body, *motors), (*body_errors, *motor_errors)
 
 
 def _surprise(model: Quadrotor, flight: Flight, driven: Array, said: Replay, observer: Observer) -> Array:
     """Negative log-likelihood of all innovations, without the constant."""
-    _, errors = _body(flight, said, observer)
+    _, errors = _body(model, flight, said, observer)
     _, motor_errors = _motors(model, flight, driven, said, observer)
 
     def of(error, variance, counts):
@@ -280,7 +228,7 @@ def _before(x: Array) -> Array:
     return jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
 
 
-def _body(flight: Flight, said: Replay, o: Observer):
+def _body(model: Quadrotor, flight: Flight, said: Replay, o: Observer):
     """Rate, angular acceleration, its unmodelled parts and the unmodelled force; innovations and variances."""
 
     def axis(rate, model_rate, torque, trim):
@@ -311,12 +259,13 @@ def _body(flight: Flight, said: Replay, o: Observer):
         dt, model_force, measured, fresh = inputs
         keep = jnp.exp(-dt / o.force_time)
         d, p = keep * d, keep**2 * p + o.force**2 * (1 - keep**2)
-        beyond = model_force - jnp.array([0.0, 0.0, STANDARD_GRAVITY])
+        beyond = model_force - hover
         missed = o.force_share**2 * (beyond @ beyond)
         variance, error = p + o.accelerometer**2 + missed, measured - model_force - d
         gain = jnp.where(fresh > 0, 0.0, p / variance)
         return (d + gain * error, (1 - gain) * p), (d + gain * error, error, jnp.broadcast_to(variance, (3,)))
 
+    hover = model.parameters.gravity * jnp.array([0.0, 0.0, 1.0])
     interval, alpha, force = _before(flight.interval), _before(said.angular_acceleration), _before(said.specific_force)
     levels = flight.body_rate, alpha, o.torque, o.trim
     state, total, error, variance = jax.vmap(axis, in_axes=(1, 1, 0, 0), out_axes=1)(*levels)

@@ -23,7 +23,7 @@ from cfb_mjx.sysid.excitation.conditions import Conditions
 from cfb_mjx.sysid.excitation.experiment import TICK, Experiment, follow
 from cfb_mjx.sysid.excitation.paths import PATHS, path
 from cfb_mjx.sysid.tracing.confirmation import confirm
-from cfb_mjx.sysid.tracing.search import Hypothesis, Search
+from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 
 TYPICAL = 0.2
@@ -140,25 +140,18 @@ def _unexplained(
     delay = float(model.parameters.observation_delay)
     search = Search.start([log], model.parameters, delay, check_sensors([log], delay), others)
     nothing = search.learned(search.nothing())
-    right = replace(
-        nothing,
-        effects=tuple(effect if type(e).name == true else e for e in nothing.effects),
-        present=(true,),
-    )
+    right = nothing.having(effect)
     right, _ = search.refine(search.learned(right))
     nothing, linear = search.refine(nothing)
+    probes = search.probes(nothing, linear)
     found = {}
     for name in names:
         if name == true:
             continue
-        # In its place, and beside nothing: what the other effect explains of this flight.
-        best: Hypothesis = nothing
-        tried = [(search.adding(nothing, linear, v), v) for v in search.candidates() if v[0].effect == name]
-        # None where the sign the flight asks for makes no sense: then the effect explains nothing of it.
-        sensible = [(e, v) for e, v in tried if e is not None]
-        if sensible:
-            e, variant = max(sensible, key=lambda pair: pair[0].gain)
-            best, _ = search.refine(search.with_candidate(nothing, variant, e))
-        best = replace(best, levels=right.levels)
-        found[name] = confirm(search, best, right).gain
+        best = nothing
+        # An effect without a probe, its sign making no sense, explains nothing of this flight.
+        if name in probes:
+            evidence, variant = probes[name]
+            best, _ = search.refine(search.with_candidate(nothing, variant, evidence))
+        found[name] = confirm(search, replace(best, levels=right.levels), right).gain
     return found

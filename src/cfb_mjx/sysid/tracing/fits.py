@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -54,5 +54,5 @@ def fitted(search: Search, hypothesis: Hypothesis) -> Fit:
     """Fit everything a hypothesis holds."""
     hypothesis, linear = search.refine(hypothesis)
     evaluation = predicted(search, hypothesis)
-    flights = [replace(evaluation, logs=(log,)) for log in evaluation.logs if len(log.windows)]
-    return Fit(hypothesis, linear, errors_of(evaluation), np.array([errors_of(flight) for flight in flights]))
+    flights = [errors_of(one) for one in evaluation.each if len(one.logs[0].windows)]
+    return Fit(hypothesis, linear, errors_of(evaluation), np.array(flights))

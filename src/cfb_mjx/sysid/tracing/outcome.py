@@ -219,9 +219,7 @@ def _unexplained(search: Search, wide: Search, proposal: Proposal | None, hypoth
     lines = find_lines(residual_rows(search, hypothesis))
     if len(wide.logs) >= ENOUGH:
         again = find_lines(residual_rows(wide, hypothesis))
-        lines = [
-            a for a in lines if any(a.axis == b.axis and abs(a.frequency - b.frequency) < SAME_LINE for b in again)
-        ]
+        lines = [a for a in lines if any(_same(a, b) for b in again)]
     return Unexplained(proposal, lines) if proposal or lines else None
 
 
@@ -230,7 +228,7 @@ def _same(a: Line, b: Line) -> bool:
 
 
 def _per_log(evaluation: Evaluation) -> list[dict[str, float] | None]:
-    return [Evaluation((log,), evaluation.horizons).metrics("commands_in") for log in evaluation.logs]
+    return [one.metrics("commands_in") for one in evaluation.each]
 
 
 def _change(judge: Search, poorer: Hypothesis, richer: Hypothesis) -> float:

@@ -72,6 +72,12 @@ class Hypothesis:
         """What is wrong with the recording beyond what the sensors say of each other."""
         return SensorFaults(motor_shift=self.shift)
 
+    def having(self, effect: Effect) -> Hypothesis:
+        """The same with an effect that was absent."""
+        name = type(effect).name
+        effects = tuple(effect if type(e).name == name else e for e in self.effects)
+        return replace(self, effects=effects, present=(*self.present, name))
+
     def without(self, name: str) -> Hypothesis:
         """The same with one effect back at neutral."""
         pairs = zip(self.effects, self.origin, strict=True)
@@ -280,6 +286,18 @@ class Search:
         low = CATALOGUE[variant[0].effect].prior[variant[0].field][0]
         return None if low >= 0 and np.any(found.values < 0) else found
 
+    def probes(self, hypothesis: Hypothesis, linear: Linear) -> dict[str, tuple[Evidence, list[Column]]]:
+        """Every absent effect whose sign makes sense, at the probe that gains most."""
+        best: dict[str, tuple[Evidence, list[Column]]] = {}
+        for variant in self.candidates():
+            name = variant[0].effect
+            if name in hypothesis.present:
+                continue
+            found = self.adding(hypothesis, linear, variant)
+            if found is not None and (name not in best or found.gain > best[name][0].gain):
+                best[name] = (found, variant)
+        return best
+
     def with_candidate(self, hypothesis: Hypothesis, variant: list[Column], found: Evidence) -> Hypothesis:
         """The hypothesis with a candidate at the values the linear fit gives it."""
         name = variant[0].effect
@@ -289,8 +307,7 @@ class Search:
         effect = hypothesis.effect(name)
         for column, value in zip(variant, found.values, strict=True):
             effect = cols.moved(effect, column, float(value) * column.scale, False)
-        effects = tuple(effect if type(e).name == name else e for e in hypothesis.effects)
-        return replace(hypothesis, effects=effects, present=(*hypothesis.present, name))
+        return hypothesis.having(effect)
 
 
 def _joined(parts):

@@ -132,25 +132,15 @@ def trace(
         clear = next(e for e, v in passing if v[0].effect == name).t >= CLEAR
         refused |= stretched
         tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))}
-        kept, seen = fit, {}
-        if worth_it(name, fit, richer, nothing, clear):
-            # Taken out again, for the newcomer's turn has also fitted the others anew, and that is not its merit.
-            less = leave_out(search, richer, name)
-            if needed(search, less, richer, nothing):
-                kept, seen = re_examined(search, nothing, less.fit, richer, progress)
-                fit = less.fit
-                if kept is richer:
-                    seen[name] = less
-            else:
-                kept = fit = less.fit
-        if kept is fit:
+        fit, seen = taken_in(search, nothing, fit, name, richer, clear, progress)
+        if seen is None:
             refused.add(name)
             vain += 1
         else:
             vain = 0
             # What was too slight beside a large error may matter now.
             refused = set()
-            fit, left_out = kept, seen
+            left_out = seen
         checkpoint.save(fit.hypothesis, refused, tried)
     if len(fit.hypothesis.present) > 1:
         single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
@@ -165,15 +155,8 @@ def trace(
 
 def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, list[Column]]]:
     """Every absent effect at its best probe, the largest gain first."""
-    best: dict[str, tuple[Evidence, list[Column]]] = {}
-    for variant in search.candidates():
-        name = variant[0].effect
-        if name in fit.hypothesis.present or name in refused:
-            continue
-        found = search.adding(fit.hypothesis, fit.linear, variant)
-        if found is not None and (name not in best or found.gain > best[name][0].gain):
-            best[name] = (found, variant)
-    return sorted(best.values(), key=lambda pair: -pair[0].gain)
+    best = search.probes(fit.hypothesis, fit.linear)
+    return sorted((pair for name, pair in best.items() if name not in refused), key=lambda pair: -pair[0].gain)
 
 
 def best_fit(
@@ -220,6 +203,41 @@ def needed(search: Search, less: LeftOut, fit: Fit, nothing: Fit) -> bool:
     if less.own is None or not significant(less.own, len(search.names)):
         return False
     return material(less.fit, fit, nothing, less.own.t >= CLEAR)
+
+
+def taken_in(
+    search: Search,
+    nothing: Fit,
+    fit: Fit,
+    name: str,
+    richer: Fit,
+    clear: bool,
+    progress: Callable[[str], None],
+) -> tuple[Fit, dict[str, LeftOut] | None]:
+    """Take an effect in if it is worth it, and look at the others again.
+
+    Args:
+        search: over the fit flights.
+        nothing: the declared model.
+        fit: without the effect.
+        name: the effect.
+        richer: with it.
+        clear: whether its statistic is above `CLEAR`.
+        progress: told what happens.
+
+    Returns:
+        The fit, and what is left of it without each effect looked at; None for that where the effect does not stay.
+    """
+    if not worth_it(name, fit, richer, nothing, clear):
+        return fit, None
+    # Taken out again, for the newcomer's turn has also fitted the others anew, and that is not its merit.
+    less = leave_out(search, richer, name)
+    if not needed(search, less, richer, nothing):
+        return less.fit, None
+    kept, seen = re_examined(search, nothing, less.fit, richer, progress)
+    if kept is less.fit:
+        return kept, None
+    return kept, seen | {name: less} if kept is richer else seen
 
 
 def re_examined(
@@ -269,7 +287,7 @@ def simplified(
         ranking: of the first round.
         progress: told what happens.
     """
-    candidates = {variant[0].effect: (found, variant) for found, variant in rank(search, nothing, set())}
+    candidates = search.probes(nothing.hypothesis, nothing.linear)
     rivals = [item["name"] for item in ranking if item["name"] not in fit.hypothesis.present][:RIVALS]
     for name in rivals:
         if name not in KNOWN or name not in candidates:

@@ -1,0 +1,63 @@
+"""What an `Observer` found, as part of a model: it pushes, turns and fades."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from cfb_mjx.model.effects import Condition, Effect, Memory, Motors, Wrench
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters import Parameters
+from cfb_mjx.sysid.observer import Observer
+
+
+class Disturbance(Effect):
+    """Adds what an `Observer` found to a model: no physical effect, so it is not in the catalogue.
+
+    Remembered are the quick and the slow angular acceleration, the specific force and the error of the steady rotor
+    speeds (`Observed.memory`); each fades with its own correlation time.
+    """
+
+    name: ClassVar[str] = "observed_disturbance"
+    units: ClassVar[dict[str, str]] = {"times": "s"}
+    source: ClassVar[str] = "estimated from the flight itself (cfb_mjx.sysid.observer)"
+    prior: ClassVar[dict[str, tuple[float, float]]] = {}
+    strengths: ClassVar[tuple[str, ...]] = ()
+
+    times: tuple[Array, Array, Array, Array]
+
+    @classmethod
+    def of(cls, observer: Observer) -> Disturbance:
+        """With the correlation times of ``observer``."""
+        o = observer
+        times = o.torque_time, o.trim_time, o.force_time, o.rotor_offset_time
+        return cls(tuple(jnp.asarray(t, jnp.result_type(float)) for t in times))
+
+    def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
+        zero = jnp.zeros_like(rotor_speed[0])
+        return (*(Vec(zero, zero, zero) for _ in range(3)), Vec(zero, zero, zero, zero))
+
+    def motors(
+        self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
+    ) -> tuple[Motors, Memory]:
+        return Motors(motors.target + memory[3], motors.time_constant), memory
+
+    def body(self, wrench: Wrench, condition: Condition) -> Wrench:
+        torque, trim, force, _ = condition.memory
+        drone = condition.parameters
+        push = force * drone.mass
+        turn = drone.inertia.map(lambda inertia, a: inertia * a, torque + trim)
+        # The force was seen at the rotors' centre but must not turn the drone: the gyro has told what does.
+        return Wrench(wrench.force + push, wrench.torque + turn + drone.center_of_gravity.cross(push))
+
+    def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
+        return tuple(m * jnp.exp(-dt / time) for m, time in zip(condition.memory, self.times, strict=True))
+
+
+def observed_model(model: Quadrotor, observer: Observer) -> Quadrotor:
+    """The model with a `Disturbance` as its last effect."""
+    return eqx.tree_at(lambda m: m.effects, model, (*model.effects, Disturbance.of(observer)))
