@@ -19,6 +19,7 @@ from cfb_mjx.model.effects import (
     BladeFlapping,
     CogOffset,
     CommandDelay,
+    Condition,
     EscRateLimit,
     GroundEffect,
     Gyroscopic,
@@ -356,7 +357,7 @@ def _reading(voltage, time):
 
 
 def test_battery_voltage_is_filtered_and_scales_the_target(guards):
-    effect = BatterySag(level=0.02, slope=0.8)
+    effect = BatterySag(level=0.02, slope=0.8, lag=0.3)
     memory = effect.start(Vec(*jnp.full(4, 1594.0)), guards)
     target = np.array([2000.0, 1500.0, 1000.0, 500.0])
 
@@ -366,7 +367,7 @@ def test_battery_voltage_is_filtered_and_scales_the_target(guards):
     np.testing.assert_allclose(factor(), 1.02, rtol=1e-12)
     memory = effect.sense(memory, _reading(np.nan, 0.0))
     np.testing.assert_allclose(factor(), 1.02, rtol=1e-12)
-    # The first reading counts in full, later ones through a lag of 0.3 s whatever their spacing.
+    # The first reading counts in full, later ones through the lag whatever their spacing.
     memory = effect.sense(memory, _reading(4.1, 0.5))
     np.testing.assert_allclose(factor(), 1.02 + 0.8 * 0.4 / 3.7, rtol=1e-12)
     for time, voltage in ((0.6, 3.8), (0.65, np.nan), (0.8, 3.8), (0.9, 3.8)):
@@ -435,3 +436,48 @@ def test_slung_load_keeps_momentum_but_for_the_air(swung):
     np.testing.assert_allclose(swung.velocity[:, 2], fall, rtol=2e-3)
     # The string hangs from the rotors' centre: no torque about it.
     np.testing.assert_allclose(swung.body_rate, 0, atol=1e-12)
+
+
+@ONE_WORKER
+@pytest.mark.parametrize("mass", [0.004, 0.0])
+def test_load_followed_beside_a_log_is_found_by_what_the_model_misses(guards, mass):
+    """The pull shows where the string points; a load of no weight shows nothing and is left to swing."""
+    effect = PayloadSwing(mass=mass, length=0.16, damping_ratio=0.01)
+    own, up, still = float(guards.mass), Vec(0.0, 0.0, 9.81), jnp.zeros(1)
+    zero = Vec(still[0], still[0], still[0])
+
+    def condition(memory):
+        level = Vec(1.0, 0.0, 0.0, 0.0)
+        return Condition(zero, zero, zero, level, zero, Vec(*jnp.zeros(4)), guards, memory)
+
+    def pulled(memory):
+        along, turning = memory
+        return along * (mass / own * (0.16 * turning.dot(turning) - along.dot(up)))
+
+    def row(memories, _):
+        there, here, alone = memories
+        missed = pulled(there) - pulled(here)
+        after = effect.advance(condition(there), zero, 0.004)
+        followed = effect.follow(condition(here), zero, missed, 0.004)
+        moved = after, followed, effect.advance(condition(alone), zero, 0.004)
+        return moved, jnp.stack([(a[0] - b[0]).stack() for a, b in ((after, followed), (after, moved[2]))])
+
+    def hanging(angle):
+        return Vec(jnp.sin(angle), still[0], -jnp.cos(angle)), zero
+
+    start = hanging(0.6), hanging(0.0), hanging(0.0)
+    _, off = jax.lax.scan(row, start, length=500)
+    left = np.linalg.norm(np.asarray(off), axis=-1)[-100:].max(axis=0)
+    assert left[1] > 0.4
+    np.testing.assert_allclose(left[0], 0.0 if mass else left[1], atol=0.01)
+
+
+@ONE_WORKER
+def test_load_hangs_below_what_the_drone_feels_after_a_gap(guards):
+    effect = PayloadSwing(mass=0.004, length=0.16)
+    zero = Vec(*jnp.zeros(3))
+    memory = Vec(*jnp.array([0.6, 0.0, -0.8])), Vec(*jnp.array([0.0, 3.0, 0.0]))
+    at = Condition(zero, zero, zero, Vec(1.0, 0.0, 0.0, 0.0), zero, Vec(*jnp.zeros(4)), guards, memory)
+    along, turning = effect.follow(at, Vec(3.0, 0.0, 0.0), zero, 0.4)
+    np.testing.assert_allclose(along.stack(), np.array([-3.0, 0.0, -9.81]) / np.hypot(3.0, 9.81), atol=1e-6)
+    np.testing.assert_allclose(turning.stack(), 0.0, atol=1e-12)

@@ -232,6 +232,12 @@ def advanced(prepared: Prepared, at: tuple[Condition, ...], acceleration: Vec) -
     return tuple(effect.advance(condition, acceleration, prepared.dt) for effect, condition in pairs)
 
 
+def followed(prepared: Prepared, at: tuple[Condition, ...], acceleration: Vec, missed: Vec) -> tuple:
+    """`advanced` beside a log: measured acceleration, and how much of it the model misses (world, m/s^2)."""
+    pairs = zip(prepared.model.effects, at, strict=True)
+    return tuple(effect.follow(condition, acceleration, missed, prepared.dt) for effect, condition in pairs)
+
+
 def loaded(model: Quadrotor, parameters: Parameters, loads: rotors.RotorLoads, conditions: tuple) -> Wrench:
     """Wrench of the rotors and of every effect about the rotors' centre, body axes."""
     pairs = list(zip(model.effects, conditions, strict=True))

@@ -19,7 +19,8 @@ WARM_UP = 0.3
 """After the start and after every gap rotor speeds are not known from commands for so long, s: six motor lags."""
 MEASURED_SHARE = 0.98
 """Rotor speeds are used where every motor has at least this share of valid readings."""
-_VOLTAGE_SMOOTHING = 0.25
+_VOLTAGE_SMOOTHING = 0.02
+"""Time constant, s. Short: a longer one, where the rotors feel the dips under load, makes `battery_sag` look weaker."""
 
 
 class Flight(eqx.Module):

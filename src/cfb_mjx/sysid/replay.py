@@ -17,11 +17,11 @@ from cfb_mjx.model import rotors
 from cfb_mjx.model.effects import Reading
 from cfb_mjx.model.quadrotor import (
     Quadrotor,
-    advanced,
     at_rotor_center,
     begin,
     commanded_path,
     conditions,
+    followed,
     loaded,
     prepare,
     remembering,
@@ -94,11 +94,12 @@ def _scan(model: Quadrotor, flight: Flight, driven, lead):
         Vec.unstack(next_row(driven)),
         flight.voltage,
         flight.time,
+        Vec.unstack(between(flight.specific_force)),
     )
 
     def row(carry, inputs):
         speed, memory = carry
-        at, command, dt, here, there, voltage, time = inputs
+        at, command, dt, here, there, voltage, time, felt = inputs
         reading = Reading(voltage, time)
         memory = tuple(effect.sense(m, reading) for effect, m in zip(model.effects, memory, strict=True))
         prepared = prepare(model, dt)
@@ -113,7 +114,9 @@ def _scan(model: Quadrotor, flight: Flight, driven, lead):
         wrench = loaded(model, prepared.parameters, rotors.loads_at(prepared.rotors, body_speed, rate), seen)
         angular, force = at_rotor_center(prepared.parameters, wrench, where.body_rate)
         up = Vec(0.0, 0.0, prepared.parameters.gravity)
-        moved = advanced(prepared, seen, rotate(where.quaternion, force) - up)
+        # What remembers accelerations (a slung load) followed the drone, not the model of it.
+        missed = rotate(where.quaternion, felt - force)
+        moved = followed(prepared, seen, rotate(where.quaternion, felt) - up, missed)
         return (path.end, moved), (
             Replay(speed.stack(), angular.stack(), force.stack()),
             jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec)),

@@ -112,6 +112,13 @@ class Effect(eqx.Module):
         """Memory after ``dt`` seconds that began in ``condition`` with this acceleration (world, m/s^2)."""
         return condition.memory
 
+    def follow(self, condition: Condition, acceleration: Vec, missed: Vec, dt: Any) -> Memory:
+        """`advance` beside a log, where ``acceleration`` was measured.
+
+        ``missed`` is how much of it the model does not say: it tells how far off the memory is.
+        """
+        return self.advance(condition, acceleration, dt)
+
 
 def overrides(effect: Effect, hook: str) -> bool:
     """Whether the effect does anything in one of the functions above."""

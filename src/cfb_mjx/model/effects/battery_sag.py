@@ -2,9 +2,10 @@
 
     steady rotor speed *= 1 + level + slope (V - 3.7 V) / 3.7 V
 
-Slope 1 is a motor whose speed is proportional to the voltage, 0 one whose controller makes up for it. Remembered are
-the voltage, 3.7 V until a log says otherwise, and when it was last read: readings pass a first-order filter of 0.3 s,
-the first one is taken as it is, unknown ones are passed over. Between readings the voltage stays.
+Slope 1 is a motor whose speed is proportional to the voltage, 0 one whose controller makes up for it. V is what was
+read, through a first-order filter of time constant ``lag``: with a short one the rotors feel every dip under load, with
+a long one they answer to how empty the battery is. Remembered are V, 3.7 V until a log says otherwise, and when it was
+last read: the first reading is taken as it is, unknown ones are passed over. Between readings V stays.
 """
 
 from __future__ import annotations
@@ -22,8 +23,6 @@ from cfb_mjx.parameters.parameters import Parameters
 
 NOMINAL_VOLTAGE = 3.7
 """Of one lithium-polymer cell, V."""
-SMOOTHING = 0.3
-"""Time constant of the filter on measured voltages, s."""
 _LONG_AGO = 1000.0  # s
 
 
@@ -31,18 +30,21 @@ class BatterySag(Effect):
     """Steady rotor speed *= 1 + level + slope (V - 3.7) / 3.7."""
 
     name: ClassVar[str] = "battery_sag"
-    units: ClassVar[dict[str, str]] = {"level": "1", "slope": "1"}
+    units: ClassVar[dict[str, str]] = {"level": "1", "slope": "1", "lag": "s"}
     source: ClassVar[str] = (
         "Q. Quan, Introduction to Multicopter Design and Control, 2017, ch. 4 (motor and ESC model: speed against "
         "voltage)"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"level": (-0.1, 0.1), "slope": (0.0, 1.2)}
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"level": (-0.1, 0.1), "slope": (0.0, 1.2), "lag": (0.002, 5.0)}
     strengths: ClassVar[tuple[str, ...]] = ("level", "slope")
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({"lag": 0.02}, {"lag": 0.5})
 
     level: Float[Array, "*batch"] = eqx.field(converter=number)
     """Relative change at 3.7 V."""
     slope: Float[Array, "*batch"] = eqx.field(converter=number)
     """Relative change of speed per relative change of voltage."""
+    lag: Float[Array, "*batch"] = eqx.field(converter=number, default=0.02)
+    """Of what the rotors feel behind what was read, s."""
 
     @classmethod
     def neutral(cls) -> BatterySag:
@@ -58,7 +60,7 @@ class BatterySag(Effect):
         known = jnp.isfinite(reading.voltage)
         # Not multiplied by the unknown: NaN would come through any weight, and through the derivative.
         measured = jnp.where(known, reading.voltage, voltage).astype(voltage.dtype)
-        kept = jnp.exp(-jnp.maximum(now - time, 0.0) / SMOOTHING)
+        kept = jnp.exp(-jnp.maximum(now - time, 0.0) / self.lag)
         return Vec(measured + (voltage - measured) * kept), Vec(jnp.where(known, now, time))
 
     def motors(

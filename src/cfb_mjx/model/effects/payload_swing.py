@@ -6,7 +6,8 @@
 n is the unit vector from the drone to the load, a the drone's acceleration, M its mass and F the force (world) of all
 that comes before this effect: the tension T follows from the string keeping its length. A string does not push; where
 it would go slack the load is still carried along on its sphere. Remembered are n and n'; at the start the load hangs
-still.
+still. Swings are hardly damped, and once a string was slack nothing tells where they began: beside a log, the force
+the model misses turns n towards where the string pulls (a Luenberger observer).
 """
 
 from __future__ import annotations
@@ -21,6 +22,13 @@ from cfb_mjx.model.effects.base import Condition, Effect, Memory, Wrench
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec, rotate, rotate_inverse
 from cfb_mjx.parameters.parameters import Parameters
+
+FOLLOWING = 8.0
+"""Twice the damping of the error of a load followed beside a log, 1/s."""
+UNSURE = 0.5
+"""What else a model may miss, m/s^2: weaker pulls say little of where the string points."""
+GAP = 0.05
+"""After rows this far apart, s, a load is taken to hang still below what the drone feels."""
 
 
 class PayloadSwing(Effect):
@@ -38,11 +46,10 @@ class PayloadSwing(Effect):
         "damping_ratio": (0.002, 0.4),
     }
     strengths: ClassVar[tuple[str, ...]] = ("mass",)
-    # Strongly damped ones hang on their length little: they are found from afar.
     probes: ClassVar[tuple[dict[str, float], ...]] = (
-        {"length": 0.1, "damping_ratio": 0.2},
-        {"length": 0.15, "damping_ratio": 0.2},
-        {"length": 0.25, "damping_ratio": 0.2},
+        {"length": 0.1, "damping_ratio": 0.05},
+        {"length": 0.15, "damping_ratio": 0.05},
+        {"length": 0.25, "damping_ratio": 0.05},
     )
 
     mass: Float[Array, "*batch"] = eqx.field(converter=number)
@@ -80,4 +87,20 @@ class PayloadSwing(Effect):
         turning = turning - (across * (1 / self.length) + turning * damping) * dt
         along = along + turning * dt
         along = along * (1 / jnp.sqrt(along.dot(along)))
+        return along, turning - along * along.dot(turning)
+
+    def follow(self, condition: Condition, acceleration: Vec, missed: Vec, dt: Any) -> Memory:
+        along, turning = self.advance(condition, acceleration, dt)
+        felt = acceleration + Vec(0.0, 0.0, condition.parameters.gravity)
+        mass, own = self.mass, condition.parameters.mass
+        pull = mass / own * jnp.maximum(self.length * turning.dot(turning) - along.dot(felt), 0.0)
+        # An angle where the pull is strong, and nothing where there is none.
+        off = (missed - along * along.dot(missed)) * (pull / (pull * pull + UNSURE**2))
+        along = along + off * (FOLLOWING * dt)
+        turning = turning + off * (FOLLOWING**2 / 2 * dt)
+        below = felt * (-1 / jnp.sqrt(felt.dot(felt) + 1e-6))
+        gap = jnp.asarray(dt) > GAP
+        along = Vec(*(jnp.where(gap, b, a) for a, b in zip(along, below, strict=True)))
+        along = along * (1 / jnp.sqrt(along.dot(along)))
+        turning = Vec(*(jnp.where(gap, 0.0, x) for x in turning))
         return along, turning - along * along.dot(turning)

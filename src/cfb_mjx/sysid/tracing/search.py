@@ -242,7 +242,8 @@ class Search:
                 fixed = 0, (kept - hypothesis.lead) / lead, 1e9
                 values = solve(linear.blocks.sum(0), index, linear.scale, fixed)
             deviation = np.sqrt(np.diag(covariance(linear.blocks, index, linear.scale, values, pull[2])))
-            if np.max(np.abs(values) / deviation) < 0.3:
+            # Noise levels come from a poorer model: they are learned anew even where the values stay.
+            if attempt and np.max(np.abs(values) / deviation) < 0.3:
                 break
             hypothesis = self.moved(hypothesis, own, values * linear.scale[index])
             if attempt == 0:

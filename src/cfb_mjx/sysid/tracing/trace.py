@@ -128,19 +128,23 @@ def trace(
         passing = [(e, v) for e, v in ranking if significant(e, len(search.names))]
         if not passing:
             break
-        name, richer, stretched = best_fit(search, fit, passing, progress)
-        clear = next(e for e, v in passing if v[0].effect == name).t >= CLEAR
+        options, stretched = contenders(search, fit, passing, progress)
         refused |= stretched
-        tried[-1] |= {"tried": name, "drop": dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))}
-        fit, seen = taken_in(search, nothing, fit, name, richer, clear, progress)
-        if seen is None:
+        statistic = {v[0].effect: e.t for e, v in passing}
+        # The likeliest first. It may be too slight beside a large error of which another contender is the cause.
+        for name, richer in options:
+            drop = dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))
+            tried[-1] |= {"tried": name, "drop": drop}
+            fit, seen = taken_in(search, nothing, fit, name, richer, statistic[name] >= CLEAR, progress)
+            if seen is not None:
+                vain = 0
+                # What was too slight beside a large error may matter now.
+                refused = set()
+                left_out = seen
+                break
             refused.add(name)
-            vain += 1
         else:
-            vain = 0
-            # What was too slight beside a large error may matter now.
-            refused = set()
-            left_out = seen
+            vain += 1
         checkpoint.save(fit.hypothesis, refused, tried)
     if len(fit.hypothesis.present) > 1:
         single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
@@ -159,17 +163,18 @@ def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, li
     return sorted((pair for name, pair in best.items() if name not in refused), key=lambda pair: -pair[0].gain)
 
 
-def best_fit(
+def contenders(
     search: Search, fit: Fit, ranking: list[tuple[Evidence, list[Column]]], progress: Callable[[str], None]
-) -> tuple[str, Fit, set[str]]:
-    """The candidate that explains the flights best, fitted beside what is there.
+) -> tuple[list[tuple[str, Fit]], set[str]]:
+    """The candidates that explain the flights best, fitted beside what is there.
 
     The ranking rests on slopes at neutral, which say little of effects whose shape is still to be fitted: those that
-    come near the best there are fitted too. Of those that gain about the same, the one with the fewest numbers is
-    taken.
+    come near the best there are fitted too. Of those that gain about the same, the one with the fewest numbers comes
+    first.
 
     Returns:
-        Its name, the fit with it, and the names of those that would have to be implausibly strong.
+        Their names and the fits with them, in the order to try them, and the names of those that would have to be
+        implausibly strong.
     """
     fits = {}
     for found, variant in ranking[:CONTENDERS]:
@@ -185,17 +190,18 @@ def best_fit(
     stretched = set(fits) - set(plausible)
     if len(plausible) < 2:
         name = (plausible or list(fits))[-1]
-        return name, fits[name], stretched
+        return [(name, fits[name])], stretched
     numbers = {variant[0].effect: len(variant) for _, variant in ranking}
     most = max(gains[name] for name in plausible)
     close = [name for name in plausible if gains[name] >= most - PARSIMONY * abs(most)]
-    name = min(close, key=numbers.get)
+    first = min(close, key=numbers.get)
     delayed = "command_delay"
-    if name == SHIFT and fits[name].hypothesis.shift < 0 and delayed in plausible:
+    if first == SHIFT and fits[first].hypothesis.shift < 0 and delayed in plausible:
         # Commands logged early and commands that act late look the same unless rotor speeds were logged: the
         # physical cause comes first, and the report names both.
-        name = delayed if gains[delayed] > (1 - CLOSE) * gains[name] else name
-    return name, fits[name], stretched
+        first = delayed if gains[delayed] > (1 - CLOSE) * gains[first] else first
+    order = sorted(plausible, key=lambda name: (name != first, -gains[name]))
+    return [(name, fits[name]) for name in order], stretched
 
 
 def needed(search: Search, less: LeftOut, fit: Fit, nothing: Fit) -> bool:
