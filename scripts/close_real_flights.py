@@ -17,11 +17,13 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from scipy.signal import butter, sosfiltfilt
 
 from cfb_mjx.cli.refining import by_predictions
 from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.logs import FlightLog, read_log
+from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import ModelFile, load_model_file
 from cfb_mjx.sysid import evaluate
@@ -43,6 +45,7 @@ BODY = (
 GENTLE = 7
 """Gentle flights among those fitted: the square counts as much as all of them, for the two are judged side by side."""
 GROUPS = {"gentle": ("random1", "random2", "multisine"), "square": ("square",)}
+BANDS = ((0.1, 0.5), (1.0, 3.0))
 VARIANTS = ("commands_in", "rotor_speed_in", "commands_in_observer", "rotor_speed_in_observer", "hold")
 TARGETS = {
     ("commands_in", "gentle"): (0.40, 0.80),
@@ -66,7 +69,7 @@ TITLES = {
 def steps(folder: Path, work: Path) -> dict[str, list[str]]:
     """The commands, by the model file they leave in the work folder."""
     fit = sorted(str(path) for path in (folder / "fit").glob("*.parquet"))
-    made = {name: str(work / f"{name}.yaml") for name in ("rotors", "motors", "plant", "predictor")}
+    made = {name: str(work / f"{name}.yaml") for name in ("rotors", "motors", "repaired", "plant", "predictor")}
     refine = ["refine", *fit, "--weight", f"square={GENTLE}"]
     body = ["--effects", ",".join(BODY)]
     kept_numbers = {name: ["--json", str(work / f"{name}.json")] for name in ("plant", "predictor")}
@@ -74,7 +77,8 @@ def steps(folder: Path, work: Path) -> dict[str, list[str]]:
     options = {
         "rotors": ["fit-rotors", *fit, "--offset", "--per-motor", "--set", f"mass={MASS}"],
         "motors": ["refine", *fit, "--model", made["rotors"], "--estimator", "innovations", "--effects", together],
-        "plant": [*refine, "--model", made["motors"], *body, *kept_numbers["plant"]],
+        "repaired": [*refine, "--model", made["motors"], *body],
+        "plant": [*refine, "--model", made["motors"], *body, "--as-logged", *kept_numbers["plant"]],
         "predictor": [*refine, "--model", made["plant"], *body, "--predictor", *kept_numbers["predictor"]],
     }
     return {name: [*command, "-o", made[name]] for name, command in options.items()}
@@ -105,6 +109,28 @@ def errors(described: ModelFile, logs: list[FlightLog], observer: Observer | Non
                 attitude = float(np.radians(seen[f"attitude_mean_deg@{horizon}s"]))
                 found[f"{variant} {group} {horizon}"] = attitude, seen[f"velocity_mean_mps@{horizon}s"]
     return found
+
+
+def columns(made: dict[str, ModelFile], fit: list[FlightLog]) -> dict:
+    """The fit flights, predicted with the sensor faults taken out and as they were logged."""
+    faults = SensorFaults.from_mappings(made["repaired"].effects, "repaired")
+    found = {name: errors(made[name], fit) for name in ("repaired", "plant")}
+    bands = {band: float(np.median([band_scale(log, *band) for log in fit])) for band in BANDS}
+    bands = {f"{low:g} to {high:g} Hz": scale for (low, high), scale in bands.items()}
+    return {"velocity_scale": faults.velocity_scale, "bands": bands, "errors": found}
+
+
+def band_scale(log: FlightLog, low: float, high: float) -> float:
+    """Logged horizontal velocity over the slope of logged position, of motion between two frequencies in Hz."""
+    step = 0.01
+    grid = np.arange(log.time[0], log.time[-1], step)
+    place, speed = (interpolate(log.time, x[:, :2], grid) for x in (log.position, log.velocity))
+    sos = butter(2, [low, high], "band", fs=1 / step, output="sos")
+    slope = np.gradient(sosfiltfilt(sos, place, axis=0), step, axis=0)
+    # The estimator may be ahead or behind: what is in step counts, and what is a quarter turn off does not.
+    beside = np.gradient(slope, step, axis=0)
+    both = np.stack([slope.ravel(), beside.ravel()], axis=1)
+    return float(np.linalg.lstsq(both, sosfiltfilt(sos, speed, axis=0).ravel())[0][0])
 
 
 def without_each(plant: ModelFile, fit: list[FlightLog], judged: list[FlightLog]) -> dict:
@@ -203,6 +229,10 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "|---|---|---:|---|",
             *_effects(models["plant"], results),
             "",
+            "## The velocity column",
+            "",
+            *_columns(results["columns"]),
+            "",
             "## The observer",
             "",
             "A torque, a force and, where rotor speed was measured, motor errors, estimated from data before each",
@@ -267,6 +297,25 @@ def _story(results: dict) -> list[str]:
     if missed:
         text += ["", "**Goals not reached**:", "", *(f"- {line}" for line in missed)]
     return text
+
+
+def _columns(seen: dict) -> list[str]:
+    rows, bands = [], ", ".join(f"{scale:.2f} at {band}" for band, scale in seen["bands"].items())
+    for variant in ("commands_in", "rotor_speed_in"):
+        for group in GROUPS:
+            cells = [_pair(seen["errors"][name][f"{variant} {group} 0.5"]) for name in ("repaired", "plant")]
+            rows.append(f"| {TITLES[variant]} | {group} | " + " | ".join(cells) + " |")
+    return [
+        f"The sensors, compared with each other, say that the logged velocity is {seen['velocity_scale']:.3f} times",
+        f"too large. It is not the same scale for all motion: {bands} (horizontal velocity over slope of the",
+        "position, median of the flights fitted to). The plant takes the column as it was logged (`--as-logged`).",
+        "Which is better was asked of the flights fitted to; mean errors there after 0.5 s, attitude, rad, / velocity",
+        "as logged, m/s:",
+        "",
+        "| prediction | flights | scale taken out | as logged |",
+        "|---|---|---|---|",
+        *rows,
+    ]
 
 
 ARGUMENTS = {
@@ -381,7 +430,7 @@ def main() -> None:
             print(f"cfb {command[0]} -> {name}.yaml", flush=True)
             subprocess.run([sys.executable, "-m", "cfb_mjx.cli", *command], check=True)
     declared = load_model_file("cfb-guards").with_values("weighed with its decks", mass=MASS)
-    made = {name: load_model_file(work / f"{name}.yaml") for name in ("motors", "plant", "predictor")}
+    made = {name: load_model_file(work / f"{name}.yaml") for name in ("motors", "repaired", "plant", "predictor")}
     models = {
         "declared": declared,
         "innovations": made["motors"],
@@ -390,6 +439,7 @@ def main() -> None:
     }
     judged = logs["validation"]
     results = {part: [log.name for log in some] for part, some in logs.items()}
+    results["columns"] = kept(work / "columns.json", lambda: columns(made, logs["fit"]))
     results["observer"] = kept(work / "observer.json", lambda: tuned(made["plant"], logs["fit"]))
     observer = Observer(**results["observer"])
     results["errors"] = kept(

@@ -286,6 +286,7 @@ def refine(
     estimator: Literal["predictions", "innovations"] = "predictions",
     predictor: bool = False,
     weight: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    as_logged: bool = False,
     json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
 ) -> None:
     """Fit the numbers of effects you name, where close-loop would search for them.
@@ -303,6 +304,7 @@ def refine(
         estimator: what is fitted.
         predictor: leave inertia and inflow free; the result predicts better, is a wrong plant, and is marked so.
         weight: what flights whose names begin with NAME count against the others (predictions only).
+        as_logged: take no sensor fault out, even where sensors disagree or the model lists one.
         json: write the results here.
     """
     if not logs:
@@ -310,7 +312,7 @@ def refine(
     from cfb_mjx.cli.refining import run_refine
 
     paths = list(logs), list(held_out)
-    run_refine(*paths, output, model, list(set), effects, estimator, predictor, list(weight), json)
+    run_refine(*paths, output, model, list(set), effects, estimator, predictor, list(weight), as_logged, json)
 
 
 def bench(

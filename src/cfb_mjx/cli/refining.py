@@ -30,6 +30,7 @@ def run_refine(
     estimator: str,
     predictor: bool,
     weights: list[str],
+    as_logged: bool,
     json: Path | None,
 ) -> None:
     """Fit, print, write the model.
@@ -47,15 +48,18 @@ def run_refine(
         require_own_names(group)
     shares = _weights(weights, logs)
     configure_jax(x64=True)
-    from cfb_mjx.model.effects import CATALOGUE
+    from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS
     from cfb_mjx.parameters import save_model_file
 
     base = changed_model(model, changes)
+    if as_logged:
+        base = replace(base, effects=tuple(e for e in base.effects if e["name"] not in SENSOR_FAULTS))
     names = effects.split(",") if effects else [e["name"] for e in base.effects if e["name"] in CATALOGUE]
     if not names:
         raise CfbError(f"model {base.name} has no effects; name some to fit, for instance --effects rotor_drag.")
     fit = by_innovations if estimator == "innovations" else by_predictions
-    extra = {} if estimator == "innovations" else {"predictor": predictor, "weights": shares}
+    predicting = {"predictor": predictor, "weights": shares}
+    extra = {"as_logged": as_logged} if estimator == "innovations" else predicting
     refined, report = fit(base, logs, names, progress=say, **extra)
     origin = provenance("refine", base.name, "fit_logs_sha256", paths, held_out=[path.name for path in held_out])
     refined = replace(refined, name=output.stem, provenance=origin)
@@ -71,7 +75,9 @@ def run_refine(
         print(f"results: {json}")
 
 
-def by_innovations(base: ModelFile, logs: list[FlightLog], names: list[str], progress) -> tuple[ModelFile, dict]:
+def by_innovations(
+    base: ModelFile, logs: list[FlightLog], names: list[str], as_logged: bool = False, progress=lambda _: None
+) -> tuple[ModelFile, dict]:
     """The model with some effects fitted to innovations, and what to report."""
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid.flight import usual_delay
@@ -79,7 +85,8 @@ def by_innovations(base: ModelFile, logs: list[FlightLog], names: list[str], pro
 
     parameters = base.parameters()
     delay = usual_delay(logs, parameters)
-    found = fit_given(logs, parameters, names, Quadrotor.from_file(base).effects, delay, progress)
+    declared = Quadrotor.from_file(base).effects
+    found = fit_given(logs, parameters, names, declared, delay, progress, as_logged)
     rows, mappings = {}, _mappings(found.effects, found.uncertainty)
     for mapping in mappings:
         std = mapping.get("uncertainty")

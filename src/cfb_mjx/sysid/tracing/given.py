@@ -9,7 +9,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import CATALOGUE, Effect
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.trace import deviations
@@ -35,6 +35,7 @@ def fit_given(
     declared: tuple[Effect, ...] = (),
     delay: float = 0.008,
     progress: Callable[[str], None] = lambda _: None,
+    as_logged: bool = False,
 ) -> Given:
     """Fit named effects together, by the likelihood of whitened innovations, which feedback does not bias.
 
@@ -45,6 +46,7 @@ def fit_given(
         declared: effects the declared model has already; they start the fit.
         delay: declared age of pose and velocity in a row, s.
         progress: told what happens.
+        as_logged: take no sensor fault out of the flights, only biases.
 
     Raises:
         CfbError: an effect the catalogue does not have.
@@ -54,6 +56,7 @@ def fit_given(
             raise CfbError(f"{name}: no such effect; the catalogue has {', '.join(sorted(CATALOGUE))}.")
     progress("comparing the sensors with each other")
     sensors = check_sensors(list(logs), delay)
+    sensors = replace(sensors, faults=HEALTHY) if as_logged else sensors
     search = Search.start(list(logs), parameters, delay, sensors, declared)
     progress("replaying the declared model")
     hypothesis, linear = search.refine(replace(search.learned(search.nothing()), present=tuple(names)))

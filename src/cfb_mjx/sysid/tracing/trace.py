@@ -28,6 +28,8 @@ RIVALS, AS_GOOD = 3, 0.03
 """So many effects are tried alone in place of several; no error may grow by more than this share."""
 CLOSE = 0.1
 """A rival that gains all but this share of the winner's gain is named as confusable with it."""
+SAME_ERRORS = 0.03
+"""Of such rivals those are tried first whose prediction errors (mean logarithm) are the lowest but for this."""
 LARGEST = 6
 """Effects at most."""
 PATIENCE = 3
@@ -169,8 +171,8 @@ def contenders(
     """The candidates that explain the flights best, fitted beside what is there.
 
     The ranking rests on slopes at neutral, which say little of effects whose shape is still to be fitted: those that
-    come near the best there are fitted too. Of those that gain about the same, the one with the fewest numbers comes
-    first.
+    come near the best there are fitted too. Of those that gain nearly the same, the ones that predict best come first,
+    and of those the one with the fewest numbers.
 
     Returns:
         Their names and the fits with them, in the order to try them, and the names of those that would have to be
@@ -193,7 +195,12 @@ def contenders(
         return [(name, fits[name])], stretched
     numbers = {variant[0].effect: len(variant) for _, variant in ranking}
     most = max(gains[name] for name in plausible)
-    close = [name for name in plausible if gains[name] >= most - PARSIMONY * abs(most)]
+    errors = {name: np.log(fits[name].errors).mean() for name in plausible}
+    rivals = [name for name in plausible if gains[name] >= (1 - CLOSE) * most]
+    # Innovations hardly tell a lag from a delay beside the unknown age of commands; half a second of flight does.
+    rivals = [name for name in rivals if errors[name] <= min(errors[r] for r in rivals) + SAME_ERRORS]
+    most = max(gains[name] for name in rivals)
+    close = [name for name in rivals if gains[name] >= most - PARSIMONY * abs(most)]
     first = min(close, key=numbers.get)
     delayed = "command_delay"
     if first == SHIFT and fits[first].hypothesis.shift < 0 and delayed in plausible:
