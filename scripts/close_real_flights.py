@@ -327,7 +327,7 @@ ARGUMENTS = {
     "cog_offset": "the mean place of the batteries; every flight has its own besides",
     "torque_scale": "less reactive torque; yaw only",
     "thrust_tilt": "rotors a few milliradians off the vertical",
-    "battery_sag": "rotor speed follows the voltage of the battery",
+    "battery_sag": "rotor speed follows the charge of the battery, little its dips under load (hence the lag)",
     "motor_asymmetry": "motors are driven up and coast down",
 }
 

@@ -1,6 +1,7 @@
 """``cfb refine`` from the logs to a model the other commands take."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -60,3 +61,13 @@ def test_bad_requests_are_refused(cfb, tmp_path, arguments, needles):
     assert all(needle in done.stderr for needle in needles)
     assert len(done.stderr.strip().splitlines()) == 1
     assert not (tmp_path / "m.yaml").exists()
+
+
+def test_sensor_faults_of_the_model_stay_out_of_a_fit_as_logged(cfb, tmp_path):
+    base = load_model_file("cfb-guards")
+    faulty = replace(base, effects=({"name": "sensor_velocity_scale", "parameters": {"scale": 1.1}},))
+    save_model_file(faulty, tmp_path / "faulty.yaml")
+    request = ["--model", tmp_path / "faulty.yaml", "--effects", "rotor_drag", "--estimator", "innovations"]
+    done = cfb("refine", LOG, "-o", tmp_path / "m.yaml", *request, "--as-logged")
+    assert done.returncode == 0, done.stderr
+    assert [e["name"] for e in load_model_file(tmp_path / "m.yaml").effects] == ["rotor_drag"]
