@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from cfb_mjx.cli import refining
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters import load_model_file, save_model_file
 
@@ -63,11 +64,18 @@ def test_bad_requests_are_refused(cfb, tmp_path, arguments, needles):
     assert not (tmp_path / "m.yaml").exists()
 
 
-def test_sensor_faults_of_the_model_stay_out_of_a_fit_as_logged(cfb, tmp_path):
-    base = load_model_file("cfb-guards")
-    faulty = replace(base, effects=({"name": "sensor_velocity_scale", "parameters": {"scale": 1.1}},))
+def test_sensor_faults_of_the_model_stay_out_of_a_fit_as_logged(monkeypatch, tmp_path):
+    seen = {}
+
+    def fit(base, logs, names, as_logged, progress):
+        seen.update(effects=[e["name"] for e in base.effects], as_logged=as_logged)
+        return base, {"numbers": {}}
+
+    monkeypatch.setattr(refining, "by_innovations", fit)
+    known = ({"name": "sensor_velocity_scale", "parameters": {"scale": 1.1}}, {"name": "rotor_drag", "parameters": {}})
+    faulty = replace(load_model_file("cfb-guards"), effects=known)
     save_model_file(faulty, tmp_path / "faulty.yaml")
-    request = ["--model", tmp_path / "faulty.yaml", "--effects", "rotor_drag", "--estimator", "innovations"]
-    done = cfb("refine", LOG, "-o", tmp_path / "m.yaml", *request, "--as-logged")
-    assert done.returncode == 0, done.stderr
-    assert [e["name"] for e in load_model_file(tmp_path / "m.yaml").effects] == ["rotor_drag"]
+    for as_logged, kept in ((False, ["sensor_velocity_scale", "rotor_drag"]), (True, ["rotor_drag"])):
+        rest = (str(tmp_path / "faulty.yaml"), [], "rotor_drag", "innovations", False, [], as_logged, None)
+        refining.run_refine([LOG], [], tmp_path / "m.yaml", *rest)
+        assert seen == {"effects": kept, "as_logged": as_logged}
