@@ -174,8 +174,22 @@ def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Colu
     return bool(said > 0.5 * np.trace(total[np.ix_(effect, effect)]))
 
 
-def explain(found: Trace, progress: Callable[[str], None] = lambda _: None) -> tuple[Search, Proposal | None]:
+def material(search: Search, poorer: Hypothesis, richer: Hypothesis, declared: Hypothesis) -> bool:
+    """Whether a formula lowers prediction errors of some flights by what matters."""
+    old, new, first = (prediction_errors(search, hypothesis) for hypothesis in (poorer, richer, declared))
+    enough = np.max(1 - new / old) >= STRUCTURE and np.max((old - new) / first) >= OF_FIRST
+    return bool(enough and np.log(new / old).sum() <= 0)
+
+
+def explain(
+    found: Trace, progress: Callable[[str], None] = lambda _: None, held_out: Search | None = None
+) -> tuple[Search, Proposal | None]:
     """Look for a formula beside what was found, keep it if it is material, and drop effects it makes needless.
+
+    Args:
+        found: what the search came to.
+        progress: told what happens.
+        held_out: over other flights. What the fit flights excite too little to matter may matter there.
 
     Returns:
         The search over the fit flights, widened by the formula if there is one, and the formula.
@@ -186,10 +200,11 @@ def explain(found: Trace, progress: Callable[[str], None] = lambda _: None) -> t
     if not terms:
         return search, None
     richer, deviation = fit_formula(widened, base, terms)
-    old, new = found.errors, prediction_errors(widened, richer)
-    slight = np.max(1 - new / old) < STRUCTURE or np.max((old - new) / found.declared_errors) < OF_FIRST
-    if slight or np.log(new / old).sum() > 0:
+    wholes = [widened] if held_out is None else [widened, replace(held_out, names=widened.names)]
+    declared = replace(base, effects=base.origin, present=(), shift=0.0)
+    if not any(material(whole, base, richer, declared) for whole in wholes):
         return search, None
+    new = prediction_errors(widened, richer)
     # A force that hangs on the place has a constant part, which looked like wind.
     windy = "wind" in hypothesis.present and any(c.field == "place" for c in terms)
     for name in sorted(hypothesis.present, key=lambda name: not (windy and name == "wind")):

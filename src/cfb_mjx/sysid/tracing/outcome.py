@@ -166,12 +166,13 @@ def close_loop(
     parameters = base.parameters()
     delay = usual_delay(fit, parameters)
     found = trace(fit, parameters, delay, progress, declared, checkpoint)
-    search, proposal = explain(found, progress)
-    progress("judging on held-out flights")
-    before = evaluate(found.search.nothing().model(parameters), held_out)
     # Biases of the held-out sensors come from their own kinematics; no model is fitted.
     check = replace(check_sensors(held_out, delay), faults=found.sensors.faults)
-    judge, wide = found.search.beside(held_out, check), search.beside(held_out, check)
+    judge = found.search.beside(held_out, check)
+    search, proposal = explain(found, progress, judge)
+    progress("judging on held-out flights")
+    before = evaluate(found.search.nothing().model(parameters), held_out)
+    wide = search.beside(held_out, check)
     if proposal is not None and not _borne_out(wide, proposal):
         proposal, search, wide = None, found.search, judge
     hypothesis, reported, unconfirmed = _judged(search, judge, found, proposal)
