@@ -29,7 +29,7 @@ def contest(monkeypatch):
             for name, (_, _, _, error, _) in made.items()
         }
         search = SimpleNamespace(with_candidate=lambda hypothesis, variant, found: variant[0].effect)
-        monkeypatch.setattr(tracing, "fitted", lambda search, name: fits[name])
+        monkeypatch.setattr(tracing, "fitted", lambda search, name, whole: fits[name])
         monkeypatch.setattr(tracing, "implausible", lambda hypothesis, name: not made[name][4])
         monkeypatch.setattr(
             tracing, "confirm", lambda search, poorer, richer: SimpleNamespace(gain=made[richer.name][2])

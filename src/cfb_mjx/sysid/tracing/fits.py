@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,20 +39,26 @@ class Fit:
 
     Attributes:
         hypothesis: with the values that fit.
-        linear: its derivatives by the whole catalogue.
+        linear: its derivatives by the whole catalogue; None for one among many, which may not be taken.
         errors: (8,) `ERRORS` over all flights.
         by_flight: (L, 8) `ERRORS` in each flight that has prediction windows.
     """
 
     hypothesis: Hypothesis
-    linear: Linear
+    linear: Linear | None
     errors: np.ndarray
     by_flight: np.ndarray
 
 
-def fitted(search: Search, hypothesis: Hypothesis) -> Fit:
-    """Fit everything a hypothesis holds."""
-    hypothesis, linear = search.refine(hypothesis)
+def fitted(search: Search, hypothesis: Hypothesis, whole: bool = True) -> Fit:
+    """Fit everything a hypothesis holds; derivatives by the catalogue only if ``whole``."""
+    hypothesis = search.settled(hypothesis)
+    linear = search.whole(hypothesis) if whole else None
     evaluation = predicted(search, hypothesis)
     flights = [errors_of(one) for one in evaluation.each if len(one.logs[0].windows)]
     return Fit(hypothesis, linear, errors_of(evaluation), np.array(flights))
+
+
+def completed(search: Search, fit: Fit) -> Fit:
+    """The fit with its derivatives by the whole catalogue."""
+    return fit if fit.linear is not None else replace(fit, linear=search.whole(fit.hypothesis))

@@ -31,6 +31,10 @@ from cfb_mjx.sysid.tracing.noise import sensor_noise
 from cfb_mjx.sysid.tracing.sensors import SensorCheck
 from cfb_mjx.sysid.tracing.whitening import FIRST, Blocks, Signals, fit_levels, levels_from
 
+STILL = 0.3
+"""Steps below this share of a standard deviation end a fit."""
+SAME_LEVELS = 0.5
+"""Noise levels that change by less (their logarithms) do not make it worth while to fit again."""
 LEAD_RANGE, LEAD_USUAL, LEAD_SPREAD = (0.0, 0.5), 0.25, 0.1
 """Share of the next command in the mean over an interval: a quarter if every second command is logged, half at most.
 Beyond this a lead would be a time shift, so what is known of it beforehand has to decide between the two."""
@@ -227,8 +231,18 @@ class Search:
             found += cols.strengths(name)[0] + cols.shapes(hypothesis.effect(name))
         return [replace(c, probe=()) for c in found] + list(hypothesis.terms)
 
+    def whole(self, hypothesis: Hypothesis) -> Linear:
+        """Derivatives by what is there and by the rest of the catalogue."""
+        absent = [c for v in self.candidates() if v[0].effect not in hypothesis.present for c in v]
+        return self.linearise(hypothesis, self.own_columns(hypothesis) + absent)
+
     def refine(self, hypothesis: Hypothesis, rounds: int = 5) -> tuple[Hypothesis, Linear]:
         """Fit everything that is there together; derivatives by the whole catalogue come with the result."""
+        hypothesis = self.settled(hypothesis, rounds)
+        return hypothesis, self.whole(hypothesis)
+
+    def settled(self, hypothesis: Hypothesis, rounds: int = 5) -> Hypothesis:
+        """Fit everything that is there together."""
         for attempt in range(rounds - 1):
             own = self.own_columns(hypothesis)
             linear = self.linearise(hypothesis, own)
@@ -242,14 +256,16 @@ class Search:
                 fixed = 0, (kept - hypothesis.lead) / lead, 1e9
                 values = solve(linear.blocks.sum(0), index, linear.scale, fixed)
             deviation = np.sqrt(np.diag(covariance(linear.blocks, index, linear.scale, values, pull[2])))
-            # Noise levels come from a poorer model: they are learned anew even where the values stay.
-            if attempt and np.max(np.abs(values) / deviation) < 0.3:
+            still = np.max(np.abs(values) / deviation) < STILL
+            if attempt and still:
                 break
             hypothesis = self.moved(hypothesis, own, values * linear.scale[index])
             if attempt == 0:
-                hypothesis = self.learned(hypothesis)
-        absent = [c for v in self.candidates() if v[0].effect not in hypothesis.present for c in v]
-        return hypothesis, self.linearise(hypothesis, self.own_columns(hypothesis) + absent)
+                # Noise levels come from a poorer model: they are learned anew even where the values stay.
+                before, hypothesis = hypothesis.levels, self.learned(hypothesis)
+                if still and np.max(np.abs(hypothesis.levels - before)) < SAME_LEVELS:
+                    break
+        return hypothesis
 
     def moved(self, hypothesis: Hypothesis, own: list[Column], by: np.ndarray) -> Hypothesis:
         """The hypothesis after a step: the lead's first, then one for each of its columns."""

@@ -16,7 +16,7 @@ from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import SHIFT, Column
 from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
-from cfb_mjx.sysid.tracing.fits import ERRORS, Fit, fitted
+from cfb_mjx.sysid.tracing.fits import ERRORS, Fit, completed, fitted
 from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Linear, Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
 
@@ -139,7 +139,7 @@ def trace(
             tried[-1] |= {"tried": name, "drop": drop}
             fit, seen = taken_in(search, nothing, fit, name, richer, statistic[name] >= CLEAR, progress)
             if seen is not None:
-                vain = 0
+                fit, vain = completed(search, fit), 0
                 # What was too slight beside a large error may matter now.
                 refused = set()
                 left_out = seen
@@ -150,7 +150,7 @@ def trace(
         checkpoint.save(fit.hypothesis, refused, tried)
     if len(fit.hypothesis.present) > 1:
         single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
-        fit, left_out = (single, {}) if single is not None else (fit, left_out)
+        fit, left_out = (completed(search, single), {}) if single is not None else (fit, left_out)
     found = [
         _summary(search, fit, name, left_out.get(name) or leave_out(search, fit, name))
         for name in fit.hypothesis.present
@@ -184,7 +184,7 @@ def contenders(
             break
         name = variant[0].effect
         progress(f"trying {name} beside {', '.join(fit.hypothesis.present) or 'nothing'}")
-        fits[name] = fitted(search, search.with_candidate(fit.hypothesis, variant, found))
+        fits[name] = fitted(search, search.with_candidate(fit.hypothesis, variant, found), whole=False)
     plausible = [name for name, richer in fits.items() if not implausible(richer.hypothesis, name)]
     if len(plausible) > 1:
         gains = {name: confirm(search, fit.hypothesis, fits[name].hypothesis).gain for name in plausible}
@@ -282,7 +282,7 @@ def re_examined(
         seen[name] = less
         rival, variant = less.ranking[0]
         if variant[0].effect != name and rival.gain > less.own.gain + LEAST_GAIN:
-            other = fitted(search, search.with_candidate(less.fit.hypothesis, variant, rival))
+            other = fitted(search, search.with_candidate(less.fit.hypothesis, variant, rival), whole=False)
             if np.log(other.errors / fit.errors).sum() < 0:
                 fit, seen = other, {}
     return fit, seen
@@ -307,7 +307,7 @@ def simplified(
             continue
         progress(f"trying {name} in place of {', '.join(fit.hypothesis.present)}")
         found, variant = candidates[name]
-        single = fitted(search, search.with_candidate(nothing.hypothesis, variant, found))
+        single = fitted(search, search.with_candidate(nothing.hypothesis, variant, found), whole=False)
         if np.isfinite(single.errors).all() and np.max(single.errors / fit.errors - 1) < AS_GOOD:
             return single
     return None
