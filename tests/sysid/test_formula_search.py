@@ -16,8 +16,8 @@ from cfb_mjx.sysid.tracing.search import Hypothesis
 class _Search:
     names = ("wind", "rotor_drag")
 
-    def refine(self, hypothesis):
-        return hypothesis, None
+    def settled(self, hypothesis):
+        return hypothesis
 
 
 @pytest.mark.parametrize(("without_wind", "left"), [(1.0, ("rotor_drag",)), (2.0, ("wind", "rotor_drag"))])

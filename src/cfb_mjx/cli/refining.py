@@ -57,9 +57,9 @@ def run_refine(
     names = effects.split(",") if effects else [e["name"] for e in base.effects if e["name"] in CATALOGUE]
     if not names:
         raise CfbError(f"model {base.name} has no effects; name some to fit, for instance --effects rotor_drag.")
-    fit = by_innovations if estimator == "innovations" else by_predictions
-    predicting = {"predictor": predictor, "weights": shares}
-    extra = {"as_logged": as_logged} if estimator == "innovations" else predicting
+    innovations = estimator == "innovations"
+    fit = by_innovations if innovations else by_predictions
+    extra = {"as_logged": as_logged} if innovations else {"predictor": predictor, "weights": shares}
     refined, report = fit(base, logs, names, progress=say, **extra)
     origin = provenance("refine", base.name, "fit_logs_sha256", paths, held_out=[path.name for path in held_out])
     refined = replace(refined, name=output.stem, provenance=origin)

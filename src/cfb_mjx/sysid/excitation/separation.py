@@ -141,7 +141,7 @@ def _unexplained(
     search = Search.start([log], model.parameters, delay, check_sensors([log], delay), others)
     nothing = search.learned(search.nothing())
     right = nothing.having(effect)
-    right, _ = search.refine(search.learned(right))
+    right = search.settled(search.learned(right))
     nothing, linear = search.refine(nothing)
     probes = search.probes(nothing, linear)
     found = {}
@@ -152,6 +152,6 @@ def _unexplained(
         # An effect without a probe, its sign making no sense, explains nothing of this flight.
         if name in probes:
             evidence, variant = probes[name]
-            best, _ = search.refine(search.with_candidate(nothing, variant, evidence))
+            best = search.settled(search.with_candidate(nothing, variant, evidence))
         found[name] = confirm(search, replace(best, levels=right.levels), right).gain
     return found

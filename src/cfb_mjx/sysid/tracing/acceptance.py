@@ -58,10 +58,12 @@ def worth_it(name: str, fit: Fit, richer: Fit, nothing: Fit, clear: bool) -> boo
 
 def material(fit: Fit, richer: Fit, nothing: Fit, clear: bool) -> bool:
     """Whether the richer fit lowers an error by a share that matters, of all flights or, if ``clear``, of one."""
-
-    def enough(poorer, better, first):
-        return np.max(1 - better / poorer) >= MATERIAL and np.max((poorer - better) / first) >= OF_FIRST
-
-    if enough(fit.errors, richer.errors, nothing.errors):
+    shares = MATERIAL, OF_FIRST
+    if enough(fit.errors, richer.errors, nothing.errors, *shares):
         return True
-    return clear and enough(fit.by_flight, richer.by_flight, nothing.by_flight)
+    return clear and enough(fit.by_flight, richer.by_flight, nothing.by_flight, *shares)
+
+
+def enough(poorer: np.ndarray, better: np.ndarray, first: np.ndarray, share: float, of_first: float) -> bool:
+    """Whether an error is lowered by a share, and an error by a share of what the declared model (``first``) scores."""
+    return bool(np.max(1 - better / poorer) >= share and np.max((poorer - better) / first) >= of_first)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS, ResidualFormula
+from cfb_mjx.sysid.tracing.acceptance import enough
 from cfb_mjx.sysid.tracing.columns import FORMULA, Column, term_columns
 from cfb_mjx.sysid.tracing.evidence import covariance, evidence, solve
 from cfb_mjx.sysid.tracing.fits import prediction_errors
@@ -174,11 +175,8 @@ def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Colu
     return bool(said > 0.5 * np.trace(total[np.ix_(effect, effect)]))
 
 
-def material(search: Search, poorer: Hypothesis, richer: Hypothesis, declared: Hypothesis) -> bool:
-    """Whether a formula lowers prediction errors of some flights by what matters."""
-    old, new, first = (prediction_errors(search, hypothesis) for hypothesis in (poorer, richer, declared))
-    enough = np.max(1 - new / old) >= STRUCTURE and np.max((old - new) / first) >= OF_FIRST
-    return bool(enough and np.log(new / old).sum() <= 0)
+def _lowered(old: np.ndarray, new: np.ndarray, first: np.ndarray) -> bool:
+    return enough(old, new, first, STRUCTURE, OF_FIRST) and np.log(new / old).sum() <= 0
 
 
 def explain(
@@ -200,11 +198,13 @@ def explain(
     if not terms:
         return search, None
     richer, deviation = fit_formula(widened, base, terms)
-    wholes = [widened] if held_out is None else [widened, replace(held_out, names=widened.names)]
-    declared = replace(base, effects=base.origin, present=(), shift=0.0)
-    if not any(material(whole, base, richer, declared) for whole in wholes):
-        return search, None
     new = prediction_errors(widened, richer)
+    if not _lowered(found.errors, new, found.declared_errors):
+        if held_out is None:
+            return search, None
+        three = hypothesis, richer, held_out.nothing()
+        if not _lowered(*(prediction_errors(held_out, each) for each in three)):
+            return search, None
     # A force that hangs on the place has a constant part, which looked like wind.
     windy = "wind" in hypothesis.present and any(c.field == "place" for c in terms)
     for name in sorted(hypothesis.present, key=lambda name: not (windy and name == "wind")):
@@ -220,7 +220,7 @@ def explain(
     plain = base
     for name in set(hypothesis.present) - set(richer.present):
         plain = plain.without(name)
-    plain, _ = widened.refine(plain)
+    plain = widened.settled(plain)
     buys = float(np.max(1 - new / prediction_errors(widened, plain)))
     return widened, Proposal(terms_of(richer, deviation, gains), buys, richer, plain)
 

@@ -59,10 +59,11 @@ def fit_given(
     sensors = replace(sensors, faults=HEALTHY) if as_logged else sensors
     search = Search.start(list(logs), parameters, delay, sensors, declared)
     progress("replaying the declared model")
-    hypothesis, linear = search.refine(replace(search.learned(search.nothing()), present=tuple(names)))
+    hypothesis = search.settled(replace(search.learned(search.nothing()), present=tuple(names)))
     for number in range(1, ROUNDS):
         progress(f"fitting {', '.join(names)}, round {number + 1}")
-        hypothesis, linear = search.refine(hypothesis)
+        hypothesis = search.settled(hypothesis)
+    linear = search.whole(hypothesis)
     uncertainty: dict[str, dict] = {name: {} for name in names}
     for column, std in deviations(search, hypothesis, linear).items():
         own = uncertainty[column.effect]
