@@ -27,7 +27,7 @@ from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import ModelFile, load_model_file
 from cfb_mjx.sysid import evaluate
-from cfb_mjx.sysid.nanodrone import PUBLISHED, QUANTITIES, benchmark
+from cfb_mjx.sysid.nanodrone import PUBLISHED, QUANTITIES, Contestant, benchmark
 from cfb_mjx.sysid.observer import Observer
 from cfb_mjx.sysid.observer_tuning import tune_observer
 from cfb_mjx.sysid.repeatability import repeated
@@ -155,8 +155,11 @@ def tuned(plant: ModelFile, fit: list[FlightLog]) -> dict:
 
 def sums(models: dict[str, ModelFile], judged: list[FlightLog], observer: Observer) -> dict:
     """The IDSIA benchmark's sums on the validation flights."""
-    built = {name: (Quadrotor.from_file(m), None) for name, m in models.items()}
-    built |= {f"{name}, observer": (Quadrotor.from_file(m), observer) for name, m in models.items()}
+    built = {}
+    for suffix, beside in (("", None), (", observer", observer)):
+        for name, described in models.items():
+            faults = SensorFaults.from_mappings(described.effects, described.name)
+            built[name + suffix] = Contestant(Quadrotor.from_file(described), beside, faults)
     rows = benchmark(judged, built, 1, lambda *_: None)["rows"]
     return {name: [row[f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for name, row in rows.items()}
 

@@ -17,6 +17,7 @@ from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import BladeFlapping
 from cfb_mjx.sysid import nanodrone
 from cfb_mjx.sysid.observer import Observer
+from cfb_mjx.sysid.sensor_faults import SensorFaults
 
 ROWS = 58
 GUARDS = Quadrotor.from_file("cfb-guards")
@@ -90,7 +91,7 @@ def held(log, row):
 
 
 def test_metrics_are_those_of_brute_force(log):
-    found = nanodrone.benchmark([log], {"declared": (GUARDS, None)})
+    found = nanodrone.benchmark([log], {"declared": nanodrone.Contestant(GUARDS)})
     assert found["windows"] == found["flights"]["tiny"]["windows"] == ROWS - 50
     expected = {
         "naive": brute(log, lambda row: [at(log, row)] * 50),
@@ -109,9 +110,10 @@ def test_a_prediction_knows_rotor_speeds_up_to_its_step_only(log, observer):
     changed = np.array(log.rotor_speed)
     changed[30:] += 200.0
     row, before = 3, nanodrone.find_starts(log)
+    contestant = nanodrone.Contestant(GUARDS, observer)
     other = log.replace(rotor_speed=changed)
-    a = nanodrone.predict(GUARDS, log, before, observer)
-    b = nanodrone.predict(GUARDS, other, nanodrone.find_starts(other), observer)
+    a = nanodrone.predict(contestant, log, before)
+    b = nanodrone.predict(contestant, other, nanodrone.find_starts(other))
     # Step h is driven by row 3 + h - 1: the first that may differ is h = 28.
     for x, y in zip(a, b, strict=True):
         np.testing.assert_array_equal(x[row, : 30 - row], y[row, : 30 - row])
@@ -127,9 +129,25 @@ def test_an_observer_uses_nothing_but_the_past(log):
         values[7:] = np.abs(rng.normal(size=values[7:].shape))
         spoilt[name] = values
     spoilt["quaternion"][7:] /= np.linalg.norm(spoilt["quaternion"][7:], axis=1, keepdims=True)
-    a, b = (nanodrone.predict(model, x, nanodrone.find_starts(x), Observer()) for x in (log, log.replace(**spoilt)))
+    contestant = nanodrone.Contestant(model, Observer())
+    a, b = (nanodrone.predict(contestant, x, nanodrone.find_starts(x)) for x in (log, log.replace(**spoilt)))
     for x, y in zip(a, b, strict=True):
         np.testing.assert_array_equal(x[:7], y[:7])
+
+
+@pytest.mark.parametrize("observer", [None, Observer()], ids=["model", "observer"])
+def test_a_stretched_velocity_column_is_known_at_the_start_and_put_back(log, observer):
+    model = Quadrotor(GUARDS.parameters, (BladeFlapping(-5e-4, 0.0),))  # so that velocity matters
+    stretch = np.array([1.09, 1.09, 0.98])
+    stretched = log.replace(velocity=log.velocity * stretch)
+    faults = SensorFaults(velocity_scale=1.09, vertical_scale=0.98)
+    a, b = nanodrone.find_starts(log), nanodrone.find_starts(stretched)
+    true = nanodrone.predict(nanodrone.Contestant(model, observer), log, a)
+    found = nanodrone.predict(nanodrone.Contestant(model, observer, faults), stretched, b)
+    for x, y, factor in zip(found, true, (1, stretch, 1, 1), strict=True):
+        np.testing.assert_allclose(x, y * factor, rtol=1e-9, atol=1e-12)
+    ignored = nanodrone.predict(nanodrone.Contestant(model, observer), stretched, b)
+    assert np.abs(ignored[0] - true[0]).max() > 1e-4
 
 
 def test_an_exact_model_with_an_observer_beats_hold():
@@ -137,7 +155,8 @@ def test_an_exact_model_with_an_observer_beats_hold():
     long = fly(Plant(), 3.0, 6, noise=0.0)[0]
     rows = np.searchsorted(long.time, 0.01 * np.arange(298))
     steady = long.rows(rows).replace(time=0.01 * np.arange(298), metadata={"observation_delay": 0.008})
-    found = nanodrone.benchmark([steady], {"model": (GUARDS, None), "model_observer": (GUARDS, Observer())})["rows"]
+    contestants = {"model": nanodrone.Contestant(GUARDS), "model_observer": nanodrone.Contestant(GUARDS, Observer())}
+    found = nanodrone.benchmark([steady], contestants)["rows"]
     for name in ("model", "model_observer"):
         for key in ("attitude_sum_rad", "velocity_sum_mps", "rate_sum_radps"):
             assert found[name][key] < 0.6 * found["hold"][key], (name, key)

@@ -85,6 +85,28 @@ def test_sensor_faults_are_named_and_measured(campaigns, case, fault, truth, tol
     assert after < 0.8 * before
 
 
+@pytest.mark.parametrize(("across", "up"), [(1.09, 1.0), (1.0, 0.94), (1.05, 1.10)])
+def test_a_velocity_stretched_along_some_axes_only_is_told_from_one_stretched_along_all(campaigns, across, up):
+    """As an estimator does that takes horizontal velocity from optical flow and vertical velocity from a ranger."""
+    stretch = np.array([across, across, up])
+    flights = [log.replace(velocity=log.velocity * stretch) for log in campaigns["clean"].fit]
+    check = check_sensors(flights, 0.008)
+    assert [f.name for f in check.findings] == ["sensor_velocity_scale"]
+    np.testing.assert_allclose(check.faults.stretch, stretch, atol=0.004)
+    assert check.findings[0].p_value < 1e-6
+    assert check.findings[0].parameters == {
+        "scale": check.faults.velocity_scale,
+        "vertical": check.faults.vertical_scale,
+    }
+    assert set(check.findings[0].uncertainty) == {"scale", "vertical"}
+    told = SensorFaults.from_mappings(check.faults.to_mappings(), "drone.yaml")
+    assert told == check.faults
+    healthy = check_sensors(campaigns["clean"].fit, 0.008)
+    for log, bad in zip(campaigns["clean"].fit, flights, strict=True):
+        np.testing.assert_allclose(check.gyro_bias[log.name], healthy.gyro_bias[log.name], atol=1e-4)
+        np.testing.assert_allclose(told.repaired(bad).velocity, log.velocity, atol=0.005 * np.abs(log.velocity).max())
+
+
 def test_repairs_undo_faults(campaigns):
     log = campaigns["clean"].fit[0]
     shifted = log.replace(
@@ -235,6 +257,12 @@ def test_terms_of_formulas_are_the_derivatives_by_their_numbers(closed, axis):
 def test_a_sensor_fault_without_a_sensible_number_is_refused(value):
     item = {"name": "sensor_delay", "parameters": {"delay": value}}
     with pytest.raises(CfbError, match=r"drone\.yaml: effects\.sensor_delay\.parameters\.delay"):
+        SensorFaults.from_mappings([item], "drone.yaml")
+
+
+def test_a_sensor_fault_has_no_parameters_but_its_own():
+    item = {"name": "sensor_delay", "parameters": {"delay": 0.02, "vertical": 0.9}}
+    with pytest.raises(CfbError, match=r"effects\.sensor_delay\.parameters\.vertical = 0\.9 .*sensor_delay has delay"):
         SensorFaults.from_mappings([item], "drone.yaml")
 
 

@@ -34,15 +34,18 @@ def run_nanodrone(folder: Path, model: str | None, json: Path | None, stride: in
     from cfb_mjx.logs.idsia import VEHICLE_MASS
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import load_model_file
-    from cfb_mjx.sysid.nanodrone import PUBLISHED, QUANTITIES, STEPS, benchmark
+    from cfb_mjx.sysid.nanodrone import PUBLISHED, QUANTITIES, STEPS, Contestant, benchmark
     from cfb_mjx.sysid.observer import Observer
+    from cfb_mjx.sysid.sensor_faults import SensorFaults
 
     declared = load_model_file(DECLARED).with_values("the benchmark's description", mass=VEHICLE_MASS)
-    models = {"declared": (Quadrotor.from_file(declared), None)}
+    contestants = {"declared": Contestant(Quadrotor.from_file(declared))}
     if model is not None:
-        asked = Quadrotor.from_file(load_model_file(model))
-        models |= {"model": (asked, None), "model_observer": (asked, Observer())}
-    result = benchmark(logs, models, stride, Progress("benchmark"))
+        described = load_model_file(model)
+        asked, faults = Quadrotor.from_file(described), SensorFaults.from_mappings(described.effects, model)
+        contestants["model"] = Contestant(asked, None, faults)
+        contestants["model_observer"] = Contestant(asked, Observer(), faults)
+    result = benchmark(logs, contestants, stride, Progress("benchmark"))
     published = {
         name: {f"{quantity}_sum_{unit}": x for (quantity, unit), x in zip(QUANTITIES.items(), sums, strict=True)}
         for name, sums in PUBLISHED.items()

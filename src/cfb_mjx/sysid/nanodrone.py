@@ -28,6 +28,7 @@ from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.metrics import geodesic_deg
 from cfb_mjx.sysid.observer import Observer, causal_rotor_speed, observe
 from cfb_mjx.sysid.replay import remembered
+from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 
 STEPS = 50
 INTERVAL = 0.01
@@ -117,13 +118,26 @@ def hold(starts: Starts) -> tuple[np.ndarray, ...]:
     return position + velocity * time, velocity, multiply(quaternion, exponential(rate * time)), rate
 
 
-def predict(model: Quadrotor, log: FlightLog, starts: Starts, observer: Observer | None = None):
-    """A model's prediction: position, velocity, quaternion and body rate, (W, S, 3 or 4).
+@dataclass(frozen=True)
+class Contestant:
+    """What is judged: a model, with an observer or without, and the faults it knows of the recording chain."""
 
-    A window starts from its row as it is; in the step after row k the rotors turn as row k says. An observer adds the
-    disturbance and the filtered body rate it knows at that row.
+    model: Quadrotor
+    observer: Observer | None = None
+    faults: SensorFaults = HEALTHY
+
+
+def predict(contestant: Contestant, log: FlightLog, starts: Starts):
+    """A contestant's prediction: position, velocity, quaternion and body rate, (W, S, 3 or 4).
+
+    A window starts from its row; in the step after row k the rotors turn as row k says. A scale of the velocity column
+    is taken out of the row and put back into what is predicted; lags of sensors are left alone, for rows later than a
+    window's start would be needed. An observer adds the disturbance and the filtered body rate it knows at that row.
     """
+    model, observer, stretch = contestant.model, contestant.observer, contestant.faults.stretch
+    log = contestant.faults.unstretched(log)
     position, velocity, quaternion, rate = (x[starts.row] for x in starts.truth)
+    velocity = velocity / stretch
     memory = _memory(model, log, starts.row)
     if observer is not None:
         # Pose is read without its delay: to allow for it, rows later than a window's start would be needed.
@@ -138,7 +152,8 @@ def predict(model: Quadrotor, log: FlightLog, starts: Starts, observer: Observer
         index = np.minimum(np.arange(first, first + BLOCK), len(starts) - 1)
         flown = _fly(model, jax.tree.map(lambda x, i=index: x[i], state), inputs[index])
         parts.append(jax.tree.map(lambda x, n=len(starts) - first: np.asarray(x)[:n], flown))
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    position, velocity, quaternion, rate = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    return position, velocity * stretch, quaternion, rate
 
 
 def _memory(model: Quadrotor, log: FlightLog, rows: np.ndarray) -> tuple:
@@ -167,11 +182,11 @@ def _fly(model: Quadrotor, state: State, inputs):
 
 def benchmark(
     logs: Sequence[FlightLog],
-    models: dict[str, tuple[Quadrotor, Observer | None]],
+    contestants: dict[str, Contestant],
     stride: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
-    """Judge ``models`` beside `naive` and `hold` on every flight.
+    """Judge ``contestants`` beside `naive` and `hold` on every flight.
 
     Returns:
         ``windows``; `metrics` over all windows of all flights under ``rows`` by name; ``flights`` with both of each.
@@ -184,8 +199,8 @@ def benchmark(
         starts = find_starts(log, stride)
         if len(starts):
             found[log.name] = {"naive": errors(starts, naive(starts)), "hold": errors(starts, hold(starts))}
-            for name, (model, observer) in models.items():
-                found[log.name][name] = errors(starts, predict(model, log, starts, observer))
+            for name, contestant in contestants.items():
+                found[log.name][name] = errors(starts, predict(contestant, log, starts))
         if progress is not None:
             progress(index + 1, len(logs))
     if not found:

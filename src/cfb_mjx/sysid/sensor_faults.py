@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.resample import interpolate
@@ -14,12 +16,12 @@ from cfb_mjx.model import State
 from cfb_mjx.model.effects import SENSOR_FAULTS
 
 ATTRIBUTES = {
-    "sensor_delay": "delay",
-    "sensor_velocity_scale": "velocity_scale",
-    "sensor_gyro_lowpass": "gyro_lag",
-    "sensor_time_shift": "motor_shift",
+    "sensor_delay": {"delay": "delay"},
+    "sensor_velocity_scale": {"scale": "velocity_scale", "vertical": "vertical_scale"},
+    "sensor_gyro_lowpass": {"lag": "gyro_lag"},
+    "sensor_time_shift": {"shift": "motor_shift"},
 }
-"""Attribute of `SensorFaults` that holds a fault of `SENSOR_FAULTS`."""
+"""Attributes of `SensorFaults` that hold the parameters of a fault of `SENSOR_FAULTS`."""
 
 
 @dataclass(frozen=True)
@@ -28,13 +30,15 @@ class SensorFaults:
 
     Attributes:
         delay: age of pose and velocity beyond the declared observation delay, s.
-        velocity_scale: logged velocity over true velocity.
+        velocity_scale: logged velocity over true velocity, horizontally; and vertically too unless told otherwise.
+        vertical_scale: the same vertically, where an estimator (optical flow, say) stretches only one of the two.
         gyro_lag: lag of the gyro column, s.
         motor_shift: how late command and rotor-speed columns are against all others, s (negative: early).
     """
 
     delay: float = 0.0
     velocity_scale: float = 1.0
+    vertical_scale: float | None = None
     gyro_lag: float = 0.0
     motor_shift: float = 0.0
 
@@ -42,6 +46,16 @@ class SensorFaults:
     def healthy(self) -> bool:
         """Whether there is nothing to take out."""
         return self == SensorFaults()
+
+    @property
+    def stretch(self) -> np.ndarray:
+        """Logged over true velocity along the world's axes, (3,)."""
+        vertical = self.velocity_scale if self.vertical_scale is None else self.vertical_scale
+        return np.array([self.velocity_scale, self.velocity_scale, vertical])
+
+    def unstretched(self, log: FlightLog) -> FlightLog:
+        """The log with nothing but the scale of its velocity taken out, which needs no row but itself."""
+        return log if (self.stretch == 1.0).all() else log.replace(velocity=log.velocity / self.stretch)
 
     def repaired(self, log: FlightLog) -> FlightLog:
         """The log a healthy chain would have recorded; rows whose replacements lie in a gap or beyond the end go."""
@@ -57,8 +71,8 @@ class SensorFaults:
         if self.delay:
             changes["position"] = later(log.position, self.delay)
             changes["quaternion"] = tidy(later(tidy(log.quaternion), self.delay))
-        if self.delay or self.velocity_scale != 1.0:
-            changes["velocity"] = later(log.velocity, self.delay) / self.velocity_scale
+        if self.delay or (self.stretch != 1.0).any():
+            changes["velocity"] = later(log.velocity, self.delay) / self.stretch
         if self.gyro_lag:
             changes["body_rate"] = later(log.body_rate, self.gyro_lag)
         if self.motor_shift:
@@ -86,7 +100,7 @@ class SensorFaults:
         gyro = [times.index(self._instant(h, self.gyro_lag)) for h in horizons]
         return State(
             predicted.position[:, pose],
-            predicted.velocity[:, pose] * self.velocity_scale,
+            predicted.velocity[:, pose] * self.stretch,
             predicted.quaternion[:, pose],
             predicted.body_rate[:, gyro],
             predicted.rotor_speed[:, gyro],
@@ -98,11 +112,13 @@ class SensorFaults:
 
     def to_mappings(self) -> list[dict]:
         """As listed among the effects of a model file."""
-        return [
-            {"name": name, "parameters": {fault.parameter: getattr(self, ATTRIBUTES[name])}}
-            for name, fault in SENSOR_FAULTS.items()
-            if getattr(self, ATTRIBUTES[name]) != fault.healthy
-        ]
+        found = []
+        for name, fault in SENSOR_FAULTS.items():
+            values = {key: getattr(self, attribute) for key, attribute in ATTRIBUTES[name].items()}
+            values = {key: value for key, value in values.items() if value is not None}
+            if any(value != fault.healthy for value in values.values()):
+                found.append({"name": name, "parameters": values})
+        return found
 
     @classmethod
     def from_mappings(cls, items: Iterable[Mapping], where: str) -> SensorFaults:
@@ -116,14 +132,18 @@ class SensorFaults:
             name = item.get("name")
             if name not in SENSOR_FAULTS:
                 continue
-            key, values = SENSOR_FAULTS[name].parameter, item.get("parameters")
-            value = values.get(key) if isinstance(values, Mapping) else None
-            number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not number or (name == "sensor_velocity_scale" and value <= 0):
-                raise CfbError(
-                    f"{where}: effects.{name}.parameters.{key} = {value!r} must be a number that makes sense."
-                )
-            found[ATTRIBUTES[name]] = float(value)
+            values = item.get("parameters")
+            values = values if isinstance(values, Mapping) else {}
+            known = ATTRIBUTES[name]
+            for key in (SENSOR_FAULTS[name].parameter, *(k for k in values if k != SENSOR_FAULTS[name].parameter)):
+                value = values.get(key)
+                number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+                if key not in known or not number or (name == "sensor_velocity_scale" and value <= 0):
+                    raise CfbError(
+                        f"{where}: effects.{name}.parameters.{key} = {value!r} must be a number that makes sense"
+                        f" ({name} has {' and '.join(known)})."
+                    )
+                found[known[key]] = float(value)
         return cls(**found)
 
 

@@ -31,7 +31,9 @@ class Kinematics:
         attitude_lag: pose behind gyro beyond the declared delay, s.
         velocity_lag: velocity behind accelerometer beyond the declared delay, s.
         velocity_scale: velocity over slope of position.
-        weight: how much motion there was to tell each of the three from (inverse variances), for pooling.
+        horizontal_scale: the same of the horizontal components alone.
+        vertical_scale: the same of the vertical component alone.
+        weight: how much motion there was to tell each of the five from (inverse variances), for pooling.
     """
 
     gyro_bias: np.ndarray
@@ -39,6 +41,8 @@ class Kinematics:
     attitude_lag: float
     velocity_lag: float
     velocity_scale: float
+    horizontal_scale: float
+    vertical_scale: float
     weight: np.ndarray
 
 
@@ -67,6 +71,8 @@ def compare_sensors(log: FlightLog, delay: float, gravity: float = 9.81) -> Kine
     gyro_bias = _gyro_bias(quaternion, gyro, long, step, ok_long)
     accelerometer_bias = _accelerometer_bias(quaternion, velocity, world, long, step, ok_long)
     scale, scale_weight = _scale(position, velocity, long, step, ok_long)
+    horizontal, horizontal_weight = _scale(position[:, :2], velocity[:, :2], long, step, ok_long)
+    vertical, vertical_weight = _scale(position[:, 2:], velocity[:, 2:], long, step, ok_long)
 
     short = max(4, round(SHORT / step))
     ok = _spans(covered, short, LAGS[-1] + step, step)
@@ -87,7 +93,9 @@ def compare_sensors(log: FlightLog, delay: float, gravity: float = 9.81) -> Kine
         attitude_lag,
         velocity_lag,
         scale,
-        np.array([attitude_weight, velocity_weight, scale_weight]),
+        horizontal,
+        vertical,
+        np.array([attitude_weight, velocity_weight, scale_weight, horizontal_weight, vertical_weight]),
     )
 
 
@@ -110,7 +118,8 @@ def _spans(covered: np.ndarray, rows: int, margin: float, step: float) -> np.nda
 
 
 def _integral(values: np.ndarray, step: float) -> np.ndarray:
-    return np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (values[1:] + values[:-1]) * step, axis=0)])
+    begin = np.zeros((1, values.shape[1]))
+    return np.concatenate([begin, np.cumsum(0.5 * (values[1:] + values[:-1]) * step, axis=0)])
 
 
 def _span(total: np.ndarray, rows: int, lag: float, step: float) -> np.ndarray:

@@ -195,8 +195,7 @@ def _judged(
     hypothesis = proposal.hypothesis if proposal else found.hypothesis
     reported, unconfirmed = [], []
     for fault in found.sensors.findings:
-        key = SENSOR_FAULTS[fault.name].parameter
-        reported.append(Reported(fault.name, fault.p_value, {key: fault.value}, {key: fault.std}))
+        reported.append(Reported(fault.name, fault.p_value, fault.parameters, fault.uncertainty))
     for item in found.found:
         verdict = confirm(judge, item.without, found.hypothesis)
         entry = Reported(item.name, verdict.p_value, item.parameters, item.uncertainty, item, verdict)

@@ -22,16 +22,33 @@ _BIAS_NOISE = 0.008
 
 @dataclass(frozen=True)
 class Finding:
-    """One sensor fault."""
+    """One sensor fault: its number, and of a velocity column stretched differently along the vertical that one's."""
 
     name: str
     value: float
     std: float
+    vertical: tuple[float, float] | None = None
 
     @property
     def p_value(self) -> float:
         """Two-sided, of no fault."""
-        return float(2 * norm.sf(abs(self.value - SENSOR_FAULTS[self.name].healthy) / self.std))
+        pairs = [(self.value, self.std)] + ([self.vertical] if self.vertical else [])
+        healthy = SENSOR_FAULTS[self.name].healthy
+        return min(float(2 * norm.sf(abs(value - healthy) / std)) for value, std in pairs)
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """As in a model file."""
+        return self._by_name(0)
+
+    @property
+    def uncertainty(self) -> dict[str, float]:
+        """Standard deviations, by the same names."""
+        return self._by_name(1)
+
+    def _by_name(self, which: int) -> dict[str, float]:
+        found = {SENSOR_FAULTS[self.name].parameter: (self.value, self.std)[which]}
+        return found | ({"vertical": self.vertical[which]} if self.vertical else {})
 
 
 @dataclass(frozen=True)
@@ -63,6 +80,12 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
         delay: declared age of pose and velocity, s.
     """
     kinematics = [compare_sensors(log, delay) for log in logs]
+    vertical = _own_vertical_scale(kinematics)
+    if vertical is not None:
+        # Stretched alike along all axes first, so that all else is compared as in any other flight.
+        ratio = vertical[0] / _pooled(kinematics, "horizontal_scale", 3)[0]
+        even = SensorFaults(vertical_scale=ratio)
+        kinematics = [compare_sensors(even.repaired(log), delay) for log in logs]
     pooled = {
         "attitude_lag": _pooled(kinematics, "attitude_lag", 0),
         "velocity_lag": _pooled(kinematics, "velocity_lag", 1),
@@ -78,10 +101,10 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
     }
     findings = []
     for name, (value, std) in looked.items():
-        away = abs(value - SENSOR_FAULTS[name].healthy)
+        own = vertical if name == "sensor_velocity_scale" else None
         # A gyro cannot be ahead of what it measures.
-        if away > SMALLEST[name] and away > SURE * std and not (name == "sensor_gyro_lowpass" and value < 0):
-            findings.append(Finding(name, value, std))
+        if (_away(name, value, std) or own) and not (name == "sensor_gyro_lowpass" and value < 0):
+            findings.append(Finding(name, value, std, own))
     if any(f.name == "sensor_delay" for f in findings) and not any(f.name == "sensor_gyro_lowpass" for f in findings):
         # With a healthy gyro both comparisons show the same delay; the turn tells it more exactly.
         weight = np.array([1 / turn_std**2, 1 / gain_std**2])
@@ -89,7 +112,7 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
         findings = [
             Finding(f.name, value, float(weight.sum() ** -0.5)) if f.name == "sensor_delay" else f for f in findings
         ]
-    faults = SensorFaults(**{ATTRIBUTES[f.name]: f.value for f in findings})
+    faults = SensorFaults(**{ATTRIBUTES[f.name][key]: x for f in findings for key, x in f.parameters.items()})
     if not faults.healthy:
         # Biases again, from repaired flights.
         kinematics = [compare_sensors(faults.repaired(log), delay) for log in logs]
@@ -103,13 +126,30 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
     )
 
 
+def _away(name: str, value: float, std: float, healthy: float | None = None) -> bool:
+    """Whether a fault is worth taking out, and surely one."""
+    away = abs(value - (SENSOR_FAULTS[name].healthy if healthy is None else healthy))
+    return away > SMALLEST[name] and away > SURE * std
+
+
+def _own_vertical_scale(kinematics: list[Kinematics]) -> tuple[float, float] | None:
+    """Vertical velocity over slope of height, where that is surely another than horizontally."""
+    (across, across_std), (up, up_std) = (
+        _pooled(kinematics, "horizontal_scale", 3),
+        _pooled(kinematics, "vertical_scale", 4),
+    )
+    if not _away("sensor_velocity_scale", up, float(np.hypot(up_std, across_std)), across):
+        return None
+    return up, up_std
+
+
 def _pooled(kinematics: list[Kinematics], name: str, index: int) -> tuple[float, float]:
     """Weighted mean over the flights, with a deviation that covers their scatter too."""
     values = np.array([getattr(k, name) for k in kinematics])
     weights = np.array([k.weight[index] for k in kinematics])
     total = weights.sum()
     if total <= 0:
-        return (1.0 if name == "velocity_scale" else 0.0), np.inf
+        return (1.0 if name.endswith("_scale") else 0.0), np.inf
     mean = float(weights @ values / total)
     used = weights > 0.01 * weights.max()
     chi = float(np.sum(weights[used] * (values[used] - mean) ** 2) / max(used.sum() - 1, 1))
