@@ -8,6 +8,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from plant import Plant, derivative, fly
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from cfb_mjx.cli import main
@@ -90,18 +91,38 @@ def held(log, row):
         yield p + 0.01 * h * v, v, turned, w
 
 
+def thrown(log, row):
+    """Thrust of the paper's constants turning with a constant body rate, by an integrator of SciPy's."""
+    p, v, q, w = at(log, row)
+    turned = Rotation.from_quat(q, scalar_first=True)
+
+    def slope(t, x, lift):
+        up = (turned * Rotation.from_rotvec(w * t)).apply([0.0, 0.0, 1.0])
+        return np.concatenate([x[3:], up * lift - [0.0, 0.0, 9.81]])
+
+    x = np.concatenate([p, v])
+    for k in range(50):
+        lift = 3.72e-8 * np.sum(log.rotor_speed[row + k] ** 2) / 0.045
+        x = solve_ivp(slope, (0.01 * k, 0.01 * (k + 1)), x, args=(lift,), rtol=1e-10, atol=1e-12).y[:, -1]
+        q = (turned * Rotation.from_rotvec(w * 0.01 * (k + 1))).as_quat(scalar_first=True)
+        yield x[:3], x[3:], q, w
+
+
 def test_metrics_are_those_of_brute_force(log):
     found = nanodrone.benchmark([log], {"declared": nanodrone.Contestant(GUARDS)})
     assert found["windows"] == found["flights"]["tiny"]["windows"] == ROWS - 50
     expected = {
         "naive": brute(log, lambda row: [at(log, row)] * 50),
         "hold": brute(log, lambda row: held(log, row)),
+        "physics": brute(log, lambda row: thrown(log, row)),
         "declared": brute(log, lambda row: integrated(log, row)),
     }
     for name, numbers in expected.items():
         assert set(found["rows"][name]) == set(numbers)
         for key, value in numbers.items():
-            assert found["rows"][name][key] == pytest.approx(value, rel=1e-5), (name, key)
+            # The thrust of a step of physics is that halfway through its turn.
+            close = pytest.approx(value, rel=1e-4 if name == "physics" else 1e-5)
+            assert found["rows"][name][key] == close, (name, key)
         assert found["flights"]["tiny"]["rows"][name] == found["rows"][name]
 
 
@@ -235,9 +256,9 @@ def test_the_command_writes_its_table_and_json(folder, tmp_path, capsys, monkeyp
     assert main(["benchmark-nanodrone", str(folder), "--model", "cfb-guards", "--json", str(out)]) == 0
     printed = capsys.readouterr().out
     found = json.loads(out.read_text())
-    assert set(found["rows"]) == {"naive", "hold", "declared", "model", "model_observer"}
+    assert set(found["rows"]) == {"naive", "hold", "physics", "declared", "model", "model_observer"}
     assert set(found["flights"]["made"]["rows"]["model"]) == set(found["rows"]["naive"])
     assert found["windows"] > 50
     assert found["published"]["physics"]["attitude_sum_rad"] == 5.101
-    for label in ("naive", "hold", "cfb-guards, 45 g", "model with observer", "LSTM"):
+    for label in ("naive", "hold", "physics (rate held)", "cfb-guards, 45 g", "model with observer", "LSTM"):
         assert f"\n{label} " in printed

@@ -59,6 +59,7 @@ def run_nanodrone(folder: Path, model: str | None, json: Path | None, stride: in
 
 _UNITS = {"position": "m", "velocity": "m/s", "attitude": "rad", "rate": "rad/s"}
 _LABELS = {
+    "physics": "physics (rate held)",
     "declared": f"{DECLARED}, 45 g",
     "model": "model",
     "model_observer": "model with observer",

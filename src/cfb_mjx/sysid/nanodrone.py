@@ -19,7 +19,8 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.logs.rotation import exponential, multiply
+from cfb_mjx.logs.idsia import VEHICLE_MASS
+from cfb_mjx.logs.rotation import exponential, multiply, to_world
 from cfb_mjx.model.quadrotor import Quadrotor, integrate_measured, prepare
 from cfb_mjx.model.state import State, stack, unstack
 from cfb_mjx.model.vector import Vec
@@ -38,6 +39,8 @@ SHOWN = (1, 10, 50)
 BLOCK = 1024
 """Windows predicted together."""
 QUANTITIES = {"position": "m", "velocity": "mps", "attitude": "rad", "rate": "radps"}
+THRUST, GRAVITY = 3.72e-8, 9.81
+"""Of the paper's row *physics*: thrust of a rotor over its squared speed, N s^2, and m/s^2."""
 PUBLISHED: dict[str, tuple[float, float, float, float]] = {
     "naive": (17.79, 38.92, 8.21, 29.09),
     "physics": (2.322, 10.62, 5.101, 29.09),
@@ -127,6 +130,26 @@ class Contestant:
     faults: SensorFaults = HEALTHY
 
 
+def physics(starts: Starts) -> tuple[np.ndarray, ...]:
+    """What the paper's row *physics* is: thrust moves the drone, and its body rate stays what it is.
+
+    Its rate errors are those of *naive* to the last digit, and the paper says why: torques from squared rotor speeds
+    predicted turns worse than none, so angular acceleration is zero.
+    """
+    position, velocity, quaternion, rate = (x[starts.row] for x in starts.truth)
+    halfway = exponential(rate * (INTERVAL / 2))
+    found = []
+    for k in range(STEPS):
+        middle, quaternion = multiply(quaternion, halfway), multiply(quaternion, exponential(rate * INTERVAL))
+        lift = np.zeros_like(rate)
+        lift[:, 2] = THRUST * np.sum(starts.rotor_speed[starts.row + k] ** 2, axis=1) / VEHICLE_MASS
+        acceleration = to_world(middle, lift) - [0.0, 0.0, GRAVITY]
+        position = position + INTERVAL * velocity + 0.5 * INTERVAL**2 * acceleration
+        velocity = velocity + INTERVAL * acceleration
+        found.append((position, velocity, quaternion, rate))
+    return tuple(np.stack(x, axis=1) for x in zip(*found, strict=True))
+
+
 def predict(contestant: Contestant, log: FlightLog, starts: Starts):
     """A contestant's prediction: position, velocity, quaternion and body rate, (W, S, 3 or 4).
 
@@ -186,7 +209,7 @@ def benchmark(
     stride: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
-    """Judge ``contestants`` beside `naive` and `hold` on every flight.
+    """Judge ``contestants`` beside `naive`, `hold` and `physics` on every flight.
 
     Returns:
         ``windows``; `metrics` over all windows of all flights under ``rows`` by name; ``flights`` with both of each.
@@ -198,7 +221,8 @@ def benchmark(
     for index, log in enumerate(logs):
         starts = find_starts(log, stride)
         if len(starts):
-            found[log.name] = {"naive": errors(starts, naive(starts)), "hold": errors(starts, hold(starts))}
+            simple = {"naive": naive, "hold": hold, "physics": physics}
+            found[log.name] = {name: errors(starts, rule(starts)) for name, rule in simple.items()}
             for name, contestant in contestants.items():
                 found[log.name][name] = errors(starts, predict(contestant, log, starts))
         if progress is not None:
