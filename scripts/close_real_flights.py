@@ -275,7 +275,7 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "Sums of mean errors over 50 steps of 10 ms, rotor speeds in ([rules](nanodrone.md)): position m, velocity",
             "m/s, attitude rad, body rate rad/s, and beside each its share of the rows *naive* and *physics*.",
             "Published rows are on the benchmark's own test flights, which are easier to predict from how the drone",
-            "moves: *physics*, one and the same rule, errs a smaller share of *naive* there. So compare shares of both.",
+            "moves: *physics*, one and the same rule, errs a smaller share of *naive* there. Compare shares of both.",
             "",
             "| | position | velocity | attitude | body rate |",
             "|---|---|---|---|---|",
