@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from cfb_mjx.cli import main
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import GroundEffect, Wind
@@ -52,6 +53,20 @@ def test_an_effect_the_model_has_keeps_its_strength():
 def test_what_cannot_be_told_by_flying_is_refused(names, said):
     with pytest.raises(CfbError, match=said):
         separate(GUARDS, names)
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("separate --between wind,payload --rate-limit 6 --repetitions 3", "leave out --rate-limit, --repetitions"),
+        ("separate --between wind,payload --parameters inertia", "leave out --parameters"),
+        ("roll-pitch --between wind,payload", "roll-pitch tells no effects apart"),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(command, said, tmp_path, capsys):
+    assert main(["excite", *command.split(), "-o", str(tmp_path / "next")]) != 0
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "next").exists()
 
 
 def test_a_path_is_worth_its_least_telling_pair():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -228,13 +229,16 @@ def excite(
         between: effects to tell apart (separate); those the model has are taken at its strengths.
         json: write the results here too.
     """
+    from cfb_mjx.cli.exciting import refuse_unused, run_excite
+
+    limits = {"duration": duration, "rate_limit": rate_limit, "altitude_loss": altitude_loss}
+    told, usual = limits | {"parameters": parameters, "repetitions": repetitions}, signature(excite).parameters
+    refuse_unused(manoeuvre, between, [name for name, value in told.items() if value != usual[name].default])
     if manoeuvre == "separate":
         from cfb_mjx.cli.separating import run_separate
 
         run_separate(between, output, model, list(set), measured_rotors, disturbance, json)
         return
-    from cfb_mjx.cli.exciting import run_excite
-
     run_excite(
         manoeuvre,
         output,

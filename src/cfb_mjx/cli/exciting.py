@@ -39,6 +39,24 @@ class Trial:
     worst: dict
 
 
+def refuse_unused(manoeuvre: str, between: str | None, told: list[str]) -> None:
+    """Refuse options that would be ignored.
+
+    Args:
+        manoeuvre: as on the command line.
+        between: effects to tell apart, which only ``separate`` does.
+        told: options given that only the other manoeuvres have.
+
+    Raises:
+        CfbError: an option the manoeuvre has no use for, named.
+    """
+    if manoeuvre == "separate" and told:
+        names = ", ".join("--" + name.replace("_", "-") for name in told)
+        raise CfbError(f"cfb excite separate flies paths of its own: leave out {names}.")
+    if manoeuvre != "separate" and between is not None:
+        raise CfbError(f"cfb excite {manoeuvre} tells no effects apart: leave out --between, or say separate.")
+
+
 def run_excite(
     manoeuvre: Manoeuvre,
     output: Path,
