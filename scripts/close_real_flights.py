@@ -173,9 +173,7 @@ def sums(models: dict[str, ModelFile], judged: list[FlightLog], observer: Observ
     """The IDSIA benchmark's sums on the validation flights."""
     built = {}
     for suffix, beside in (("", None), (", observer", observer)):
-        for name, described in models.items():
-            faults = SensorFaults.from_mappings(described.effects, described.name)
-            built[name + suffix] = Contestant(Quadrotor.from_file(described), beside, faults)
+        built |= {name + suffix: Contestant.of(described, beside) for name, described in models.items()}
     rows = benchmark(judged, built, 1, lambda *_: None)["rows"]
     return {name: [row[f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for name, row in rows.items()}
 

@@ -32,19 +32,16 @@ def run_nanodrone(folder: Path, model: str | None, json: Path | None, stride: in
         raise CfbError(f"{folder}: two flights have one name; keep each flight as parquet or as csv.")
     configure_jax(x64=True)
     from cfb_mjx.logs.idsia import VEHICLE_MASS
-    from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid.nanodrone import PUBLISHED, QUANTITIES, STEPS, Contestant, benchmark
     from cfb_mjx.sysid.observer import Observer
-    from cfb_mjx.sysid.sensor_faults import SensorFaults
 
     declared = load_model_file(DECLARED).with_values("the benchmark's description", mass=VEHICLE_MASS)
-    contestants = {"declared": Contestant(Quadrotor.from_file(declared))}
+    contestants = {"declared": Contestant.of(declared)}
     if model is not None:
         described = load_model_file(model)
-        asked, faults = Quadrotor.from_file(described), SensorFaults.from_mappings(described.effects, model)
-        contestants["model"] = Contestant(asked, None, faults)
-        contestants["model_observer"] = Contestant(asked, Observer(), faults)
+        contestants["model"] = Contestant.of(described, where=model)
+        contestants["model_observer"] = Contestant.of(described, Observer(), where=model)
     result = benchmark(logs, contestants, stride, Progress("benchmark"))
     published = {
         name: {f"{quantity}_sum_{unit}": x for (quantity, unit), x in zip(QUANTITIES.items(), sums, strict=True)}

@@ -24,6 +24,7 @@ from cfb_mjx.logs.rotation import exponential, multiply, to_world
 from cfb_mjx.model.quadrotor import Quadrotor, integrate_measured, prepare
 from cfb_mjx.model.state import State, stack, unstack
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.disturbance import observed_model
 from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.metrics import geodesic_deg
@@ -121,6 +122,26 @@ def hold(starts: Starts) -> tuple[np.ndarray, ...]:
     return position + velocity * time, velocity, multiply(quaternion, exponential(rate * time)), rate
 
 
+def physics(starts: Starts) -> tuple[np.ndarray, ...]:
+    """What the paper's row *physics* is: thrust moves the drone, and its body rate stays what it is.
+
+    Its rate errors are those of *naive* to the last digit, and the paper says why: torques from squared rotor speeds
+    predicted turns worse than none, so angular acceleration is zero.
+    """
+    position, velocity, quaternion, rate = (x[starts.row] for x in starts.truth)
+    half, whole = exponential(rate * (INTERVAL / 2)), exponential(rate * INTERVAL)
+    found = []
+    for k in range(STEPS):
+        middle, quaternion = multiply(quaternion, half), multiply(quaternion, whole)
+        lift = np.zeros_like(rate)
+        lift[:, 2] = THRUST * np.sum(starts.rotor_speed[starts.row + k] ** 2, axis=1) / VEHICLE_MASS
+        acceleration = to_world(middle, lift) - [0.0, 0.0, GRAVITY]
+        position = position + INTERVAL * velocity + 0.5 * INTERVAL**2 * acceleration
+        velocity = velocity + INTERVAL * acceleration
+        found.append((position, velocity, quaternion, rate))
+    return tuple(np.stack(x, axis=1) for x in zip(*found, strict=True))
+
+
 @dataclass(frozen=True)
 class Contestant:
     """What is judged: a model, with an observer or without, and the faults it knows of the recording chain."""
@@ -129,25 +150,15 @@ class Contestant:
     observer: Observer | None = None
     faults: SensorFaults = HEALTHY
 
+    @classmethod
+    def of(cls, described: ModelFile, observer: Observer | None = None, where: str = "") -> Contestant:
+        """The model of a file, with the sensor faults it lists.
 
-def physics(starts: Starts) -> tuple[np.ndarray, ...]:
-    """What the paper's row *physics* is: thrust moves the drone, and its body rate stays what it is.
-
-    Its rate errors are those of *naive* to the last digit, and the paper says why: torques from squared rotor speeds
-    predicted turns worse than none, so angular acceleration is zero.
-    """
-    position, velocity, quaternion, rate = (x[starts.row] for x in starts.truth)
-    halfway = exponential(rate * (INTERVAL / 2))
-    found = []
-    for k in range(STEPS):
-        middle, quaternion = multiply(quaternion, halfway), multiply(quaternion, exponential(rate * INTERVAL))
-        lift = np.zeros_like(rate)
-        lift[:, 2] = THRUST * np.sum(starts.rotor_speed[starts.row + k] ** 2, axis=1) / VEHICLE_MASS
-        acceleration = to_world(middle, lift) - [0.0, 0.0, GRAVITY]
-        position = position + INTERVAL * velocity + 0.5 * INTERVAL**2 * acceleration
-        velocity = velocity + INTERVAL * acceleration
-        found.append((position, velocity, quaternion, rate))
-    return tuple(np.stack(x, axis=1) for x in zip(*found, strict=True))
+        Raises:
+            CfbError: effects or faults that make no sense; ``where`` is the file.
+        """
+        faults = SensorFaults.from_mappings(described.effects, where or f"model {described.name}")
+        return cls(Quadrotor.from_file(described), observer, faults)
 
 
 def predict(contestant: Contestant, log: FlightLog, starts: Starts):
@@ -159,8 +170,8 @@ def predict(contestant: Contestant, log: FlightLog, starts: Starts):
     """
     model, observer, stretch = contestant.model, contestant.observer, contestant.faults.stretch
     log = contestant.faults.unstretched(log)
-    position, velocity, quaternion, rate = (x[starts.row] for x in starts.truth)
-    velocity = velocity / stretch
+    position, _, quaternion, rate = (x[starts.row] for x in starts.truth)
+    velocity = log.velocity[starts.row]
     memory = _memory(model, log, starts.row)
     if observer is not None:
         # Pose is read without its delay: to allow for it, rows later than a window's start would be needed.

@@ -135,7 +135,7 @@ class SensorFaults:
             values = item.get("parameters")
             values = values if isinstance(values, Mapping) else {}
             known = ATTRIBUTES[name]
-            for key in (SENSOR_FAULTS[name].parameter, *(k for k in values if k != SENSOR_FAULTS[name].parameter)):
+            for key in dict.fromkeys([SENSOR_FAULTS[name].parameter, *values]):
                 value = values.get(key)
                 number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
                 if key not in known or not number or (name == "sensor_velocity_scale" and value <= 0):

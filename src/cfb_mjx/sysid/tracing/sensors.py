@@ -85,7 +85,7 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
         # Stretched alike along all axes first, so that all else is compared as in any other flight.
         ratio = vertical[0] / _pooled(kinematics, "horizontal_scale", 3)[0]
         even = SensorFaults(vertical_scale=ratio)
-        kinematics = [compare_sensors(even.repaired(log), delay) for log in logs]
+        kinematics = [compare_sensors(even.unstretched(log), delay) for log in logs]
     pooled = {
         "attitude_lag": _pooled(kinematics, "attitude_lag", 0),
         "velocity_lag": _pooled(kinematics, "velocity_lag", 1),
