@@ -15,7 +15,7 @@ from jaxtyping import install_import_hook
 jax.config.update("jax_enable_x64", True)
 
 # Annotated shapes and dtypes are checked in tests only. Must run before anything imports these packages.
-install_import_hook(["cfb_mjx.model", "cfb_mjx.parameters"], "beartype.beartype")
+install_import_hook(["cfb_mjx.model", "cfb_mjx.parameters", "cfb_mjx.envs", "cfb_mjx.control"], "beartype.beartype")
 
 
 def pytest_configure(config) -> None:

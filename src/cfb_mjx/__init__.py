@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 __version__ = "0.1.0"
 
-_ROOMS = ("logs", "model", "parameters", "sysid", "view")
-__all__ = ["__version__", "logs", "model", "parameters", "sysid", "view"]
+_ROOMS = ("control", "envs", "logs", "model", "parameters", "sysid", "train", "view")
+__all__ = ["__version__", "control", "envs", "logs", "model", "parameters", "sysid", "train", "view"]
 
 if TYPE_CHECKING:
-    from cfb_mjx import logs, model, parameters, sysid, view
+    from cfb_mjx import control, envs, logs, model, parameters, sysid, train, view
 
 
 def __getattr__(name: str):

@@ -20,6 +20,8 @@ SUMMARY = {
     "excite": "design a manoeuvre that identifies the drone, and predict what a fit will know",
     "close-loop": "find the physical effect a model lacks, and add it",
     "refine": "fit the numbers of named effects, to innovations or to predictions",
+    "train": "train a controller, by PPO or by back-propagation through the model",
+    "fly": "fly a controller in simulation and measure it",
     "bench": "measure throughput, compile time and memory",
     "demo": "evaluate a flight, fly 4096 randomised drones, write a page",
     "version": "print versions",

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from cfb_mjx.cli.learning_commands import fly, train
 from cfb_mjx.errors import CfbError
 
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")]
@@ -371,6 +372,8 @@ COMMANDS = {
     "excite": excite,
     "close-loop": close_loop,
     "refine": refine,
+    "train": train,
+    "fly": fly,
     "bench": bench,
     "demo": demo,
     "version": version,

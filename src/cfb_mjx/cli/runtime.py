@@ -84,11 +84,11 @@ class Progress:
         self.what = what
         self.live = sys.stderr.isatty()
 
-    def __call__(self, done: int, total: int) -> None:
+    def __call__(self, done: int, total: int, more: str = "") -> None:
         if not self.live:
             return
         filled = round(30 * done / max(total, 1))
         end = "\n" if done >= total else ""
-        print(
-            f"\r{self.what} [{'#' * filled}{'.' * (30 - filled)}] {done}/{total}", end=end, file=sys.stderr, flush=True
-        )
+        # The rest of an earlier, longer line is wiped.
+        line = f"\r{self.what} [{'#' * filled}{'.' * (30 - filled)}] {done}/{total} {more}\x1b[K"
+        print(line, end=end, file=sys.stderr, flush=True)

@@ -6,6 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from cfb_mjx.model.state import AnyArray
+
 
 class Gains(eqx.Module):
     """Of three loops side by side."""
@@ -36,7 +38,7 @@ def update(
     error: Float[Array, "3"],
     measured: Float[Array, "3"],
     dt: float,
-    wraps: Bool[Array, "3"] | bool = False,
+    wraps: Bool[AnyArray, "3"] | bool = False,
 ) -> tuple[Memory, Float[Array, "3"]]:
     """One step: proportional and integral of the error, derivative of the measurement.
 

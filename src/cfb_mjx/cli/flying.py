@@ -1,0 +1,136 @@
+"""``cfb fly``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import require_folder, write_json
+
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+
+def run_fly(
+    controller: str,
+    task: str,
+    model: str,
+    plants: int,
+    magnitude: float,
+    randomisation: str,
+    noise: bool,
+    seed: int,
+    json: Path | None,
+    figure: Path | None,
+) -> None:
+    """Fly, print what was measured, write what was asked for.
+
+    Raises:
+        CfbError: an unknown controller, model or randomisation, impossible numbers, or outputs without a folder.
+    """
+    require_folder(json, figure)
+    if plants < 1:
+        raise CfbError(f"--plants {plants}: at least one drone must fly.")
+    if magnitude < 0:
+        raise CfbError(f"--magnitude {magnitude}: must be zero or positive.")
+    configure_jax(x64=False)
+    import jax
+    import numpy as np
+
+    from cfb_mjx.envs import Noise, TargetTask
+    from cfb_mjx.envs.target import QUIET
+    from cfb_mjx.model import Quadrotor
+    from cfb_mjx.parameters import load_model_file, load_randomisation
+    from cfb_mjx.train import flying
+
+    nominal = Quadrotor.from_file(load_model_file(model))
+    spread = load_randomisation(randomisation)
+    delay = max(0.016, 0.004 * np.ceil(float(np.max(nominal.parameters.observation_delay)) / 0.004 - 1e-9))
+    course = TargetTask(
+        noise=Noise() if noise else QUIET,
+        randomisation=spread if magnitude else None,
+        magnitude=magnitude,
+        longest_delay_s=float(delay),
+    )
+    pilot = find_pilot(controller, nominal)
+    keys = jax.random.split(jax.random.PRNGKey(seed), plants)
+    measured, flown = flying.TESTS[task](pilot, course, nominal, keys)
+    result = {"controller": controller, "task": task, "model": model, "plants": plants, "magnitude": magnitude}
+    result |= summary(task, {k: np.asarray(v) for k, v in measured._asdict().items()})
+    _print(result)
+    if json is not None:
+        write_json(json, result | {"environment": environment()})
+        print(f"results: {json}")
+    if figure is not None:
+        from cfb_mjx.view.flight import flight_figure
+
+        flight_figure(flown, pilot.control_dt_s, figure, f"{controller}, {task}, {model}")
+        print(f"figure: {figure}")
+
+
+def find_pilot(controller: str, nominal):
+    """The pilot of a name or a policy file.
+
+    Raises:
+        CfbError: there is no such controller, or the file is no policy.
+    """
+    from cfb_mjx.control import FirmwarePid
+    from cfb_mjx.control.policy_file import load_policy, shipped_policies
+    from cfb_mjx.train.flying import Neural, Pid
+
+    if controller == "pid":
+        return Pid(FirmwarePid.hovering(nominal.changed_parameters()))
+    found = shipped_policies()
+    if controller in found:
+        return Neural(load_policy(found[controller]).controller)
+    if Path(controller).suffix != ".npz":
+        names = ", ".join(["pid", *found])
+        raise CfbError(f"{controller}: no such controller; give a policy file (.npz) or one of {names}.")
+    return Neural(load_policy(controller).controller)
+
+
+def summary(task: str, measured: dict) -> dict:
+    """JSON of a test: means over the flights, and over many also quantiles and the rate of success."""
+    import numpy as np
+
+    failed = measured["failed"]
+    if task == "hover":
+        values = {"mean_distance_mm": 1e3 * measured["mean_distance_m"], "command_std": measured["command_std"]}
+        good = ~failed
+    elif task == "step":
+        values = {key: measured[key] for key in ("arrival_s", "peak_speed_mps", "overshoot_m")}
+        good = ~failed & np.isfinite(measured["arrival_s"])
+    else:
+        values = {key: measured[key] for key in ("lost_height_m", "final_distance_m")}
+        good = measured["recovered"]
+    result = {key: float(np.mean(value)) for key, value in values.items()} | {"failed": bool(failed.any())}
+    if len(failed) > 1:
+        result |= {"failure_rate": float(failed.mean()), "success_rate": float(good.mean())}
+        result["quantiles"] = {
+            key: {f"{q:g}": float(np.quantile(value[good], q)) if good.any() else None for q in QUANTILES}
+            for key, value in values.items()
+        }
+    elif task == "recover":
+        result["recovered"] = bool(good[0])
+    return result
+
+
+_UNITS = {"mm": "mm", "s": "s", "mps": "m/s", "m": "m"}
+
+
+def _print(result: dict) -> None:
+    drones = "drone" if result["plants"] == 1 else "drones"
+    print(f"{result['controller']}, {result['task']}: {result['plants']} {drones}, {result['model']}")
+    quantiles = result.get("quantiles", {})
+    for key, value in result.items():
+        if key in ("controller", "task", "model", "plants", "magnitude", "quantiles"):
+            continue
+        name, _, unit = key.rpartition("_")
+        unit = _UNITS.get(unit)
+        text = f"{name} [{unit}]" if unit else key
+        shown = value if isinstance(value, bool) else f"{value:.4g}"
+        spread = quantiles.get(key)
+        more = (
+            "" if not spread or spread["0.5"] is None else f"   median {spread['0.5']:.4g}, 95 % {spread['0.95']:.4g}"
+        )
+        print(f"  {text.replace('_', ' '):<24}{shown}{more}")

@@ -1,0 +1,81 @@
+"""What ``cfb train`` and ``cfb fly`` take; see `cfb_mjx.cli.commands`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Output = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
+File = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+
+
+def train(
+    task: Annotated[Literal["target"], tyro.conf.Positional],
+    output: Output,
+    config: Annotated[str | None, tyro.conf.arg(metavar="CONFIG")] = None,
+    model: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None,
+    algorithm: Literal["ppo", "analytic"] | None = None,
+    seed: int | None = None,
+    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE...")] = (),
+    start: File = None,
+    resume: bool = False,
+    force: bool = False,
+    devices: int = 1,
+) -> None:
+    """Train a controller. Interrupt it whenever you like: --resume goes on to the same result.
+
+    Writes policy.npz (what `cfb fly` flies), curve.csv and curve.png (learning curve), config.yaml and checkpoint.npz.
+
+    Args:
+        task: what to learn: fly to a target and hold it.
+        output: folder for the results.
+        config: training YAML, or the name of a shipped one; the task's own by default.
+        model: preset or model YAML of the drone, with its effects; in place of the configuration's.
+        algorithm: ppo (the paper's) or analytic (back-propagation through the model); in place of the configuration's.
+        seed: of everything random; in place of the configuration's.
+        set: changes to the configuration, for instance randomisation.magnitude=0.5 ppo.steps=2e7.
+        start: policy to start from, in place of random weights.
+        resume: go on from the checkpoint in the folder.
+        force: train on a model that is a predictor, not a plant.
+        devices: of this machine over which the drones are spread.
+    """
+    from cfb_mjx.cli.training import run_train
+
+    choices = {"model": model, "algorithm": algorithm, "seed": seed}
+    run_train(config or task, output, set, choices, start, resume, force, devices)
+
+
+def fly(
+    controller: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONTROLLER")],
+    task: Literal["hover", "step", "recover"] = "hover",
+    model: Annotated[str, tyro.conf.arg(metavar="MODEL")] = "cfb-guards",
+    plants: int = 1,
+    magnitude: float = 0.0,
+    randomisation: Annotated[str, tyro.conf.arg(metavar="NAME")] = "paper",
+    noise: bool = True,
+    seed: int = 0,
+    json: File = None,
+    figure: File = None,
+) -> None:
+    """Fly a controller in simulation and measure it.
+
+    hover: 6 s at the target, the first second not counted. step: 6 m to one side. recover: thrown at 3 m/s, tilted 60
+    deg.
+
+    Args:
+        controller: pid (the firmware's), a shipped policy, or a policy file of `cfb train`.
+        task: what to fly.
+        model: preset or model YAML of the drone, with its effects.
+        plants: number of flights, each on a drone drawn anew.
+        magnitude: factor on the randomisation of the drones; 0 flies the model itself.
+        randomisation: which ranges: a shipped name or a YAML file.
+        noise: with the noise of state and estimates that policies are trained with.
+        seed: of everything random.
+        json: write the results here.
+        figure: draw the flights here.
+    """
+    from cfb_mjx.cli.flying import run_fly
+
+    run_fly(controller, task, model, plants, magnitude, randomisation, noise, seed, json, figure)

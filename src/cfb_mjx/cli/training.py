@@ -1,0 +1,61 @@
+"""``cfb train``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from cfb_mjx.cli.runtime import Progress, configure_jax, environment, say
+from cfb_mjx.files import require_no_file, write_json
+
+NEWEST = "training.json"
+
+
+def run_train(
+    config: str,
+    output: Path,
+    changes: tuple[str, ...],
+    choices: dict,
+    start: Path | None,
+    resume: bool,
+    force: bool,
+    devices: int,
+) -> None:
+    """Train, and write policy, learning curve, configuration and checkpoint into ``output``.
+
+    Raises:
+        CfbError: a bad configuration, model or policy; an earlier training in the folder; another one to resume.
+    """
+    require_no_file(output)
+    if devices > 1 and "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        flag = f"--xla_force_host_platform_device_count={devices}"
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()
+    configure_jax(x64=False)
+    from cfb_mjx.train.config import load_config, with_changes
+    from cfb_mjx.train.run import POLICY, Training, train
+    from cfb_mjx.view.learning import learning_figure
+
+    settings = with_changes(load_config(config, changes), **choices)
+    facts = environment()
+    versions = {name: facts[name] for name in ("cfb_mjx", "jax", "jaxlib", "python")}
+    training = Training.prepare(settings, versions, start, force)
+    say(f"{settings.algorithm} on {training.described.name}, randomisation x {settings.randomisation.magnitude:g}")
+    bar = Progress("training")
+    rows = []
+
+    def advanced(done: int, total: int, rate: float, left: float) -> None:
+        bar(done, total, f"{rate / 1e3:.0f} k commands/s, {_clock(left)} left")
+
+    def reported(row: dict) -> None:
+        rows.append(row)
+        hover = f", hover {row['hover_mm']:.3g} mm, command std {row['command_std']:.3g}" if "hover_mm" in row else ""
+        say(f"{_clock(row['seconds'])}: {row['commands'] / 1e6:.3g} M commands, loss {row['loss']:.3g}{hover}")
+
+    rows = train(training, output, resume, advanced, reported, devices=devices)
+    learning_figure(rows, output / "curve.png", f"{settings.algorithm}, {training.described.name}")
+    write_json(output / NEWEST, {"environment": facts, "last": rows[-1]})
+    print(f"policy: {output / POLICY}\nlearning curve: {output / 'curve.csv'}, {output / 'curve.png'}")
+
+
+def _clock(seconds: float) -> str:
+    return f"{int(seconds // 3600)}:{int(seconds // 60 % 60):02d}:{int(seconds % 60):02d}"

@@ -1,0 +1,72 @@
+"""A small fully connected network as a controller."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cfb_mjx.envs.observation import Estimate, Layout, Memory, observation, remember, start
+
+ACTIVATIONS: dict[str, Callable] = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
+
+
+class Network(eqx.Module):
+    """Weights (inputs, outputs) and biases, first layer first; the activation stands between layers."""
+
+    weights: tuple[Float[Array, "_ _"], ...]
+    biases: tuple[Float[Array, "_"], ...]
+    activation: str = eqx.field(static=True, default="tanh")
+
+    @classmethod
+    def random(cls, key: PRNGKeyArray, sizes: tuple[int, ...], activation: str = "tanh", last: float = 1.0) -> Network:
+        """LeCun-uniform weights, zero biases; those of the last layer scaled by ``last``."""
+        weights = []
+        for i, (inputs, outputs) in enumerate(pairwise(sizes)):
+            bound = (3 / inputs) ** 0.5 * (last if i == len(sizes) - 2 else 1.0)
+            weights.append(jax.random.uniform(jax.random.fold_in(key, i), (inputs, outputs), float, -bound, bound))
+        return cls(tuple(weights), tuple(jnp.zeros(n) for n in sizes[1:]), activation)
+
+    def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
+        act = ACTIVATIONS[self.activation]
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = act(x @ weight + bias)
+        return x @ self.weights[-1] + self.biases[-1]
+
+
+class NeuralController(eqx.Module):
+    """A network that turns observations into commands u = (1 + tanh(output)) / 2."""
+
+    network: Network
+    layout: Layout = eqx.field(static=True, default_factory=Layout)
+
+    @classmethod
+    def random(
+        cls,
+        key: PRNGKeyArray,
+        layout: Layout,
+        hidden: tuple[int, ...] = (32, 32, 32, 32),
+        activation: str = "tanh",
+        hover: float = 0.55,
+    ) -> NeuralController:
+        """A controller that commands about ``hover`` whatever it sees."""
+        network = Network.random(key, (layout.size, *hidden, 4), activation, last=0.01)
+        bias = jnp.full(4, jnp.arctanh(2 * hover - 1))
+        return cls(eqx.tree_at(lambda n: n.biases[-1], network, bias), layout)
+
+    def act(self, shown: Float[Array, "size"]) -> Float[Array, "4"]:
+        """Command in (0, 1) on an observation."""
+        return 0.5 * (1 + jnp.tanh(self.network(shown)))
+
+    def start(self, estimate: Estimate, command: Float[Array, "4"] | float = 0.55) -> Memory:
+        """Memory of a controller that takes over: it has commanded ``command`` on ``estimate`` for long."""
+        return start(self.layout, estimate, command)
+
+    def command(self, memory: Memory, estimate: Estimate) -> tuple[Memory, Float[Array, "4"]]:
+        """New memory and command; called every ``layout.control_dt_s``."""
+        u = self.act(observation(self.layout, memory, estimate))
+        return remember(self.layout, memory, estimate, u), u

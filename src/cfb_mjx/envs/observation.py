@@ -1,0 +1,122 @@
+"""What a neural controller sees: the newest estimate, some past ones, its own past commands, and an optional integral.
+
+One contract for training, simulation and the exported C: `Layout` says what goes in, in which order and scale.
+Order: newest frame, past frames (newest first), past commands (newest first), integral. A frame is position relative to
+the target, velocity (world axes), the nine entries of the rotation matrix body to world by rows (the same for q and
+-q), and the body rate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+FRAME = 18
+"""Numbers in a frame."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Size, order and scale of an observation. Hashable: it is fixed for the life of a policy."""
+
+    control_dt_s: float = 0.008
+    """Time between two commands, s."""
+    past_estimates: int = 1
+    past_commands: int = 6
+    integral: bool = False
+    """Also show the integral of the relative position: with it constant errors of thrust and attitude can be held."""
+    position_limit_m: float = 8.0
+    """Farther targets look as if they were this far away, in their direction."""
+    position_scale_m: float = 1.0
+    velocity_scale_mps: float = 2.0
+    rate_scale_radps: float = 10.0
+    integral_input_limit_m: float = 0.3
+    """The integral of each axis grows no faster than if the drone were this far away."""
+    integral_limit_ms: float = 0.6
+    """Largest integral of each axis, m s."""
+
+    @property
+    def size(self) -> int:
+        """Length of the observation."""
+        return FRAME * (1 + self.past_estimates) + 4 * self.past_commands + 3 * self.integral
+
+
+class Estimate(eqx.Module):
+    """What the state estimator reports."""
+
+    position: Float[Array, "3"]
+    """Position minus target, world, m."""
+    velocity: Float[Array, "3"]
+    """World, m/s."""
+    quaternion: Float[Array, "4"]
+    """[w, x, y, z], body to world."""
+    body_rate: Float[Array, "3"]
+    """Body, rad/s."""
+
+
+class Memory(eqx.Module):
+    """What the controller keeps between two steps."""
+
+    frames: Float[Array, "estimates 18"]
+    commands: Float[Array, "commands 4"]
+    """As the observation shows them: 2 u - 1."""
+    integral: Float[Array, "3"]
+    """Of the relative position, m s."""
+
+
+def rotation_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
+    """Rotation matrix of a unit quaternion, body to world."""
+    w, x, y, z = q
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+
+
+def frame(layout: Layout, estimate: Estimate) -> Float[Array, "18"]:
+    """The numbers of one estimate, scaled."""
+    p = estimate.position
+    # The square root has no slope at zero; the small number keeps the gradient finite there.
+    distance = jnp.sqrt(jnp.sum(p * p) + 1e-12)
+    p = p * jnp.minimum(1.0, layout.position_limit_m / distance)
+    return jnp.concatenate(
+        [
+            p / layout.position_scale_m,
+            estimate.velocity / layout.velocity_scale_mps,
+            rotation_matrix(estimate.quaternion).reshape(9),
+            estimate.body_rate / layout.rate_scale_radps,
+        ]
+    )
+
+
+def start(layout: Layout, estimate: Estimate, command: Float[Array, "4"] | float) -> Memory:
+    """Memory of a controller that has seen ``estimate`` and commanded ``command`` [0 to 1] for long."""
+    shown = frame(layout, estimate)
+    past = jnp.broadcast_to(2 * jnp.asarray(command, shown.dtype) - 1, (layout.past_commands, 4))
+    return Memory(jnp.broadcast_to(shown, (layout.past_estimates, FRAME)), past, jnp.zeros(3, shown.dtype))
+
+
+def observation(layout: Layout, memory: Memory, estimate: Estimate) -> Float[Array, "size"]:
+    """What the network is given, (``layout.size``,)."""
+    parts = [frame(layout, estimate), memory.frames.reshape(-1), memory.commands.reshape(-1)]
+    if layout.integral:
+        parts.append(memory.integral / layout.integral_limit_ms)
+    return jnp.concatenate(parts)
+
+
+def remember(layout: Layout, memory: Memory, estimate: Estimate, command: Float[Array, "4"]) -> Memory:
+    """Memory after ``command`` [0 to 1] was given on ``estimate``; called once every ``layout.control_dt_s``."""
+    frames, commands = memory.frames, memory.commands
+    if layout.past_estimates:
+        frames = jnp.concatenate([frame(layout, estimate)[None], frames[:-1]])
+    if layout.past_commands:
+        commands = jnp.concatenate([(2 * command - 1)[None], commands[:-1]])
+    limit, total = layout.integral_input_limit_m, layout.integral_limit_ms
+    grown = memory.integral + layout.control_dt_s * jnp.clip(estimate.position, -limit, limit)
+    return Memory(frames, commands, jnp.clip(grown, -total, total))

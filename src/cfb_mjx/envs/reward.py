@@ -1,0 +1,75 @@
+"""The paper's reward for flying to a target, and when an episode fails."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from cfb_mjx.model.rotors import POSITION_SIGNS_X, POSITION_SIGNS_Y
+from cfb_mjx.model.state import State
+from cfb_mjx.parameters import Parameters
+
+
+def triangle(error: Float[Array, ""], largest: float) -> Float[Array, ""]:
+    """Lambda(e, e_max) = relu(1 - |e / e_max|): one at zero error, zero from ``largest`` on (paper section V)."""
+    return jnp.maximum(0.0, 1.0 - jnp.abs(error / largest))
+
+
+@dataclass(frozen=True)
+class PaperReward:
+    """Weights, widths and limits of the paper (section V). The sum is per control step.
+
+    "L u" is read as the roll and pitch torque that the command asks for once the rotors have followed it, L f(K u):
+    its width is given in N m, and u itself has no unit.
+    """
+
+    position: float = 1.0
+    position_width_m: float = 10.0
+    velocity: float = 0.05
+    velocity_width_mps: float = 10.0
+    attitude: float = 0.15
+    attitude_width: float = 2.0
+    """Of |q - [1, 0, 0, 0]|, taken with the sign of q that is nearer."""
+    body_rate: float = 0.15
+    body_rate_width_radps: float = 10.0
+    torque: float = 0.02
+    torque_width_nm: float = 0.01
+    failure: float = 300.0
+    """Subtracted in the step that ends an episode."""
+    speed_limit_mps: float = 10.0
+    rate_limit_radps: float = 30.0
+
+    def failed(self, state: State) -> Bool[Array, ""]:
+        """Whether speed or body rate have passed their limits."""
+        fast = jnp.sum(state.velocity**2) > self.speed_limit_mps**2
+        return fast | (jnp.sum(state.body_rate**2) > self.rate_limit_radps**2)
+
+    def __call__(
+        self, state: State, target: Float[Array, "3"], command: Float[Array, "4"], parameters: Parameters
+    ) -> Float[Array, ""]:
+        """Reward of ``state`` after ``command`` [0 to 1]; what is judged is the true state, not its estimate."""
+        turned = 2.0 * jnp.maximum(0.0, 1.0 - jnp.abs(state.quaternion[0]))
+        reward = (
+            self.position * triangle(length(state.position - target), self.position_width_m)
+            + self.velocity * triangle(length(state.velocity), self.velocity_width_mps)
+            + self.attitude * triangle(jnp.sqrt(turned + 1e-12), self.attitude_width)
+            + self.body_rate * triangle(length(state.body_rate), self.body_rate_width_radps)
+            + self.torque * triangle(length(commanded_torque(parameters, command)), self.torque_width_nm)
+        )
+        return reward - self.failure * self.failed(state)
+
+
+def commanded_torque(parameters: Parameters, command: Float[Array, "4"]) -> Float[Array, "2"]:
+    """Roll and pitch torque L f(K u) of rotors that have settled at ``command``, N m (paper eqs. 5, 6 and 8)."""
+    s = (parameters.motor_gain * command + parameters.motor_speed_offset) / parameters.reference_rotor_speed
+    a, b, c = parameters.thrust_polynomial
+    thrust = parameters.thrust_scale * jnp.maximum(0.0, s * (c + s * (b + s * a)))
+    half = parameters.rotor_spacing / 2
+    return jnp.stack([half * thrust @ jnp.asarray(POSITION_SIGNS_Y), -half * thrust @ jnp.asarray(POSITION_SIGNS_X)])
+
+
+def length(vector: Float[Array, "n"]) -> Float[Array, ""]:
+    """Euclidean norm with a finite slope at zero."""
+    return jnp.sqrt(jnp.sum(vector * vector) + 1e-12)

@@ -1,0 +1,129 @@
+"""Back-propagation through the simulator: the gradient of what a flight costs, exact and from every step.
+
+Drones fly on from update to update; only the last ``horizon_s`` is differentiated (truncated back-propagation through
+time). Who has failed stops where it was, costs ``failure`` for the rest of the horizon, and begins anew after it.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from cfb_mjx.control.neural import NeuralController
+from cfb_mjx.envs.observation import rotation_matrix
+from cfb_mjx.envs.target import Episode, TargetTask, observe, reset, step
+from cfb_mjx.model.quadrotor import Quadrotor, prepare
+from cfb_mjx.model.state import State
+from cfb_mjx.train.config import AnalyticSettings, SmoothCost
+
+
+class AnalyticState(eqx.Module):
+    """Everything a training is at one instant."""
+
+    controller: NeuralController
+    optimizer: Any
+    episodes: Episode
+    """One per drone."""
+    key: PRNGKeyArray
+    count: Int[Array, ""]
+
+
+def smooth_cost(
+    cost: SmoothCost,
+    state: State,
+    target: Float[Array, "3"],
+    command: Float[Array, "4"],
+    last: Float[Array, "4"],
+) -> Float[Array, ""]:
+    """Of one control step that ended in ``state`` after ``command``, with ``last`` the command before."""
+    attitude = rotation_matrix(state.quaternion)
+    return (
+        cost.position * _rounded(state.position - target, cost.position_width_m)
+        + cost.velocity * _rounded(state.velocity, cost.velocity_width_mps)
+        + cost.heading * (1 - attitude[0, 0])
+        + cost.body_rate * jnp.sum(state.body_rate**2)
+        + cost.command_change * jnp.sum((command - last) ** 2)
+    )
+
+
+def _rounded(x: Float[Array, "3"], width: float) -> Float[Array, ""]:
+    return jnp.sqrt(jnp.sum(x**2) + width**2) - width
+
+
+class Analytic:
+    """The algorithm; see `cfb_mjx.train.algorithm.Algorithm`."""
+
+    def __init__(self, settings: AnalyticSettings, task: TargetTask, nominal: Quadrotor):
+        self.settings, self.task = settings, task
+        self.updates = settings.updates
+        self.horizon = max(1, round(settings.horizon_s / task.layout.control_dt_s))
+        self.steps_per_update = settings.drones * self.horizon
+        schedule = optax.cosine_decay_schedule(settings.learning_rate, settings.updates)
+        self.optimizer = optax.chain(optax.clip_by_global_norm(settings.gradient_clip), optax.adam(schedule))
+        self._reset = jax.vmap(partial(reset, task, nominal))
+        self.update = eqx.filter_jit(self._update)
+
+    def begin(self, key: PRNGKeyArray, controller: NeuralController) -> AnalyticState:
+        """Drones at random moments of their episodes, so that they do not all end at once."""
+        of_episodes, of_counts, key = jax.random.split(key, 3)
+        episodes = eqx.filter_jit(self._reset)(jax.random.split(of_episodes, self.settings.drones))
+        counts = jax.random.randint(of_counts, (self.settings.drones,), 0, self.task.episode_steps)
+        episodes = eqx.tree_at(lambda e: e.count, episodes, counts)
+        return AnalyticState(controller, self.optimizer.init(_arrays(controller)), episodes, key, jnp.asarray(0))
+
+    def controller(self, state: AnalyticState) -> NeuralController:
+        """The controller as it stands."""
+        return state.controller
+
+    def _update(self, state: AnalyticState) -> tuple[AnalyticState, dict]:
+        differentiated = eqx.filter_value_and_grad(self._loss, has_aux=True)
+        (loss, (episodes, alive)), gradient = differentiated(state.controller, state.episodes)
+        changes, optimizer = self.optimizer.update(gradient, state.optimizer)
+        controller = eqx.apply_updates(state.controller, changes)
+        of_episodes, key = jax.random.split(state.key)
+        over = ~alive | (episodes.count >= self.task.episode_steps)
+        fresh = self._reset(jax.random.split(of_episodes, self.settings.drones))
+        episodes = where(over, fresh, episodes)
+        metrics = {"loss": loss, "failing": jnp.mean(~alive), "gradient": optax.tree.norm(gradient)}
+        return AnalyticState(controller, optimizer, episodes, key, state.count + 1), metrics
+
+    def _loss(self, controller: NeuralController, episodes: Episode):
+        costs, episodes, alive = jax.vmap(self._fly, in_axes=(None, 0))(controller, episodes)
+        return jnp.mean(costs), (episodes, alive)
+
+    def _fly(self, controller: NeuralController, episode: Episode):
+        prepared = prepare(episode.model)
+        cost = self.settings.cost
+
+        def one(carry, _):
+            episode, alive = carry
+            command = controller.act(observe(self.task, episode))
+            after, outcome = step(self.task, episode, command, prepared)
+            alive = alive & ~outcome.failed
+            last = episode.memory.commands[0] if self.task.layout.past_commands else 2 * command - 1
+            paid = smooth_cost(cost, after.state, episode.target, command, (1 + last) / 2)
+            # A failed drone stays where it was: what comes after must neither count nor overflow.
+            after = where(alive, after, jax.lax.stop_gradient(episode))
+            return (after, alive), jnp.where(alive, paid, cost.failure)
+
+        (episode, alive), costs = jax.lax.scan(one, (episode, jnp.asarray(True)), length=self.horizon)
+        return jnp.mean(costs), episode, alive
+
+
+def where(condition: Array, yes: Any, no: Any) -> Any:
+    """``jnp.where`` on every array of two like pytrees; the condition's axes come first."""
+
+    def choose(a, b):
+        return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim)), a, b)
+
+    return jax.tree.map(choose, yes, no)
+
+
+def _arrays(tree: Any) -> Any:
+    return eqx.filter(tree, eqx.is_array)

@@ -1,0 +1,64 @@
+"""The parts of Brax that are used here, and what keeps its own PPO alive on this jax.
+
+Everything here stops acting once Brax no longer needs it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import warnings
+from collections.abc import Iterator
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+
+
+def parts() -> SimpleNamespace:
+    """``losses``, ``networks``, ``distribution`` and ``types`` of Brax's PPO."""
+    with warnings.catch_warnings():
+        # Brax's physics, which comes along, imports jaxopt, which says that it is no longer maintained.
+        warnings.filterwarnings("ignore", category=DeprecationWarning)
+        from brax.training import distribution, types
+        from brax.training.agents.ppo import losses, networks
+    return SimpleNamespace(losses=losses, networks=networks, distribution=distribution, types=types)
+
+
+@contextlib.contextmanager
+def brax_ppo() -> Iterator:
+    """Yield ``brax.training.agents.ppo.train.train``, made to work.
+
+    Brax 0.14.2 calls ``jax.device_put_replicated``, which jax 0.10 has removed (google/brax issue 671). While the block
+    runs, jax has a function of that name again; where jax still has its own, nothing is touched.
+    """
+    parts()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", category=DeprecationWarning)
+        from brax.training.agents.ppo import train
+
+    if _has_it():
+        yield train.train
+        return
+    jax.device_put_replicated = _replicated
+    try:
+        yield train.train
+    finally:
+        del jax.device_put_replicated
+
+
+def _has_it() -> bool:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return callable(jax.device_put_replicated)
+    except AttributeError:
+        return False
+
+
+def _replicated(tree, devices):
+    """A copy of ``tree`` on every device, along a new leading axis that is spread over them."""
+    mesh = jax.sharding.Mesh(devices, ("device",))
+    spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
+    return jax.tree.map(
+        lambda x: jax.device_put(jnp.broadcast_to(jnp.asarray(x), (len(devices), *jnp.shape(x))), spread), tree
+    )

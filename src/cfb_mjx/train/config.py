@@ -1,0 +1,260 @@
+"""What a training is made of: one YAML file, read strictly."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from cfb_mjx.envs import Layout, Noise, PaperReward, Starts, TargetTask
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import shipped
+from cfb_mjx.parameters.model_file import load_yaml
+from cfb_mjx.parameters.randomisation import load_randomisation
+from cfb_mjx.train.strict import build, plain
+
+FORMAT = "cfb_mjx training 1"
+
+
+@dataclass(frozen=True)
+class NetworkSettings:
+    """The policy: the paper's is fully connected, four layers of 32."""
+
+    hidden: tuple[int, ...] = (32, 32, 32, 32)
+    activation: Literal["tanh", "relu", "swish"] = "tanh"
+
+
+@dataclass(frozen=True)
+class RandomisationSettings:
+    """Which drones to train on."""
+
+    ranges: str = "paper"
+    """A shipped randomisation or a YAML file."""
+    magnitude: float = 1.0
+    """Factor on all ranges; 0 trains on the nominal drone alone."""
+    graded: bool = False
+    """Every episode draws its own factor between 0 and ``magnitude``: uniform draws of a dozen numbers are never all
+    near their means, and without this the nominal drone itself would never be flown."""
+
+
+@dataclass(frozen=True)
+class SmoothCost:
+    """What back-propagation minimises: the paper's wishes with a slope that does not vanish near the target.
+
+    Per control step, with s(x, w) = sqrt(|x|^2 + w^2) - w: ``position`` s(p, width) + ``velocity`` s(v, width) +
+    ``heading`` (1 - R_xx) + ``body_rate`` |omega|^2 + ``command_change`` |u_k - u_(k-1)|^2; a failed drone costs
+    ``failure`` per step. Summed over a flight s(v, w) is nearly the length of the way: it leaves a fast approach alone
+    and stops swinging about the target.
+    """
+
+    position: float = 1.0
+    position_width_m: float = 0.05
+    velocity: float = 0.1
+    velocity_width_mps: float = 0.1
+    heading: float = 0.2
+    body_rate: float = 0.002
+    command_change: float = 20.0
+    failure: float = 5.0
+
+
+@dataclass(frozen=True)
+class AnalyticSettings:
+    """Back-propagation through the simulator."""
+
+    drones: int = 256
+    horizon_s: float = 1.0
+    updates: int = 600
+    learning_rate: float = 2e-3
+    """At the start; it falls to zero along a cosine."""
+    gradient_clip: float = 1.0
+    cost: SmoothCost = field(default_factory=SmoothCost)
+
+
+@dataclass(frozen=True)
+class PpoSettings:
+    """Proximal policy optimisation (Schulman et al. 2017) with Brax's loss."""
+
+    drones: int = 2048
+    unroll: int = 32
+    """Commands of every drone between two updates of the policy."""
+    minibatches: int = 8
+    epochs: int = 4
+    steps: int = 50_000_000
+    """Commands in total."""
+    learning_rate: float = 1e-3
+    """At the start; it falls to a tenth along a line."""
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    clipping: float = 0.2
+    entropy_cost: float = 1e-3
+    reward_scaling: float = 0.02
+    gradient_clip: float = 1.0
+    first_std: float = 0.2
+    """Of the Gaussian before the tanh, at the start."""
+    value_hidden: tuple[int, ...] = (64, 64)
+
+    @property
+    def updates(self) -> int:
+        """Collections of ``unroll`` commands."""
+        return -(-self.steps // (self.drones * self.unroll))
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """One training. The defaults are those of ``configs/target.yaml``."""
+
+    format: Literal["cfb_mjx training 1"] = FORMAT
+    task: Literal["target"] = "target"
+    description: str = ""
+    model: str = "cfb-guards"
+    """A preset or a model YAML."""
+    body: Literal["rigid", "mjx"] = "rigid"
+    algorithm: Literal["ppo", "analytic"] = "ppo"
+    seed: int = 0
+    checkpoints: int = 20
+    """Over the whole training, evenly spaced; the policy is flown and the learning curve grows at each."""
+    episode_s: float = 6.0
+    network: NetworkSettings = field(default_factory=NetworkSettings)
+    observation: Layout = field(default_factory=Layout)
+    reward: PaperReward = field(default_factory=PaperReward)
+    starts: Starts = field(default_factory=Starts)
+    noise: Noise = field(default_factory=Noise)
+    randomisation: RandomisationSettings = field(default_factory=RandomisationSettings)
+    analytic: AnalyticSettings = field(default_factory=AnalyticSettings)
+    ppo: PpoSettings = field(default_factory=PpoSettings)
+
+    def build_task(self, longest_delay_s: float = 0.016) -> TargetTask:
+        """The task that is trained on."""
+        spread = load_randomisation(self.randomisation.ranges) if self.randomisation.magnitude else None
+        return TargetTask(
+            self.observation,
+            self.reward,
+            self.starts,
+            self.noise,
+            spread,
+            self.randomisation.magnitude,
+            self.randomisation.graded,
+            self.episode_s,
+            longest_delay_s,
+        )
+
+    def to_mapping(self) -> dict[str, Any]:
+        """What its YAML file would hold."""
+        return plain(self)
+
+
+def load_config(name_or_path: str | Path = "target", changes: tuple[str, ...] = ()) -> TrainingConfig:
+    """Read a shipped training (``target``) or a YAML file, with ``KEY=VALUE`` changes (dotted keys, YAML values).
+
+    Raises:
+        CfbError: no such file, an unknown key, a value of the wrong type or out of range, named.
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        names = sorted(file.stem for file in shipped("configs").glob("*.yaml"))
+        if str(name_or_path) not in names:
+            raise CfbError(f"{name_or_path}: no such training; give a YAML file or one of {', '.join(names)}.")
+        path = shipped("configs", f"{name_or_path}.yaml")
+    document = load_yaml(path)
+    if document.get("format") != FORMAT:
+        raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
+    # Checked before the changes go in, so that a fault of the file is not blamed on the command line.
+    build(TrainingConfig, document, str(path))
+    for change in changes:
+        _change(document, change)
+    config = build(TrainingConfig, document, str(path) if not changes else f"{path} with {', '.join(changes)}")
+    _require_sense(config, str(path))
+    return config
+
+
+def with_changes(config: TrainingConfig, **values: Any) -> TrainingConfig:
+    """A copy with some top-level settings replaced; None leaves one as it is."""
+    return replace(config, **{key: value for key, value in values.items() if value is not None})
+
+
+def _change(document: dict, change: str) -> None:
+    dotted, equals, text = change.partition("=")
+    try:
+        value = yaml.safe_load(text)
+    except yaml.YAMLError:
+        equals = ""
+    if not equals or not dotted:
+        raise CfbError(f"--set {change}: write KEY=VALUE, for instance randomisation.magnitude=0.5.")
+    *path, last = dotted.split(".")
+    inner = document
+    for key in path:
+        inner = inner.setdefault(key, {})
+        if not isinstance(inner, dict):
+            raise CfbError(f"--set {change}: {key} is no group of settings.")
+    # YAML 1.1 reads 1e-3 as text.
+    if isinstance(value, str):
+        with suppress(ValueError):
+            value = float(value)
+    inner[last] = value
+
+
+_AT_LEAST = {
+    "checkpoints": 1,
+    "observation.past_estimates": 0,
+    "observation.past_commands": 0,
+    "randomisation.magnitude": 0,
+    "seed": 0,
+    "analytic.drones": 1,
+    "analytic.updates": 1,
+    "ppo.drones": 1,
+    "ppo.unroll": 1,
+    "ppo.minibatches": 1,
+    "ppo.epochs": 1,
+    "ppo.steps": 1,
+}
+_POSITIVE = (
+    "episode_s",
+    "observation.control_dt_s",
+    "observation.position_limit_m",
+    "observation.position_scale_m",
+    "observation.velocity_scale_mps",
+    "observation.rate_scale_radps",
+    "observation.integral_limit_ms",
+    "reward.position_width_m",
+    "reward.velocity_width_mps",
+    "reward.attitude_width",
+    "reward.body_rate_width_radps",
+    "reward.torque_width_nm",
+    "reward.speed_limit_mps",
+    "reward.rate_limit_radps",
+    "analytic.horizon_s",
+    "analytic.learning_rate",
+    "analytic.gradient_clip",
+    "analytic.cost.position_width_m",
+    "analytic.cost.velocity_width_mps",
+    "ppo.learning_rate",
+    "ppo.gradient_clip",
+    "ppo.first_std",
+)
+
+
+def _require_sense(config: TrainingConfig, where: str) -> None:
+    for key, least in _AT_LEAST.items():
+        if _at(config, key) < least:
+            raise CfbError(f"{where}: {key} = {_at(config, key)} must be at least {least}.")
+    for key in _POSITIVE:
+        if not _at(config, key) > 0:
+            raise CfbError(f"{where}: {key} = {_at(config, key)} must be positive.")
+    for key in ("starts.near", "ppo.discount", "ppo.gae_lambda"):
+        if not 0 <= _at(config, key) <= 1:
+            raise CfbError(f"{where}: {key} = {_at(config, key)} must lie between 0 and 1.")
+    for key in ("network.hidden", "ppo.value_hidden"):
+        if not _at(config, key) or min(_at(config, key)) < 1:
+            raise CfbError(f"{where}: {key} must name at least one layer, each of at least one neuron.")
+    if config.ppo.drones % config.ppo.minibatches:
+        raise CfbError(f"{where}: ppo.drones = {config.ppo.drones} must be a multiple of ppo.minibatches.")
+    load_randomisation(config.randomisation.ranges)
+
+
+def _at(config: Any, dotted: str) -> Any:
+    for key in dotted.split("."):
+        config = getattr(config, key)
+    return config

@@ -1,0 +1,245 @@
+"""Fly controllers and measure how: hover, a step of six metres, recovery."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, NamedTuple, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cfb_mjx.control.neural import NeuralController
+from cfb_mjx.control.pid import DT as PID_DT
+from cfb_mjx.control.pid import FirmwarePid, Setpoint, init
+from cfb_mjx.control.pid import step as pid_step
+from cfb_mjx.envs.observation import Estimate, Layout
+from cfb_mjx.envs.target import TargetTask, reset, step
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.state import State
+
+HOVER_S, SETTLING_S = 6.0, 1.0
+"""The paper's hover test: so long, of which the first second is not counted."""
+STEP_DISTANCE_M, ARRIVED_M, STEP_S = 6.0, 0.10, 4.0
+"""The paper's back-and-forth: how far, what counts as there, and how long it is watched."""
+
+
+class Pilot(Protocol):
+    """A controller that holds the target: what it sees is relative to it."""
+
+    control_dt_s: float
+
+    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
+        """Memory at take-over; ``command`` is what the rotors turn at."""
+
+    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
+        """New memory and command."""
+
+
+class Neural(eqx.Module):
+    """A `NeuralController` as a pilot."""
+
+    controller: NeuralController
+
+    @property
+    def control_dt_s(self) -> float:
+        """Time between two commands, s."""
+        return self.controller.layout.control_dt_s
+
+    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
+        """Memory at take-over."""
+        return self.controller.start(estimate, command)
+
+    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
+        """New memory and command."""
+        return self.controller.command(memory, estimate)
+
+
+class Pid(eqx.Module):
+    """The firmware's PID as a pilot, heading kept at zero."""
+
+    pid: FirmwarePid
+    control_dt_s: float = eqx.field(static=True, default=PID_DT)
+
+    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
+        """Empty integrators."""
+        return init(self.pid, _measured(estimate))
+
+    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
+        """New memory and command."""
+        return pid_step(self.pid, memory, _measured(estimate), Setpoint.hover(jnp.zeros(3)))
+
+
+def _measured(estimate: Estimate) -> State:
+    return State(estimate.position, estimate.velocity, estimate.quaternion, estimate.body_rate, jnp.zeros(4))
+
+
+class Flight(NamedTuple):
+    """After every command; positions relative to the target."""
+
+    position: Float[Array, "*drones steps 3"]
+    velocity: Float[Array, "*drones steps 3"]
+    quaternion: Float[Array, "*drones steps 4"]
+    body_rate: Float[Array, "*drones steps 3"]
+    command: Float[Array, "*drones steps 4"]
+    failed: Bool[Array, "*drones steps"]
+    """Whether limits of speed or rate have been passed up to here."""
+
+
+def fly(
+    pilot: Pilot,
+    task: TargetTask,
+    nominal: Quadrotor,
+    key: PRNGKeyArray,
+    seconds: float,
+    state: State | None = None,
+) -> Flight:
+    """One flight to the origin on a drone drawn as the task says; ``vmap`` over ``key`` (and ``state``) for many.
+
+    The simulation takes steps of the pilot's control step where that is shorter than the model's.
+    """
+    dt = pilot.control_dt_s
+    if dt < nominal.dt:
+        nominal = replace(nominal, dt=dt)
+    # What the episode remembers for a network is of no use to other pilots; keep it small.
+    task = replace(task, layout=Layout(control_dt_s=dt, past_estimates=0, past_commands=0))
+    episode = reset(task, nominal, key, state)
+    parameters = episode.model.parameters
+    settled = (episode.state.rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
+    memory = pilot.start(episode.estimate, jnp.clip(settled, 0.0, 1.0))
+
+    def one(carry, _):
+        episode, memory, failed = carry
+        memory, command = pilot.command(memory, episode.estimate)
+        episode, outcome = step(task, episode, command)
+        failed = failed | outcome.failed
+        at = episode.state
+        row = Flight(at.position, at.velocity, at.quaternion, at.body_rate, command, failed)
+        return (episode, memory, failed), row
+
+    return jax.lax.scan(one, (episode, memory, jnp.asarray(False)), length=round(seconds / dt))[1]
+
+
+class Hover(NamedTuple):
+    """Of the paper's hover test, per drone."""
+
+    mean_distance_m: Float[Array, "*drones"]
+    command_std: Float[Array, "*drones"]
+    """Standard deviation over time, mean of the four motors."""
+    failed: Bool[Array, "*drones"]
+
+
+def hover(pilot: Pilot, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray) -> tuple[Hover, Flight]:
+    """Start level at the target, hold it `HOVER_S` seconds, count all but the first `SETTLING_S` (paper section VI).
+
+    Args:
+        pilot: the controller.
+        task: says which drones and how much noise.
+        nominal: the drone.
+        keys: one per flight.
+    """
+    return _hover(pilot, task, nominal, keys)
+
+
+@eqx.filter_jit
+def _hover(pilot, task, nominal, keys):
+    start = nominal.hover_state((0.0, 0.0, 0.0))
+    flown = jax.vmap(lambda key: fly(pilot, task, nominal, key, HOVER_S, start))(keys)
+    counted = round(SETTLING_S / pilot.control_dt_s)
+    distance = jnp.linalg.norm(flown.position[:, counted:], axis=-1).mean(axis=1)
+    spread = flown.command[:, counted:].std(axis=1).mean(axis=-1)
+    return Hover(distance, spread, flown.failed[:, -1]), flown
+
+
+class Step(NamedTuple):
+    """Of a flight to a target `STEP_DISTANCE_M` away, per drone."""
+
+    arrival_s: Float[Array, "*drones"]
+    """First time nearer than `ARRIVED_M`; infinite if never."""
+    peak_speed_mps: Float[Array, "*drones"]
+    overshoot_m: Float[Array, "*drones"]
+    """How far beyond the target, along the way."""
+    failed: Bool[Array, "*drones"]
+
+
+def six_metres(pilot: Pilot, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray) -> tuple[Step, Flight]:
+    """From hover, `STEP_DISTANCE_M` away along x; the flights too."""
+    return _six_metres(pilot, task, nominal, keys)
+
+
+@eqx.filter_jit
+def _six_metres(pilot, task, nominal, keys):
+    start = nominal.hover_state((-STEP_DISTANCE_M, 0.0, 0.0))
+    flown = jax.vmap(lambda key: fly(pilot, task, nominal, key, STEP_S, start))(keys)
+    distance = jnp.linalg.norm(flown.position, axis=-1)
+    times = pilot.control_dt_s * (1 + jnp.arange(distance.shape[1]))
+    arrival = jnp.min(jnp.where(distance < ARRIVED_M, times, jnp.inf), axis=1)
+    speed = jnp.linalg.norm(flown.velocity, axis=-1).max(axis=1)
+    return Step(arrival, speed, jnp.maximum(0.0, flown.position[..., 0].max(axis=1)), flown.failed[:, -1]), flown
+
+
+class Recovery(NamedTuple):
+    """Of a throw, per drone."""
+
+    recovered: Bool[Array, "*drones"]
+    """No limit passed, and slow, level and within `CAUGHT_M` at the end."""
+    lost_height_m: Float[Array, "*drones"]
+    final_distance_m: Float[Array, "*drones"]
+    failed: Bool[Array, "*drones"]
+
+
+RECOVERY_S, CAUGHT_M = 4.0, 0.75
+
+
+def recovery(
+    pilot: Pilot, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray, tilt_deg: float = 60.0, speed: float = 3.0
+) -> tuple[Recovery, Flight]:
+    """Thrown at ``speed`` [m/s] in a random direction with ``tilt_deg`` of tilt about a random level axis.
+
+    Recovered is who is below 0.5 m/s, tilted less than 30 deg and within `CAUGHT_M` after `RECOVERY_S` without having
+    passed a limit on the way.
+    """
+    return _recovery(pilot, task, nominal, keys, jnp.asarray(tilt_deg), jnp.asarray(speed))
+
+
+@eqx.filter_jit
+def _recovery(pilot, task, nominal, keys, tilt_deg, speed):
+    hovering = nominal.hover_state((0.0, 0.0, 0.0))
+
+    def thrown(key):
+        of_flight, of_axis, of_way = jax.random.split(key, 3)
+        angle = jax.random.uniform(of_axis, minval=0.0, maxval=2 * jnp.pi)
+        half = jnp.radians(tilt_deg) / 2
+        quaternion = jnp.stack(
+            [jnp.cos(half), jnp.sin(half) * jnp.cos(angle), jnp.sin(half) * jnp.sin(angle), jnp.zeros(())]
+        )
+        way = jax.random.normal(of_way, (3,))
+        state = State(
+            hovering.position,
+            speed * way / jnp.linalg.norm(way),
+            quaternion,
+            hovering.body_rate,
+            hovering.rotor_speed,
+            hovering.memory,
+        )
+        return fly(pilot, task, nominal, of_flight, RECOVERY_S, state)
+
+    flown = jax.vmap(thrown)(keys)
+    distance = jnp.linalg.norm(flown.position[:, -1], axis=-1)
+    slow = jnp.linalg.norm(flown.velocity[:, -1], axis=-1) < 0.5
+    _, x, y, _ = jnp.moveaxis(flown.quaternion[:, -1], -1, 0)
+    level = 1 - 2 * (x * x + y * y) > np.cos(np.radians(30.0))
+    well = ~flown.failed[:, -1] & slow & level & (distance < CAUGHT_M)
+    lost = -jnp.minimum(0.0, flown.position[..., 2].min(axis=1))
+    return Recovery(well, lost, distance, flown.failed[:, -1]), flown
+
+
+def nominal_task(task: TargetTask) -> TargetTask:
+    """The same task on the nominal drone."""
+    return replace(task, randomisation=None)
+
+
+TESTS = {"hover": hover, "step": six_metres, "recover": recovery}
+"""Each takes pilot, task, nominal drone and keys, and returns what it measured and the flights."""

@@ -1,0 +1,267 @@
+"""The pipeline of a training: segments between checkpoints, learning curve, policy; what is interrupted goes on."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import yaml
+
+from cfb_mjx.control.neural import NeuralController
+from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import output_folder, write_text
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.rotors import hover_command
+from cfb_mjx.parameters import ModelFile, load_model_file
+from cfb_mjx.train.algorithm import Algorithm
+from cfb_mjx.train.checkpoint import load_state, read_about, save_checkpoint
+from cfb_mjx.train.config import TrainingConfig
+from cfb_mjx.train.flying import Neural, hover, nominal_task
+
+CHECKPOINT, POLICY, CURVE, CONFIG = "checkpoint.npz", "policy.npz", "curve.csv", "config.yaml"
+_JUDGED_ON = 64
+"""Hover flights at each point of the curve, with the noise of the task."""
+
+Row = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a training starts from.
+
+    Attributes:
+        config: the configuration.
+        described: the model file it names.
+        start: a policy to start from, instead of a random one.
+        versions: of the software, for the policy file.
+    """
+
+    config: TrainingConfig
+    described: ModelFile
+    start: PolicyFile | None
+    versions: dict[str, str]
+
+    @classmethod
+    def prepare(
+        cls, config: TrainingConfig, versions: dict[str, str], start: Path | None = None, force: bool = False
+    ) -> Training:
+        """Read what the configuration names.
+
+        Raises:
+            CfbError: a bad model or policy, a predictor that is not insisted on, or a policy of another shape.
+        """
+        described = load_model_file(config.model)
+        if not force:
+            described.require_plant("training", "--force")
+        policy = None if start is None else load_policy(start)
+        if policy is not None:
+            controller, wanted = policy.controller, config.network
+            hidden = tuple(len(b) for b in controller.network.biases[:-1])
+            if controller.layout != config.observation or hidden != wanted.hidden:
+                raise CfbError(f"{start}: this policy has another observation or network than the configuration.")
+            if controller.network.activation != wanted.activation:
+                raise CfbError(f"{start}: this policy's activation is {controller.network.activation}.")
+        return cls(config, described, policy, versions)
+
+    def identity(self) -> dict[str, Any]:
+        """What a checkpoint must agree with to be gone on from."""
+        return {
+            "config": self.config.to_mapping(),
+            "model": _described(self.described),
+            "start": None if self.start is None else self.start.weights_sha256,
+        }
+
+    def nominal(self) -> Quadrotor:
+        """The drone about which the others are drawn."""
+        if self.config.body == "mjx":
+            from cfb_mjx.model import MjxBody
+
+            return Quadrotor.from_file(self.described, body=MjxBody(floor=False))
+        return Quadrotor.from_file(self.described)
+
+    def first_controller(self, nominal: Quadrotor) -> NeuralController:
+        """The policy it starts with."""
+        if self.start is not None:
+            return self.start.controller
+        network = self.config.network
+        return NeuralController.random(
+            jax.random.PRNGKey(self.config.seed),
+            self.config.observation,
+            network.hidden,
+            network.activation,
+            float(jnp.clip(jnp.mean(hover_command(nominal.changed_parameters())), 0.05, 0.95)),
+        )
+
+    def policy(self, controller: NeuralController) -> PolicyFile:
+        """The policy as a file, with what made it."""
+        return PolicyFile(controller, self.config.task, {**self.identity(), "versions": self.versions})
+
+
+def train(
+    training: Training,
+    output: Path,
+    resume: bool = False,
+    progress: Callable[[int, int, float, float], None] = lambda done, total, rate, left: None,
+    report: Callable[[Row], None] = lambda row: None,
+    evaluate: bool = True,
+    devices: int = 1,
+) -> list[Row]:
+    """Train, writing ``policy.npz``, ``curve.csv``, ``config.yaml`` and ``checkpoint.npz`` into ``output``.
+
+    Args:
+        training: what to do.
+        output: folder; made if need be.
+        resume: go on from the checkpoint there, if there is one.
+        progress: called after every update with updates done, all updates, commands flown per second, seconds left.
+        report: called with every new row of the learning curve.
+        evaluate: fly the hover test at every checkpoint.
+        devices: of this machine over which the drones are spread.
+
+    Returns:
+        The learning curve, one row per checkpoint.
+
+    Raises:
+        CfbError: an earlier training is in the way, the checkpoint is of another training, or there are fewer devices.
+    """
+    output = output_folder(output)
+    checkpoint = output / CHECKPOINT
+    about = _found(checkpoint, output, training, resume)
+    nominal = training.nominal()
+    delay = float(jnp.max(nominal.parameters.observation_delay))
+    task = training.config.build_task(max(0.016, 0.004 * math.ceil(delay / 0.004 - 1e-9)))
+    task.hold(nominal)
+    algorithm = build(training.config, task, nominal)
+    key = jax.random.fold_in(jax.random.PRNGKey(training.config.seed), 1)
+    state = _strong(algorithm.begin(key, training.first_controller(nominal)))
+    done, seconds, rows = 0, 0.0, []
+    if about is not None:
+        state = load_state(checkpoint, state)
+        done, seconds, rows = about["updates"], about["seconds"], about["rows"]
+    state = _spread(state, devices)
+    write_text(output / CONFIG, yaml.safe_dump(training.config.to_mapping(), sort_keys=False))
+    for end in segments(algorithm.updates, training.config.checkpoints):
+        if end <= done:
+            continue
+        metrics, spent = {}, 0.0
+        for update in range(done, end):
+            started = time.perf_counter()
+            state, metrics = algorithm.update(state)
+            jax.block_until_ready(metrics)
+            spent += time.perf_counter() - started
+            pace = spent / (update + 1 - done)
+            left = pace * (algorithm.updates - update - 1)
+            progress(update + 1, algorithm.updates, algorithm.steps_per_update / pace, left)
+        done, seconds = end, seconds + spent
+        controller = algorithm.controller(state)
+        row = {"update": done, "commands": done * algorithm.steps_per_update, "seconds": round(seconds, 2)}
+        row |= {name: float(value) for name, value in metrics.items()}
+        row |= _judged(controller, training, task, nominal) if evaluate else {}
+        rows.append(row)
+        save_policy(training.policy(controller), output / POLICY)
+        write_text(output / CURVE, _csv(rows))
+        # Last: what it says is done must be on disk.
+        save_checkpoint(checkpoint, state, {**training.identity(), "updates": done, "seconds": seconds, "rows": rows})
+        report(row)
+    return rows
+
+
+def build(config: TrainingConfig, task, nominal: Quadrotor) -> Algorithm:
+    """The algorithm of a configuration."""
+    if config.algorithm == "ppo":
+        from cfb_mjx.train.ppo import Ppo
+
+        return Ppo(config.ppo, task, nominal)
+    from cfb_mjx.train.analytic import Analytic
+
+    return Analytic(config.analytic, task, nominal)
+
+
+def segments(updates: int, count: int) -> list[int]:
+    """After which updates checkpoints are written; the last is ``updates``."""
+    return sorted({round(updates * (i + 1) / count) for i in range(count)} - {0})
+
+
+def _strong(state: Any) -> Any:
+    # A weakly typed number becomes a strong one in the first update, and the second would be compiled afresh.
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype) if eqx.is_array(x) else x, state)
+
+
+def _spread(state: Any, devices: int) -> Any:
+    """Drones over the devices, everything else on each: the compiler then divides the work along the data."""
+    if devices == 1:
+        return state
+    if devices > jax.local_device_count():
+        raise CfbError(f"{devices} devices were asked for, {jax.local_device_count()} are here; ask for fewer.")
+    drones = len(state.episodes.count)
+    if drones % devices:
+        raise CfbError(f"{drones} drones cannot be spread over {devices} devices evenly; change the number of drones.")
+    mesh = jax.sharding.Mesh(jax.local_devices()[:devices], ("drones",))
+    along, whole = (jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(*axes)) for axes in (("drones",), ()))
+    shared = jax.tree.map(lambda x: jax.device_put(x, whole) if eqx.is_array(x) else x, state)
+    episodes = jax.tree.map(lambda x: jax.device_put(x, along), state.episodes)
+    return eqx.tree_at(lambda s: s.episodes, shared, episodes)
+
+
+def _found(checkpoint: Path, output: Path, training: Training, resume: bool) -> dict[str, Any] | None:
+    if not resume:
+        if checkpoint.exists():
+            raise CfbError(f"{output}: holds a training already; go on with --resume, or give another folder with -o.")
+        return None
+    if not checkpoint.exists():
+        return None
+    about = read_about(checkpoint)
+    for part, now in training.identity().items():
+        if about.get(part) != _json(now):
+            what = ", ".join(_differences(about.get(part), _json(now), part)) or part
+            raise CfbError(f"{checkpoint}: the training there had another {what}; give what it had, or another folder.")
+    return about
+
+
+def _json(value: Any) -> Any:
+    return json.loads(json.dumps(value))
+
+
+def _differences(before: Any, now: Any, path: str) -> list[str]:
+    if isinstance(before, dict) and isinstance(now, dict):
+        keys = [*before, *(k for k in now if k not in before)]
+        return [d for k in keys for d in _differences(before.get(k), now.get(k), f"{path}.{k}")]
+    return [] if before == now else [path]
+
+
+def _judged(controller: NeuralController, training: Training, task, nominal: Quadrotor) -> Row:
+    keys = jax.random.split(jax.random.PRNGKey(training.config.seed + 1), _JUDGED_ON)
+    measured, _ = hover(Neural(controller), nominal_task(task), nominal, keys)
+    return {
+        "hover_mm": 1e3 * float(jnp.mean(measured.mean_distance_m)),
+        "command_std": float(jnp.mean(measured.command_std)),
+        "hover_failed": float(jnp.mean(measured.failed)),
+    }
+
+
+def _csv(rows: list[Row]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    for row in rows:
+        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+    return text.getvalue()
+
+
+def _described(model: ModelFile) -> dict[str, Any]:
+    return {
+        "name": model.name,
+        "kind": model.kind,
+        "parameters": {key: entry.value.tolist() for key, entry in model.entries.items()},
+        "effects": [{k: v for k, v in effect.items() if k in ("name", "parameters")} for effect in model.effects],
+    }

@@ -1,0 +1,64 @@
+"""Dataclasses from mappings, every key known and every value of its type, or a sentence that names the key."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from cfb_mjx.errors import CfbError
+
+T = TypeVar("T")
+
+
+def build(kind: type[T], raw: Mapping[str, Any], where: str, prefix: str = "") -> T:
+    """A ``kind`` (a dataclass, nested ones too) from a mapping; what is left out keeps its default.
+
+    Raises:
+        CfbError: an unknown key, or a value of the wrong type, named with ``where`` and its dotted path.
+    """
+    if not isinstance(raw, Mapping):
+        raise CfbError(f"{where}: {prefix.rstrip('.') or 'the file'} must be a mapping, found {raw!r}.")
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    unknown = [f"'{prefix}{key}'" for key in raw if key not in fields]
+    if unknown:
+        raise CfbError(f"{where}: unknown key {', '.join(unknown)}; known here are {', '.join(fields)}.")
+    hints = typing.get_type_hints(kind)
+    return kind(**{key: _value(hints[key], value, where, f"{prefix}{key}") for key, value in raw.items()})
+
+
+def plain(value: Any) -> Any:
+    """The mapping that `build` would read back."""
+    if dataclasses.is_dataclass(value):
+        return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return [plain(x) for x in value] if isinstance(value, tuple) else value
+
+
+def _value(kind: Any, raw: Any, where: str, key: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        return build(kind, raw, where, f"{key}.")
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Literal:
+        return _checked(raw in arguments, raw, f"one of {', '.join(map(str, arguments))}", where, key)
+    if origin in (types.UnionType, typing.Union):
+        if raw is None and type(None) in arguments:
+            return None
+        return _value(next(a for a in arguments if a is not type(None)), raw, where, key)
+    if origin is tuple:
+        _checked(isinstance(raw, list | tuple), raw, "a list", where, key)
+        return tuple(_value(arguments[0], x, where, key) for x in raw)
+    if kind is float:
+        number = isinstance(raw, int | float) and not isinstance(raw, bool) and math.isfinite(raw)
+        return float(_checked(number, raw, "a finite number", where, key))
+    if kind is int:
+        return _checked(isinstance(raw, int) and not isinstance(raw, bool), raw, "a whole number", where, key)
+    return _checked(isinstance(raw, kind), raw, {bool: "true or false", str: "text"}[kind], where, key)
+
+
+def _checked(holds: bool, raw: Any, wanted: str, where: str, key: str) -> Any:
+    if not holds:
+        raise CfbError(f"{where}: {key} must be {wanted}, found {raw!r}.")
+    return raw

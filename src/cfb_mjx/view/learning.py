@@ -1,0 +1,37 @@
+"""The learning curve of a training."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cfb_mjx.view.style import COLOURS, check_path, context, new_figure, save
+
+_PANELS = (
+    ("hover_mm", "mean hover error, mm", True),
+    ("command_std", "command std", False),
+    ("loss", "loss", False),
+)
+
+
+def learning_figure(rows: list[dict[str, float]], path: str | Path, title: str = "") -> None:
+    """Draw hover error, command noise and loss over commands flown, seconds on top.
+
+    Args:
+        rows: of `cfb_mjx.train.run.train`.
+        path: figure to write.
+        title: above it.
+    """
+    panels = [panel for panel in _PANELS if panel[0] in rows[0]]
+    with context():
+        figure = new_figure(3.1 * len(panels), 2.8)
+        axes = figure.subplots(1, len(panels), squeeze=False)[0]
+        millions = [row["commands"] / 1e6 for row in rows]
+        for axis, (key, label, logarithmic) in zip(axes, panels, strict=True):
+            axis.plot(millions, [row[key] for row in rows], marker=".", color=COLOURS["commands_in"])
+            axis.set_xlabel("commands flown, millions")
+            axis.set_ylabel(label)
+            if logarithmic:
+                axis.set_yscale("log")
+        figure.suptitle(f"{title}: {rows[-1]['seconds']:.0f} s of training" if title else "", fontsize=10)
+        figure.subplots_adjust(left=0.22 / len(panels), right=0.98, bottom=0.18, top=0.86, wspace=0.38)
+        save(figure, check_path(path))

@@ -1,0 +1,186 @@
+"""The target task: the paper's reward by hand, what the controller sees and when, and drones drawn at every episode."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from cfb_mjx.envs import Layout, Noise, PaperReward, TargetTask, observe, reset, step
+from cfb_mjx.envs.target import QUIET
+from cfb_mjx.errors import CfbError
+from cfb_mjx.model import Quadrotor, State, rollout
+from cfb_mjx.parameters import load_randomisation
+
+DRONE = Quadrotor.from_file("cfb-guards")
+QUIET_TASK = TargetTask(noise=QUIET)
+RANDOM_TASK = TargetTask(randomisation=load_randomisation("paper"))
+
+
+def state_at(position=(0, 0, 0), velocity=(0, 0, 0), rotation=None, rate=(0, 0, 0)) -> State:
+    xyzw = (rotation or Rotation.identity()).as_quat()
+    arrays = [np.asarray(x, float) for x in (position, velocity, xyzw[[3, 0, 1, 2]], rate, (1594.0,) * 4)]
+    return State(*map(jnp.asarray, arrays))
+
+
+def test_the_papers_reward_by_hand():
+    # Thrusts typed in from eq. 8 at s = u, as K = sigma: the lever of each rotor is l/2 = 0.03535 m.
+    command = np.array([0.55, 0.56, 0.57, 0.60])
+    f = -0.23 * command**3 + 0.562 * command**2 - 0.043 * command
+    torque = 0.03535 * np.array([-f[0] - f[1] + f[2] + f[3], -f[0] + f[1] + f[2] - f[3]])
+    turn = Rotation.from_rotvec([0.4, -0.2, 0.3])
+    q = turn.as_quat()[[3, 0, 1, 2]]
+    at = state_at((1, -2, 2), (3, 0, 4), turn, (0, 6, 8))
+    wanted = (
+        (1 - 3 / 10)
+        + 0.05 * (1 - 5 / 10)
+        + 0.15 * (1 - np.linalg.norm(q - [1, 0, 0, 0]) / 2)
+        + 0.15 * 0.0
+        + 0.02 * max(0, 1 - np.linalg.norm(torque) / 0.01)
+    )
+    got = PaperReward()(at, jnp.zeros(3), jnp.asarray(command), DRONE.parameters)
+    assert np.isclose(got, wanted, atol=1e-5)
+    same_attitude = eqx.tree_at(lambda s: s.quaternion, at, -at.quaternion)
+    assert np.isclose(PaperReward()(same_attitude, jnp.zeros(3), jnp.asarray(command), DRONE.parameters), got)
+
+
+@pytest.mark.parametrize(
+    ("velocity", "rate", "failed"),
+    [((9.9, 0, 0), (0, 0, 29.9), False), ((8, 0, 6.1), (0, 0, 0), True), ((0, 0, 0), (0, -30.1, 0), True)],
+)
+def test_too_fast_ends_the_episode_and_costs_300(velocity, rate, failed):
+    reward = PaperReward()
+    at = state_at(velocity=velocity, rate=rate)
+    hover = jnp.full(4, 0.55)
+    assert bool(reward.failed(at)) == failed
+    kept = replace(reward, failure=0.0)(at, jnp.zeros(3), hover, DRONE.parameters)
+    assert np.isclose(reward(at, jnp.zeros(3), hover, DRONE.parameters), kept - 300 * failed)
+
+
+def test_an_episode_without_noise_is_a_rollout():
+    start = state_at((0.3, 0, 1), (0.5, -0.2, 0), Rotation.from_rotvec([0.2, 0.1, 0]), (1, 0, -1))
+    commands = jnp.asarray(np.random.default_rng(0).uniform(0.4, 0.7, (25, 4)))
+    episode = reset(QUIET_TASK, DRONE, jax.random.PRNGKey(0), start)
+    one = eqx.filter_jit(lambda e, u: step(QUIET_TASK, e, u)[0])
+    for u in commands:
+        episode = one(episode, u)
+    alone = rollout(DRONE, start, commands, hold=2)
+    for name in ("position", "velocity", "quaternion", "body_rate", "rotor_speed"):
+        np.testing.assert_allclose(getattr(episode.state, name), getattr(alone, name)[-1], rtol=1e-9, atol=1e-12)
+
+
+def test_estimates_are_eight_milliseconds_old_and_turned_by_the_offset():
+    offset = np.array([0.1, -0.15, 0.2])
+    drone = eqx.tree_at(lambda m: m.parameters.attitude_offset, DRONE, jnp.asarray(offset))
+    start = state_at((0.3, 0, 1), (2, -1, 0.5), Rotation.from_rotvec([0.2, 0.1, 0]), (3, 1, -2))
+    target = np.array([1.0, 2.0, 3.0])
+    episode = reset(QUIET_TASK, drone, jax.random.PRNGKey(0), start, target)
+    commands = jnp.asarray(np.random.default_rng(1).uniform(0.4, 0.7, (10, 4)))
+    for u in commands:
+        episode, _ = step(QUIET_TASK, episode, u)
+    # Two steps of 4 ms earlier: after nine commands of 8 ms.
+    before = rollout(drone, start, commands[:9], hold=2)
+    np.testing.assert_allclose(episode.estimate.position, before.position[-1] - target, atol=1e-12)
+    np.testing.assert_allclose(episode.estimate.body_rate, before.body_rate[-1], atol=1e-12)
+    true = Rotation.from_quat(np.asarray(before.quaternion[-1])[[1, 2, 3, 0]])
+    seen = Rotation.from_quat(np.asarray(episode.estimate.quaternion)[[1, 2, 3, 0]])
+    np.testing.assert_allclose((true.inv() * seen).as_rotvec(), offset, atol=1e-9)
+
+
+def test_the_observation_is_the_contract():
+    layout = Layout(past_estimates=2, past_commands=3, integral=True)
+    task = replace(QUIET_TASK, layout=layout)
+    episode = reset(task, DRONE, jax.random.PRNGKey(3))
+    estimates, commands = [episode.estimate], []
+    for u in np.random.default_rng(2).uniform(0.4, 0.7, (4, 4)):
+        episode, _ = step(task, episode, jnp.asarray(u))
+        estimates.append(episode.estimate)
+        commands.append(u)
+
+    def frame(e):
+        matrix = Rotation.from_quat(np.asarray(e.quaternion)[[1, 2, 3, 0]]).as_matrix()
+        return np.concatenate([e.position / 1.0, e.velocity / 2.0, matrix.ravel(), e.body_rate / 10.0])
+
+    integral = sum(0.008 * np.clip(e.position, -0.3, 0.3) for e in estimates[:-1])
+    wanted = np.concatenate(
+        [frame(e) for e in estimates[:-4:-1]] + [2 * u - 1 for u in commands[:-4:-1]] + [integral / 0.6]
+    )
+    got = observe(task, episode)
+    assert got.shape == (layout.size,)
+    np.testing.assert_allclose(got, wanted, atol=1e-9)
+
+
+def test_far_targets_look_no_farther_than_the_limit():
+    at = state_at((30.0, 40.0, 0.0))
+    shown = observe(QUIET_TASK, reset(QUIET_TASK, DRONE, jax.random.PRNGKey(0), at))
+    np.testing.assert_allclose(shown[:3], [4.8, 6.4, 0.0], atol=1e-9)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**31 - 1), st.floats(0, 1.5))
+def test_every_episode_flies_another_drone_within_the_ranges(seed, magnitude):
+    drawn = _drawn(jax.random.split(jax.random.PRNGKey(seed)), magnitude)
+    mean = DRONE.parameters
+    ratio = np.asarray(drawn.parameters.thrust_scale)
+    assert np.all(np.abs(ratio - 1) <= 0.2 * magnitude + 1e-12)
+    assert np.all(np.abs(drawn.parameters.mass / mean.mass - 1) <= 0.1 * magnitude + 1e-12)
+    assert np.all(np.abs(drawn.parameters.attitude_offset) <= np.radians(15) * magnitude + 1e-12)
+    if magnitude > 0.01:
+        assert not np.allclose(ratio[0], ratio[1], rtol=1e-9)
+        assert len(set(ratio[0].tolist())) == 4
+
+
+@jax.jit
+def _drawn(keys, magnitude):
+    return jax.vmap(lambda key: reset(RANDOM_TASK, DRONE, key, magnitude=magnitude).model)(keys)
+
+
+def test_starts_reach_as_far_as_they_say_and_half_of_them_begin_nearby():
+    task = TargetTask()
+    states = jax.jit(jax.vmap(lambda key: reset(task, DRONE, key).state))(jax.random.split(jax.random.PRNGKey(0), 4000))
+    level = np.linalg.norm(states.position[:, :2], axis=1)
+    assert 6.0 < level.max() <= 6.5
+    assert np.abs(states.position[:, 2]).max() <= 2.0
+    assert 0.5 < np.mean(level < 0.65) < 0.65
+    up = Rotation.from_quat(np.asarray(states.quaternion)[:, [1, 2, 3, 0]]).as_matrix()[:, 2, 2]
+    assert up.min() < -0.95
+    np.testing.assert_allclose(np.linalg.norm(states.quaternion, axis=1), 1, atol=1e-12)
+    # What hovers beside the target keeps its height for a moment: rotors carry the weight.
+    assert np.all(np.asarray(states.rotor_speed) > 0.5 * 1594)
+
+
+def test_noise_has_the_size_it_says():
+    noise = Noise(0.0, 0.0, 0.01, 0.02, 0.03, 0.04)
+    task = TargetTask(noise=noise)
+    start = DRONE.hover_state((0.0, 0.0, 0.0))
+    seen = jax.jit(jax.vmap(lambda key: reset(task, DRONE, key, start).estimate))(
+        jax.random.split(jax.random.PRNGKey(0), 20000)
+    )
+    turned = Rotation.from_quat(np.asarray(seen.quaternion)[:, [1, 2, 3, 0]]).as_rotvec()
+    for values, std in ((seen.position, 0.01), (seen.velocity, 0.02), (turned, 0.03), (seen.body_rate, 0.04)):
+        np.testing.assert_allclose(np.std(values, axis=0), std, rtol=0.03)
+
+
+def test_the_state_is_kicked_in_every_simulation_step():
+    task = TargetTask(noise=Noise(0.001, 0.001, 0.0, 0.0, 0.0, 0.0))
+    start = DRONE.hover_state((0.0, 0.0, 0.0))
+
+    def flown(key):
+        episode = reset(task, DRONE, key, start)
+        return step(task, episode, DRONE.hover_command())[0].state
+
+    after = jax.jit(jax.vmap(flown))(jax.random.split(jax.random.PRNGKey(0), 20000))
+    # Two kicks of one thousandth each per control step.
+    np.testing.assert_allclose(np.std(after.body_rate, axis=0), 0.001 * 2**0.5, rtol=0.03)
+    np.testing.assert_allclose(np.std(after.velocity, axis=0), 0.001 * 2**0.5, rtol=0.03)
+
+
+def test_the_control_step_must_fit_the_simulation():
+    task = TargetTask(layout=Layout(control_dt_s=0.01))
+    with pytest.raises(CfbError, match=r"control_dt_s = 0.01 is no multiple"):
+        task.hold(DRONE)

@@ -1,0 +1,59 @@
+"""Training configurations: the shipped one is the defaults, and what is wrong is refused by the name of its key."""
+
+import pytest
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.train.config import TrainingConfig, load_config
+from cfb_mjx.train.strict import build
+
+
+def test_the_shipped_configuration_is_the_defaults():
+    shipped = load_config("target").to_mapping()
+    assert {**shipped, "description": ""} == TrainingConfig().to_mapping()
+
+
+def test_a_configuration_survives_being_written():
+    config = load_config("target", ("seed=3", "network.hidden=[8, 8]", "ppo.learning_rate=1e-4"))
+    assert config.seed == 3
+    assert config.network.hidden == (8, 8)
+    assert config.ppo.learning_rate == 1e-4
+    assert build(TrainingConfig, config.to_mapping(), "again") == config
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("task: target", "'format' must be"),
+        ("format: cfb_mjx training 1\nrewards: {}", "unknown key 'rewards'"),
+        ("format: cfb_mjx training 1\nreward: {positon: 1}", "unknown key 'reward.positon'"),
+        ("format: cfb_mjx training 1\nppo: {drones: 2.5}", "ppo.drones must be a whole number"),
+        ("format: cfb_mjx training 1\nppo: {drones: true}", "ppo.drones must be a whole number"),
+        ("format: cfb_mjx training 1\nppo: {discount: .nan}", "ppo.discount must be a finite number"),
+        ("format: cfb_mjx training 1\nppo: {discount: 1.5}", "ppo.discount = 1.5 must lie between 0 and 1"),
+        ("format: cfb_mjx training 1\nppo: [1]", "ppo must be a mapping"),
+        ("format: cfb_mjx training 1\nalgorithm: sac", "algorithm must be one of ppo, analytic"),
+        ("format: cfb_mjx training 1\nnetwork: {hidden: []}", "network.hidden must name at least one layer"),
+        ("format: cfb_mjx training 1\nnetwork: {hidden: 32}", "network.hidden must be a list"),
+        ("format: cfb_mjx training 1\nepisode_s: 0", "episode_s = 0.0 must be positive"),
+        ("format: cfb_mjx training 1\nobservation: {past_commands: -1}", "observation.past_commands = -1"),
+        ("format: cfb_mjx training 1\nppo: {drones: 10, minibatches: 4}", "ppo.drones = 10"),
+        ("format: cfb_mjx training 1\nrandomisation: {ranges: nothing}", "nothing: no such randomisation"),
+    ],
+)
+def test_mistakes_are_refused_by_key(tmp_path, text, said):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(CfbError) as refusal:
+        load_config(path)
+    assert said in str(refusal.value)
+
+
+@pytest.mark.parametrize("change", ["seed", "=3", "seed.x=3", "ppo.drones=[", "ppo=3", "nothing.at.all=1"])
+def test_changes_that_mean_nothing_are_refused(change):
+    with pytest.raises(CfbError, match=change.split("=")[0].split(".")[0] or "KEY=VALUE"):
+        load_config("target", (change,))
+
+
+def test_a_name_that_is_no_training_is_refused():
+    with pytest.raises(CfbError, match="no such training"):
+        load_config("hover")

@@ -1,0 +1,197 @@
+"""Both algorithms, small: gradients against differences, learning, and going on after an interruption."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cfb_mjx.control.neural import NeuralController
+from cfb_mjx.control.policy_file import load_policy
+from cfb_mjx.envs import TargetTask
+from cfb_mjx.errors import CfbError
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.parameters import load_model_file, load_randomisation, save_model_file
+from cfb_mjx.train.analytic import Analytic
+from cfb_mjx.train.brax_compat import brax_ppo
+from cfb_mjx.train.config import AnalyticSettings, TrainingConfig, load_config
+from cfb_mjx.train.ppo import Ppo
+from cfb_mjx.train.run import CHECKPOINT, CURVE, POLICY, Training, segments, train
+
+pytestmark = pytest.mark.xdist_group("training")
+
+SMALL = (
+    "checkpoints=2",
+    "network.hidden=[8, 8]",
+    "analytic.drones=4",
+    "analytic.updates=4",
+    "analytic.horizon_s=0.04",
+    "ppo.drones=8",
+    "ppo.unroll=4",
+    "ppo.steps=128",
+    "ppo.minibatches=2",
+    "ppo.epochs=2",
+    "ppo.value_hidden=[8]",
+)
+ALGORITHMS = ("analytic", "ppo")
+
+
+def small(algorithm: str, *changes: str) -> Training:
+    return Training.prepare(load_config("target", (*SMALL, f"algorithm={algorithm}", *changes)), {"cfb_mjx": "test"})
+
+
+def weights(folder) -> list[np.ndarray]:
+    return jax.tree.leaves(load_policy(folder / POLICY).controller)
+
+
+def test_the_gradient_of_a_flight_is_that_of_differences():
+    task = TargetTask(randomisation=load_randomisation("paper"))
+    analytic = Analytic(AnalyticSettings(drones=2, horizon_s=0.08), task, Quadrotor.from_file("cfb-guards"))
+    controller = NeuralController.random(jax.random.PRNGKey(0), task.layout, (8, 8))
+    # Weights of the size that training gives them: the first ones hardly look at what is seen.
+    controller = jax.tree.map(lambda w: w + 0.3 * jax.random.normal(jax.random.PRNGKey(w.size), w.shape), controller)
+    episodes = analytic.begin(jax.random.PRNGKey(1), controller).episodes
+
+    @jax.jit
+    def loss(controller):
+        return analytic._loss(controller, episodes)[0]
+
+    gradient = jax.jit(jax.grad(loss))(controller)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        way = jax.tree.map(lambda w: jnp.asarray(rng.normal(size=w.shape)), controller)
+        along = sum(jnp.vdot(g, d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(way), strict=True))
+        ahead, behind = (jax.tree.map(lambda w, d, h=h: w + h * d, controller, way) for h in (1e-5, -1e-5))
+        np.testing.assert_allclose(along, (loss(ahead) - loss(behind)) / 2e-5, rtol=1e-5)
+
+
+def test_a_failed_drone_pays_for_the_rest_of_the_horizon_and_harms_no_gradient():
+    task = TargetTask()
+    settings = AnalyticSettings(drones=2, horizon_s=0.08)
+    analytic = Analytic(settings, task, Quadrotor.from_file("cfb-guards"))
+    controller = NeuralController.random(jax.random.PRNGKey(0), task.layout, (8,))
+    episodes = analytic.begin(jax.random.PRNGKey(1), controller).episodes
+    thrown = jnp.array([[1e6, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    episodes = eqx.tree_at(lambda e: e.state.velocity, episodes, thrown)
+    (_, (after, alive)), gradient = jax.value_and_grad(analytic._loss, has_aux=True)(controller, episodes)
+    assert alive.tolist() == [False, True]
+    np.testing.assert_array_equal(after.state.velocity[0], thrown[0])
+    assert all(bool(jnp.all(jnp.isfinite(g))) for g in jax.tree.leaves(gradient))
+    costs = jax.vmap(analytic._fly, in_axes=(None, 0))(controller, episodes)[0]
+    np.testing.assert_allclose(costs[0], settings.cost.failure)
+
+
+def test_updates_lower_what_the_same_flights_cost():
+    config = load_config(
+        "target", (*SMALL, "analytic.learning_rate=0.01", "analytic.horizon_s=0.2", "analytic.updates=400")
+    )
+    task = config.build_task()
+    analytic = Analytic(config.analytic, task, Quadrotor.from_file("cfb-guards"))
+    first = NeuralController.random(jax.random.PRNGKey(1), task.layout, (8, 8), hover=0.4)
+    flights = analytic.begin(jax.random.PRNGKey(0), first)
+    state, losses = flights, []
+    for _ in range(40):
+        state = eqx.tree_at(lambda s: s.episodes, state, flights.episodes)
+        state, metrics = analytic.update(state)
+        losses.append(float(metrics["loss"]))
+    assert losses[-1] < 0.9 * losses[0]
+
+
+def test_ppo_finds_the_command_that_is_rewarded():
+    # Only the torque that a command asks for counts, and only the present: what is best is known, equal commands.
+    only = [f"reward.{name}=0" for name in ("position", "velocity", "attitude", "body_rate", "failure")]
+    now = ("reward.torque=1", "ppo.discount=0", "ppo.reward_scaling=1", "ppo.first_std=0.1", "ppo.learning_rate=0.01")
+    sizes = ("ppo.drones=64", "ppo.unroll=4", "ppo.steps=7680", "randomisation.magnitude=0")
+    config = load_config("target", (*SMALL, *only, *now, *sizes))
+    task = config.build_task()
+    ppo = Ppo(config.ppo, task, Quadrotor.from_file("cfb-guards"))
+    first = NeuralController.random(jax.random.PRNGKey(1), task.layout, (8, 8))
+    skewed = eqx.tree_at(lambda c: c.network.biases[-1], first, jnp.array([-0.4, 0.1, 0.6, 0.1]))
+    state, rewards = ppo.begin(jax.random.PRNGKey(0), skewed), []
+    for _ in range(ppo.updates):
+        state, metrics = ppo.update(state)
+        rewards.append(float(metrics["reward"]))
+    assert np.mean(rewards[:3]) < 0.6
+    assert np.mean(rewards[-3:]) > 0.75
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, algorithm):
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    rows = train(small(algorithm), whole, evaluate=False)
+
+    def interrupt(done, total, rate, left):
+        if done == total - 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(small(algorithm), cut, evaluate=False, progress=interrupt)
+    assert len((cut / CURVE).read_text().splitlines()) == 2
+    resumed = train(small(algorithm), cut, resume=True, evaluate=False)
+    assert (whole / POLICY).read_bytes() == (cut / POLICY).read_bytes()
+    for a, b in zip(rows, resumed, strict=True):
+        assert {k: v for k, v in a.items() if k != "seconds"} == {k: v for k, v in b.items() if k != "seconds"}
+
+
+def test_earlier_trainings_are_not_overwritten_nor_mixed(tmp_path):
+    train(small("ppo"), tmp_path, evaluate=False)
+    before = (tmp_path / POLICY).read_bytes()
+    # Nothing is left to do, and nothing changes.
+    train(small("ppo"), tmp_path, resume=True, evaluate=False)
+    assert (tmp_path / POLICY).read_bytes() == before
+    with pytest.raises(CfbError, match="holds a training already"):
+        train(small("ppo"), tmp_path, evaluate=False)
+    with pytest.raises(CfbError, match=r"another config\.ppo\.learning_rate"):
+        train(small("ppo", "ppo.learning_rate=0.1"), tmp_path, resume=True, evaluate=False)
+    (tmp_path / CHECKPOINT).write_bytes((tmp_path / CHECKPOINT).read_bytes()[:300])
+    with pytest.raises(CfbError, match=r"checkpoint\.npz"):
+        train(small("ppo"), tmp_path, resume=True, evaluate=False)
+    assert (tmp_path / POLICY).read_bytes() == before
+
+
+def test_one_algorithm_goes_on_from_the_others_policy(tmp_path):
+    train(small("analytic"), tmp_path / "first", evaluate=False)
+    config = load_config("target", (*SMALL, "algorithm=ppo", "ppo.learning_rate=1e-12"))
+    training = Training.prepare(config, {}, tmp_path / "first" / POLICY)
+    train(training, tmp_path / "second", evaluate=False)
+    for a, b in zip(weights(tmp_path / "first"), weights(tmp_path / "second"), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-6)
+    other = load_config("target", (*SMALL, "network.hidden=[9]"))
+    with pytest.raises(CfbError, match="another observation or network"):
+        Training.prepare(other, {}, tmp_path / "first" / POLICY)
+
+
+def test_a_model_with_effects_is_trained_on_and_a_predictor_is_refused(tmp_path):
+    effects = (
+        {"name": "rotor_drag", "parameters": {"coefficient": 1e-6}},
+        {"name": "payload_swing", "parameters": {"mass": 0.004, "length": 0.2}},
+    )
+    base = load_model_file("cfb-guards")
+    save_model_file(replace(base, effects=effects), tmp_path / "m.yaml")
+    config = replace(load_config("target", SMALL), model=str(tmp_path / "m.yaml"))
+    train(Training.prepare(config, {}), tmp_path / "run", evaluate=False)
+    save_model_file(replace(base, kind="predictor"), tmp_path / "p.yaml")
+    config = replace(config, model=str(tmp_path / "p.yaml"))
+    with pytest.raises(CfbError, match=r"predictor, not a plant.*--force"):
+        Training.prepare(config, {})
+    assert Training.prepare(config, {}, force=True).described.kind == "predictor"
+
+
+def test_checkpoints_are_spread_evenly_and_end_with_the_training():
+    assert segments(10, 4) == [2, 5, 8, 10]
+    assert segments(3, 10) == [1, 2, 3]
+
+
+def test_braxs_own_ppo_runs_here_and_leaves_jax_as_it_was():
+    had = hasattr(jax, "device_put_replicated")
+    with brax_ppo() as brax_train:
+        assert callable(brax_train)
+        spread = jax.device_put_replicated({"a": jnp.arange(3.0)}, jax.local_devices()[:1])
+        np.testing.assert_array_equal(spread["a"], [[0.0, 1.0, 2.0]])
+    assert hasattr(jax, "device_put_replicated") == had
+
+
+def test_defaults_are_valid():
+    assert TrainingConfig().ppo.updates > 0
