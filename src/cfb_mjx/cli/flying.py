@@ -74,17 +74,19 @@ def find_pilot(controller: str, nominal):
     Raises:
         CfbError: there is no such controller, or the file is no policy.
     """
-    from cfb_mjx.control import FirmwarePid
+    from cfb_mjx.control import FirmwarePid, Mellinger
     from cfb_mjx.control.policy_file import load_policy, shipped_policies
-    from cfb_mjx.train.flying import Neural, Pid
+    from cfb_mjx.train.flying import MellingerPilot, Neural, Pid
 
     if controller == "pid":
         return Pid(FirmwarePid.hovering(nominal.changed_parameters()))
+    if controller == "mellinger":
+        return MellingerPilot(Mellinger())
     found = shipped_policies()
     if controller in found:
         return Neural(load_policy(found[controller]).controller)
     if Path(controller).suffix != ".npz":
-        names = ", ".join(["pid", *found])
+        names = ", ".join(["pid", "mellinger", *found])
         raise CfbError(f"{controller}: no such controller; give a policy file (.npz) or one of {names}.")
     return Neural(load_policy(controller).controller)
 

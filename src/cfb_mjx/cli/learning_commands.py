@@ -65,7 +65,7 @@ def fly(
     deg.
 
     Args:
-        controller: pid (the firmware's), a shipped policy, or a policy file of `cfb train`.
+        controller: pid or mellinger (the firmware's), a shipped policy, or a policy file of `cfb train`.
         task: what to fly.
         model: preset or model YAML of the drone, with its effects.
         plants: number of flights, each on a drone drawn anew.

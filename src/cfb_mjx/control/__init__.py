@@ -1,12 +1,14 @@
-"""Controllers: the firmware's cascaded PID and neural policies. Pure functions over immutable pytrees."""
+"""Controllers: the firmware's PID and Mellinger, and neural policies. Pure functions over immutable pytrees."""
 
 from cfb_mjx.control.hold import PositionHold
+from cfb_mjx.control.mellinger import Mellinger
 from cfb_mjx.control.neural import Network, NeuralController
 from cfb_mjx.control.pid import FirmwarePid, PidState, Setpoint, init, resume, step
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
 
 __all__ = [
     "FirmwarePid",
+    "Mellinger",
     "Network",
     "NeuralController",
     "PidState",

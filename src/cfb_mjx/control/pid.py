@@ -177,7 +177,7 @@ def step(
     return new, mix(collective, torque, controller.idle)
 
 
-def mix(thrust: Float[Array, ""], torque: Float[Array, "3"], idle: float = 0.0) -> Float[Array, "4"]:
+def mix(thrust: Float[Array, ""], torque: Float[Array, "3"], idle: Float[Array, ""] | float = 0.0) -> Float[Array, "4"]:
     """Legacy mixing of collective and roll, pitch, yaw (counts) to commands in [0, 1].
 
     Positive counts ask for roll about +x, nose up (legacy), yaw about +z. Where a motor would exceed full power all are

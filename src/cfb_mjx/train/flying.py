@@ -11,6 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from cfb_mjx.control.mellinger import Mellinger
+from cfb_mjx.control.mellinger import init as mellinger_init
+from cfb_mjx.control.mellinger import step as mellinger_step
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.pid import DT as PID_DT
 from cfb_mjx.control.pid import FirmwarePid, Setpoint, init
@@ -70,6 +73,21 @@ class Pid(eqx.Module):
     def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
         """New memory and command."""
         return pid_step(self.pid, memory, _measured(estimate), Setpoint.hover(jnp.zeros(3)))
+
+
+class MellingerPilot(eqx.Module):
+    """The firmware's Mellinger controller as a pilot, heading kept at zero."""
+
+    mellinger: Mellinger
+    control_dt_s: float = eqx.field(static=True, default=PID_DT)
+
+    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
+        """Empty integrators."""
+        return mellinger_init(_measured(estimate))
+
+    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
+        """New memory and command."""
+        return mellinger_step(self.mellinger, memory, _measured(estimate), jnp.zeros(3))
 
 
 def _measured(estimate: Estimate) -> State:
