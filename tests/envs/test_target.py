@@ -93,7 +93,7 @@ def test_estimates_are_eight_milliseconds_old_and_turned_by_the_offset():
 
 
 def test_the_observation_is_the_contract():
-    layout = Layout(past_estimates=2, past_commands=3, integral=True)
+    layout = Layout(past_estimates=2, estimate_stride=2, past_commands=3, integral=True)
     task = replace(QUIET_TASK, layout=layout)
     episode = reset(task, DRONE, jax.random.PRNGKey(3))
     estimates, commands = [episode.estimate], []
@@ -108,7 +108,7 @@ def test_the_observation_is_the_contract():
 
     integral = sum(0.008 * np.clip(e.position, -0.3, 0.3) for e in estimates[:-1])
     wanted = np.concatenate(
-        [frame(e) for e in estimates[:-4:-1]] + [2 * u - 1 for u in commands[:-4:-1]] + [integral / 0.6]
+        [frame(e) for e in estimates[::-2]] + [2 * u - 1 for u in commands[:-4:-1]] + [integral / 0.6]
     )
     got = observe(task, episode)
     assert got.shape == (layout.size,)

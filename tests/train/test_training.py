@@ -12,11 +12,12 @@ from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.errors import CfbError
-from cfb_mjx.model import Quadrotor
+from cfb_mjx.model import Quadrotor, rollout_final
 from cfb_mjx.parameters import load_model_file, load_randomisation, save_model_file
 from cfb_mjx.train.analytic import Analytic
 from cfb_mjx.train.brax_compat import brax_ppo
-from cfb_mjx.train.config import AnalyticSettings, TrainingConfig, load_config
+from cfb_mjx.train.config import AnalyticSettings, load_config
+from cfb_mjx.train.plants import load_plants
 from cfb_mjx.train.ppo import Ppo
 from cfb_mjx.train.run import CHECKPOINT, CURVE, POLICY, Training, segments, train
 
@@ -190,8 +191,38 @@ def test_braxs_own_ppo_runs_here_and_leaves_jax_as_it_was():
         assert callable(brax_train)
         spread = jax.device_put_replicated({"a": jnp.arange(3.0)}, jax.local_devices()[:1])
         np.testing.assert_array_equal(spread["a"], [[0.0, 1.0, 2.0]])
+        from brax import envs
+
+        sizes = {"num_envs": 4, "batch_size": 4, "num_minibatches": 1, "unroll_length": 4, "num_updates_per_batch": 1}
+        _, params, _ = brax_train(
+            envs.get_environment("fast"), num_timesteps=32, episode_length=8, run_evals=False, **sizes
+        )
+        assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(params[1]))
     assert hasattr(jax, "device_put_replicated") == had
 
 
-def test_defaults_are_valid():
-    assert TrainingConfig().ppo.updates > 0
+@pytest.mark.parametrize("name", ["target", "target-analytic", "target-adaptive"])
+def test_shipped_trainings_can_be_begun(name):
+    training = Training.prepare(load_config(name), {})
+    nominal = training.nominal()
+    assert training.config.build_task().hold(nominal) == 2
+    assert training.first_controller(nominal).layout == training.config.observation
+
+
+def test_off_nominal_plants_differ_from_the_nominal_one_and_hover(tmp_path):
+    base = load_model_file("cfb-guards")
+    plants = load_plants(base)
+    assert len(plants) >= 8
+    start = Quadrotor.from_file(base).hover_state()
+    commands = jnp.full((50, 4), 0.55)
+    plain = rollout_final(Quadrotor.from_file(base), start, commands)
+    for name, drone in plants.items():
+        moved = rollout_final(drone, start, commands + jnp.array([0.0, 0.02, 0.0, 0.0]))
+        assert bool(jnp.all(jnp.isfinite(moved.position))), name
+        same = rollout_final(drone, start, commands)
+        assert not np.allclose(same.position, plain.position, atol=1e-6) or name in ("drag", "yaw torque"), name
+    (tmp_path / "p.yaml").write_text("format: cfb_mjx plants 1\nplants: [{effects: []}]")
+    with pytest.raises(CfbError, match=r"p\.yaml: every plant needs a name"):
+        load_plants(base, tmp_path / "p.yaml")
+    with pytest.raises(CfbError, match="no such set of plants"):
+        load_plants(base, "nothing")

@@ -25,6 +25,8 @@ class Layout:
     control_dt_s: float = 0.008
     """Time between two commands, s."""
     past_estimates: int = 1
+    estimate_stride: int = 1
+    """Control steps between one shown estimate and the next older one."""
     past_commands: int = 6
     integral: bool = False
     """Also show the integral of the relative position: with it constant errors of thrust and attitude can be held."""
@@ -61,6 +63,7 @@ class Memory(eqx.Module):
     """What the controller keeps between two steps."""
 
     frames: Float[Array, "estimates 18"]
+    """Of every control step, shown or not, newest first."""
     commands: Float[Array, "commands 4"]
     """As the observation shows them: 2 u - 1."""
     integral: Float[Array, "3"]
@@ -99,12 +102,14 @@ def start(layout: Layout, estimate: Estimate, command: Float[Array, "4"] | float
     """Memory of a controller that has seen ``estimate`` and commanded ``command`` [0 to 1] for long."""
     shown = frame(layout, estimate)
     past = jnp.broadcast_to(2 * jnp.asarray(command, shown.dtype) - 1, (layout.past_commands, 4))
-    return Memory(jnp.broadcast_to(shown, (layout.past_estimates, FRAME)), past, jnp.zeros(3, shown.dtype))
+    kept = layout.past_estimates * layout.estimate_stride
+    return Memory(jnp.broadcast_to(shown, (kept, FRAME)), past, jnp.zeros(3, shown.dtype))
 
 
 def observation(layout: Layout, memory: Memory, estimate: Estimate) -> Float[Array, "size"]:
     """What the network is given, (``layout.size``,)."""
-    parts = [frame(layout, estimate), memory.frames.reshape(-1), memory.commands.reshape(-1)]
+    shown = memory.frames[layout.estimate_stride - 1 :: layout.estimate_stride]
+    parts = [frame(layout, estimate), shown.reshape(-1), memory.commands.reshape(-1)]
     if layout.integral:
         parts.append(memory.integral / layout.integral_limit_ms)
     return jnp.concatenate(parts)

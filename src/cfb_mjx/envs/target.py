@@ -54,8 +54,8 @@ class TargetTask:
     """What varies from episode to episode; None: nothing does."""
     magnitude: float = 1.0
     """Factor on all ranges of ``randomisation``."""
-    graded: bool = False
-    """Draw the factor anew in every episode, between 0 and ``magnitude``."""
+    graded: float = 0.0
+    """Share of the episodes that draw their own factor between 0 and ``magnitude``."""
     episode_s: float = 6.0
     longest_delay_s: float = 0.016
     """The longest observation delay any drone of the task may have; longer ones count as this."""
@@ -137,7 +137,8 @@ def reset(
     if task.randomisation is not None:
         factor = task.magnitude if magnitude is None else magnitude
         if task.graded:
-            factor = factor * jax.random.uniform(jax.random.fold_in(of_drone, 0))
+            which, grade = jax.random.uniform(jax.random.fold_in(of_drone, 0), (2,))
+            factor = factor * jnp.where(which < task.graded, grade, 1.0)
         drawn = sample_parameters(of_drone, nominal.parameters, task.randomisation, factor)
         model = eqx.tree_at(lambda m: m.parameters, nominal, drawn)
     target = jnp.asarray(target, model.parameters.mass.dtype)

@@ -6,6 +6,7 @@ Everything here stops acting once Brax no longer needs it.
 from __future__ import annotations
 
 import contextlib
+import io
 import warnings
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -16,8 +17,9 @@ import jax.numpy as jnp
 
 def parts() -> SimpleNamespace:
     """``losses``, ``networks``, ``distribution`` and ``types`` of Brax's PPO."""
-    with warnings.catch_warnings():
-        # Brax's physics, which comes along, imports jaxopt, which says that it is no longer maintained.
+    # Brax's physics comes along: jaxopt, which warns that it is no longer maintained, and MJX, which prints that warp
+    # is not installed.
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.filterwarnings("ignore", category=DeprecationWarning)
         from brax.training import distribution, types
         from brax.training.agents.ppo import losses, networks

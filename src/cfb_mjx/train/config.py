@@ -35,9 +35,9 @@ class RandomisationSettings:
     """A shipped randomisation or a YAML file."""
     magnitude: float = 1.0
     """Factor on all ranges; 0 trains on the nominal drone alone."""
-    graded: bool = False
-    """Every episode draws its own factor between 0 and ``magnitude``: uniform draws of a dozen numbers are never all
-    near their means, and without this the nominal drone itself would never be flown."""
+    graded: float = 0.0
+    """Share of the episodes that draw their own factor between 0 and ``magnitude``: uniform draws of a dozen numbers
+    are never all near their means, and without this the nominal drone itself would never be flown."""
 
 
 @dataclass(frozen=True)
@@ -200,6 +200,7 @@ _AT_LEAST = {
     "checkpoints": 1,
     "observation.past_estimates": 0,
     "observation.past_commands": 0,
+    "observation.estimate_stride": 1,
     "randomisation.magnitude": 0,
     "seed": 0,
     "analytic.drones": 1,
@@ -243,7 +244,7 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
     for key in _POSITIVE:
         if not _at(config, key) > 0:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be positive.")
-    for key in ("starts.near", "ppo.discount", "ppo.gae_lambda"):
+    for key in ("starts.near", "randomisation.graded", "ppo.discount", "ppo.gae_lambda"):
         if not 0 <= _at(config, key) <= 1:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must lie between 0 and 1.")
     for key in ("network.hidden", "ppo.value_hidden"):
