@@ -16,6 +16,15 @@ assert str(shipped("assets", "cfb.xml")).startswith(str(pathlib.Path(cfb_mjx.__f
 assert preset_names() == ["cf21b-500", "cfb", "cfb-guards"]
 load_randomisation()
 Quadrotor.from_file("cf21b-500", body=MjxBody(floor=True))
+from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.parameters import load_model_file
+from cfb_mjx.train import load_config
+from cfb_mjx.train.plants import load_plants
+assert list(shipped_policies()) == ["target", "target-adaptive"]
+for policy in shipped_policies().values():
+    load_policy(policy)
+load_config("target-adaptive")
+load_plants(load_model_file("cfb-guards"))
 assert (pathlib.Path(cfb_mjx.__file__).parent / "py.typed").exists()
 print("fine")
 """

@@ -3,11 +3,8 @@
 import json
 from dataclasses import replace
 
-import jax
-import numpy as np
 import pytest
 
-from cfb_mjx.cli import main
 from cfb_mjx.parameters import load_model_file, save_model_file
 
 pytestmark = pytest.mark.xdist_group("training")
@@ -22,21 +19,6 @@ SMALL = (
     "ppo.epochs=1",
     "ppo.value_hidden=[8]",
 )
-
-
-@pytest.fixture(autouse=True)
-def _settings_of_the_session():
-    """Commands set precision and cache for their process, which here is that of all tests."""
-    names = (
-        "jax_enable_x64",
-        "jax_default_matmul_precision",
-        "jax_compilation_cache_dir",
-        "jax_persistent_cache_min_compile_time_secs",
-    )
-    before = {name: getattr(jax.config, name) for name in names}
-    yield
-    for name, value in before.items():
-        jax.config.update(name, value)
 
 
 @pytest.fixture(scope="module")
@@ -85,24 +67,25 @@ def test_going_on_after_the_end_changes_nothing_and_another_training_is_refused(
     assert (folder / "policy.npz").read_bytes() == before
 
 
-def test_a_policy_file_flies(trained, tmp_path, capsys):
+def test_a_policy_file_flies(cfb, trained, tmp_path):
     folder, _ = trained
-    arguments = ["fly", str(folder / "policy.npz"), "--task", "hover", "--plants", "3", "--magnitude", "1"]
-    assert main([*arguments, "--json", str(tmp_path / "h.json"), "--figure", str(tmp_path / "h.png")]) == 0
+    arguments = ("--plants", 3, "--magnitude", 1, "--json", tmp_path / "h.json", "--figure", tmp_path / "h.png")
+    done = cfb("fly", folder / "policy.npz", *arguments)
+    assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "h.json").read_text())
     assert {"mean_distance_mm", "command_std", "failed", "success_rate", "quantiles", "environment"} <= set(result)
     assert (tmp_path / "h.png").stat().st_size > 10_000
-    assert "mean distance [mm]" in capsys.readouterr().out
+    assert "mean distance [mm]" in done.stdout
 
 
-def test_the_firmwares_pid_holds_hover_and_steps_slowly(tmp_path):
+def test_the_firmwares_pid_holds_hover_and_steps_slowly(cfb, tmp_path):
     path = tmp_path / "r.json"
-    assert main(["fly", "pid", "--json", str(path)]) == 0
+    assert cfb("fly", "pid", "--json", path).returncode == 0
     hover = json.loads(path.read_text())
     assert hover["mean_distance_mm"] < 30
     assert hover["command_std"] < 0.1
     assert hover["failed"] is False
-    assert main(["fly", "pid", "--task", "step", "--json", str(path)]) == 0
+    assert cfb("fly", "pid", "--task", "step", "--json", path).returncode == 0
     step = json.loads(path.read_text())
     # Its velocity limit is 1 m/s per axis, with a tenth on top.
     assert 0.9 < step["peak_speed_mps"] < 1.6
@@ -115,30 +98,25 @@ def test_the_firmwares_pid_holds_hover_and_steps_slowly(tmp_path):
         (["fly", "nobody"], "no such controller"),
         (["fly", "nobody.npz"], "nobody.npz: there is no such file"),
         (["fly", "pid", "--plants", "0"], "at least one drone"),
-        (["fly", "pid", "--magnitude", "-1"], "zero or positive"),
         (["fly", "pid", "--model", "nothing"], "nothing: no such model"),
-        (["fly", "pid", "--json", "nowhere/x.json"], "folder nowhere does not exist"),
         (["train", "target", "-o", "x", "--config", "nothing"], "no such training"),
         (["train", "target", "-o", "x", "--set", "ppo.dronez=3"], "ppo.dronez"),
-        (["train", "target", "-o", "x", "--model", "nothing"], "nothing: no such model"),
-        (["train", "target", "-o", "x", "--start", "no.npz"], "no.npz: there is no such file"),
         (["train", "target", "-o", "x", "--set", "observation.control_dt_s=0.01"], "control_dt_s = 0.01"),
     ],
 )
-def test_mistakes_get_a_sentence(arguments, said, capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    err = capsys.readouterr().err
-    assert said in err
-    assert "Traceback" not in err
+def test_mistakes_get_a_sentence(cfb, arguments, said, tmp_path):
+    done = cfb(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
     # Nothing was begun.
     assert not (tmp_path / "x" / "policy.npz").exists()
 
 
-def test_training_on_a_predictor_must_be_insisted_on(tmp_path, capsys):
+def test_training_on_a_predictor_must_be_insisted_on(cfb, tmp_path):
     save_model_file(replace(load_model_file("cfb-guards"), kind="predictor"), tmp_path / "p.yaml")
-    assert main(["train", "target", "--model", str(tmp_path / "p.yaml"), "-o", str(tmp_path / "run")]) == 2
-    err = capsys.readouterr().err
-    assert "predictor" in err
-    assert "--force" in err
-    assert np.all([p.name == "p.yaml" for p in tmp_path.iterdir()])
+    done = cfb("train", "target", "--model", tmp_path / "p.yaml", "-o", tmp_path / "run")
+    assert done.returncode == 2
+    assert "predictor" in done.stderr
+    assert "--force" in done.stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["p.yaml"]

@@ -23,7 +23,7 @@ def flight_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
     """
     path = check_path(path)
     rows = [
-        ("position relative to target, m", np.asarray(flown.position), "xyz"),
+        ("position - target, m", np.asarray(flown.position), "xyz"),
         ("speed, m/s", np.linalg.norm(flown.velocity, axis=-1)[..., None], ("",)),
         ("command", np.asarray(flown.command), ("M1", "M2", "M3", "M4")),
     ]

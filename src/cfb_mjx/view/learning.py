@@ -23,6 +23,8 @@ def learning_figure(rows: list[dict[str, float]], path: str | Path, title: str =
     """
     panels = [panel for panel in _PANELS if panel[0] in rows[0]]
     with context():
+        from matplotlib.ticker import FormatStrFormatter
+
         figure = new_figure(3.1 * len(panels), 2.8)
         axes = figure.subplots(1, len(panels), squeeze=False)[0]
         millions = [row["commands"] / 1e6 for row in rows]
@@ -32,6 +34,8 @@ def learning_figure(rows: list[dict[str, float]], path: str | Path, title: str =
             axis.set_ylabel(label)
             if logarithmic:
                 axis.set_yscale("log")
+                for which in (axis.yaxis.set_major_formatter, axis.yaxis.set_minor_formatter):
+                    which(FormatStrFormatter("%g"))
         figure.suptitle(f"{title}: {rows[-1]['seconds']:.0f} s of training" if title else "", fontsize=10)
-        figure.subplots_adjust(left=0.22 / len(panels), right=0.98, bottom=0.18, top=0.86, wspace=0.38)
+        figure.subplots_adjust(left=0.26 / len(panels), right=0.98, bottom=0.18, top=0.86, wspace=0.38)
         save(figure, check_path(path))

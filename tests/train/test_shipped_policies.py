@@ -1,0 +1,43 @@
+"""The shipped policies do what they are shipped for; docs/controllers.md has the full measurements."""
+
+import jax
+import numpy as np
+import pytest
+
+from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.envs import TargetTask
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.parameters import load_randomisation
+from cfb_mjx.train.flying import Neural, hover, six_metres
+
+pytestmark = pytest.mark.xdist_group("training")
+
+DRONE = Quadrotor.from_file("cfb-guards")
+
+
+def pilot_of(name: str) -> Neural:
+    policy = load_policy(shipped_policies()[name])
+    assert policy.training["config"]["seed"] == 0
+    return Neural(policy.controller)
+
+
+@pytest.mark.parametrize("name", ["target", "target-adaptive"])
+def test_it_hovers_on_the_nominal_drone(name):
+    measured, _ = hover(pilot_of(name), TargetTask(), DRONE, jax.random.split(jax.random.PRNGKey(3), 8))
+    assert not np.any(measured.failed)
+    assert np.mean(measured.mean_distance_m) < 0.025
+    assert np.mean(measured.command_std) < 0.02
+
+
+def test_random_drones_are_held_within_centimetres():
+    task = TargetTask(randomisation=load_randomisation("paper"))
+    measured, _ = hover(pilot_of("target-adaptive"), task, DRONE, jax.random.split(jax.random.PRNGKey(3), 32))
+    assert not np.any(measured.failed)
+    assert np.median(measured.mean_distance_m) < 0.06
+
+
+def test_six_metres_in_two_seconds():
+    measured, _ = six_metres(pilot_of("target"), TargetTask(), DRONE, jax.random.split(jax.random.PRNGKey(3), 4))
+    assert np.all(np.asarray(measured.arrival_s) <= 2.0)
+    assert np.all(np.asarray(measured.peak_speed_mps) >= 5.0)
+    assert not np.any(measured.failed)
