@@ -41,13 +41,11 @@ def run_train(
     training = Training.prepare(settings, versions, start, force)
     say(f"{settings.algorithm} on {training.described.name}, randomisation x {settings.randomisation.magnitude:g}")
     bar = Progress("training")
-    rows = []
 
     def advanced(done: int, total: int, rate: float, left: float) -> None:
         bar(done, total, f"{rate / 1e3:.0f} k commands/s, {_clock(left)} left")
 
     def reported(row: dict) -> None:
-        rows.append(row)
         hover = f", hover {row['hover_mm']:.3g} mm, command std {row['command_std']:.3g}" if "hover_mm" in row else ""
         say(f"{_clock(row['seconds'])}: {row['commands'] / 1e6:.3g} M commands, loss {row['loss']:.3g}{hover}")
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.envs.target import TargetTask, observe, reset, step
+from cfb_mjx.envs.target import TargetTask, choose, observe, reset, step
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 
@@ -57,9 +57,7 @@ class TargetVectorEnv(VectorEnv):
             after, outcome = jax.vmap(partial(step, self.task))(episodes, 0.5 * (1 + actions))
             over = outcome.failed | outcome.timed_out
             fresh = begin(jax.random.split(key, num_envs))
-            kept = jax.tree.map(
-                lambda a, b: jnp.where(over.reshape(over.shape + (1,) * (a.ndim - 1)), a, b), fresh, after
-            )
+            kept = choose(over, fresh, after)
             return kept, look(kept), look(after), outcome
 
         self._begin = jax.jit(lambda key: (lambda e: (e, look(e)))(begin(jax.random.split(key, num_envs))))

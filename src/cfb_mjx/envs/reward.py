@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from cfb_mjx.model.rotors import POSITION_SIGNS_X, POSITION_SIGNS_Y
+from cfb_mjx.model.rotors import TORQUE_SIGNS, thrust
 from cfb_mjx.model.state import State
 from cfb_mjx.parameters import Parameters
 
@@ -63,11 +63,8 @@ class PaperReward:
 
 def commanded_torque(parameters: Parameters, command: Float[Array, "4"]) -> Float[Array, "2"]:
     """Roll and pitch torque L f(K u) of rotors that have settled at ``command``, N m (paper eqs. 5, 6 and 8)."""
-    s = (parameters.motor_gain * command + parameters.motor_speed_offset) / parameters.reference_rotor_speed
-    a, b, c = parameters.thrust_polynomial
-    thrust = parameters.thrust_scale * jnp.maximum(0.0, s * (c + s * (b + s * a)))
-    half = parameters.rotor_spacing / 2
-    return jnp.stack([half * thrust @ jnp.asarray(POSITION_SIGNS_Y), -half * thrust @ jnp.asarray(POSITION_SIGNS_X)])
+    settled = thrust(parameters, parameters.motor_gain * command + parameters.motor_speed_offset)
+    return parameters.rotor_spacing / 2 * (jnp.asarray(TORQUE_SIGNS[:2], settled.dtype) @ settled)
 
 
 def length(vector: Float[Array, "n"]) -> Float[Array, ""]:

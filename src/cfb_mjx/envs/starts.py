@@ -11,6 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import hover_rotor_speed
 from cfb_mjx.model.state import State
+from cfb_mjx.model.vector import Vec, multiply
 
 
 @dataclass(frozen=True)
@@ -49,16 +50,11 @@ def draw(starts: Starts, model: Quadrotor, target: Float[Array, "3"], key: PRNGK
     body_rate = difficulty * starts.rate_radps * (2 * parts[11:14] - 1)
     spread = 1 + difficulty * starts.rotor_speed * (2 * parts[14:18] - 1)
     rotor_speed = hover_rotor_speed(model.changed_parameters()) * spread
-    return State(position, velocity, _yawed(tilted, yaw), body_rate, rotor_speed)
+    # The tilted drone is turned about the world's vertical.
+    turn = Vec(jnp.cos(yaw / 2), 0.0, 0.0, jnp.sin(yaw / 2))
+    return State(position, velocity, multiply(turn, Vec.unstack(tilted)).stack(), body_rate, rotor_speed)
 
 
 def _direction(unit: Float[Array, ""]) -> Float[Array, "2"]:
     angle = 2 * jnp.pi * unit
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)])
-
-
-def _yawed(q: Float[Array, "4"], yaw: Float[Array, ""]) -> Float[Array, "4"]:
-    # [c, 0, 0, s] (x) q: the tilted drone is turned about the world's vertical.
-    c, s = jnp.cos(yaw / 2), jnp.sin(yaw / 2)
-    w, x, y, z = q
-    return jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])

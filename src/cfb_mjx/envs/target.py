@@ -7,7 +7,7 @@ of one drone: ``vmap`` them over many. Each episode carries its own drone, so ra
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,6 +21,7 @@ from cfb_mjx.envs.starts import Starts, draw
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
+from cfb_mjx.model.rotors import steady_command
 from cfb_mjx.model.state import AnyArray, State, stack, unstack
 from cfb_mjx.model.vector import Vec, exponential, multiply
 from cfb_mjx.parameters import Randomisation, sample_parameters
@@ -146,10 +147,20 @@ def reset(
     state = begin(model, state)
     past = DelayLine.filled(_pose(state), model.dt, task.longest_delay_s)
     estimate = _estimate(task, model, past, target, of_first)
-    parameters = model.parameters
-    settled = (state.rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
-    memory = seen.start(task.layout, estimate, jnp.clip(settled, 0.0, 1.0))
+    memory = seen.start(task.layout, estimate, settled_command(model, state))
     return Episode(model, state, target, past, memory, estimate, jnp.asarray(0), of_noise)
+
+
+def settled_command(model: Quadrotor, state: State) -> Float[Array, "4"]:
+    """The command [0 to 1] that keeps the rotors as they turn: what a controller that takes over finds."""
+    return jnp.clip(steady_command(model.parameters, state.rotor_speed), 0.0, 1.0)
+
+
+def choose(condition: Array, yes: Any, no: Any) -> Any:
+    """``jnp.where`` on every array of two like pytrees; the condition's axes come first."""
+    return jax.tree.map(
+        lambda a, b: jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim)), a, b), yes, no
+    )
 
 
 def observe(task: TargetTask, episode: Episode) -> Float[Array, "size"]:

@@ -212,7 +212,12 @@ def hover_rotor_speed(parameters: Parameters) -> Float[Array, "4"]:
 
 def hover_command(parameters: Parameters) -> Float[Array, "4"]:
     """Commands that hold the hover of `hover_rotor_speed`; outside [0, 1] if the drone cannot hover."""
-    return (hover_rotor_speed(parameters) - parameters.motor_speed_offset) / parameters.motor_gain
+    return steady_command(parameters, hover_rotor_speed(parameters))
+
+
+def steady_command(parameters: Parameters, speed: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Commands at which the rotors turn at ``speed`` [rad/s] in the end."""
+    return (speed - parameters.motor_speed_offset) / parameters.motor_gain
 
 
 def rotor_speed_history(

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.envs.observation import rotation_matrix
-from cfb_mjx.envs.target import Episode, TargetTask, observe, reset, step
+from cfb_mjx.envs.target import Episode, TargetTask, choose, observe, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.state import State
 from cfb_mjx.train.config import AnalyticSettings, SmoothCost
@@ -89,7 +89,7 @@ class Analytic:
         of_episodes, key = jax.random.split(state.key)
         over = ~alive | (episodes.count >= self.task.episode_steps)
         fresh = self._reset(jax.random.split(of_episodes, self.settings.drones))
-        episodes = where(over, fresh, episodes)
+        episodes = choose(over, fresh, episodes)
         metrics = {"loss": loss, "failing": jnp.mean(~alive), "gradient": optax.tree.norm(gradient)}
         return AnalyticState(controller, optimizer, episodes, key, state.count + 1), metrics
 
@@ -109,20 +109,11 @@ class Analytic:
             last = episode.memory.commands[0] if self.task.layout.past_commands else 2 * command - 1
             paid = smooth_cost(cost, after.state, episode.target, command, (1 + last) / 2)
             # A failed drone stays where it was: what comes after must neither count nor overflow.
-            after = where(alive, after, jax.lax.stop_gradient(episode))
+            after = choose(alive, after, jax.lax.stop_gradient(episode))
             return (after, alive), jnp.where(alive, paid, cost.failure)
 
         (episode, alive), costs = jax.lax.scan(one, (episode, jnp.asarray(True)), length=self.horizon)
         return jnp.mean(costs), episode, alive
-
-
-def where(condition: Array, yes: Any, no: Any) -> Any:
-    """``jnp.where`` on every array of two like pytrees; the condition's axes come first."""
-
-    def choose(a, b):
-        return jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim)), a, b)
-
-    return jax.tree.map(choose, yes, no)
 
 
 def _arrays(tree: Any) -> Any:

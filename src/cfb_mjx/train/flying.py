@@ -19,7 +19,7 @@ from cfb_mjx.control.pid import DT as PID_DT
 from cfb_mjx.control.pid import FirmwarePid, Setpoint, init
 from cfb_mjx.control.pid import step as pid_step
 from cfb_mjx.envs.observation import Estimate, Layout
-from cfb_mjx.envs.target import TargetTask, reset, step
+from cfb_mjx.envs.target import TargetTask, reset, settled_command, step
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
 
@@ -124,9 +124,7 @@ def fly(
     # What the episode remembers for a network is of no use to other pilots; keep it small.
     task = replace(task, layout=Layout(control_dt_s=dt, past_estimates=0, past_commands=0))
     episode = reset(task, nominal, key, state)
-    parameters = episode.model.parameters
-    settled = (episode.state.rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
-    memory = pilot.start(episode.estimate, jnp.clip(settled, 0.0, 1.0))
+    memory = pilot.start(episode.estimate, settled_command(episode.model, episode.state))
 
     def one(carry, _):
         episode, memory, failed = carry

@@ -18,10 +18,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import Network, NeuralController
 from cfb_mjx.envs.observation import Estimate, frame
-from cfb_mjx.envs.target import Episode, TargetTask, observe, reset, step
+from cfb_mjx.envs.target import Episode, TargetTask, choose, observe, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters.parameters import SPECIFICATIONS
-from cfb_mjx.train.analytic import where
 from cfb_mjx.train.brax_compat import parts
 from cfb_mjx.train.config import PpoSettings
 
@@ -141,7 +140,7 @@ class Ppo:
                     "state_extras": {"truncation": 1.0 * (outcome.timed_out & ~outcome.failed)},
                 },
             )
-            return where(over, fresh, after), (kept, outcome)
+            return choose(over, fresh, after), (kept, outcome)
 
         episodes, (data, outcome) = jax.lax.scan(one, episodes, jax.random.split(key, self.settings.unroll))
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
