@@ -164,3 +164,30 @@ def test_ctrl_c_leaves_earlier_results(files, tmp_path):
     assert "interrupted" in err
     assert "Traceback" not in err
     assert (tmp_path / "keep.json").read_text() == "{}"
+
+
+def test_ctrl_c_in_a_callback_of_the_garbage_collector_is_not_lost():
+    """Python discards what such a callback raises; jax has one, and Ctrl-C may land in it."""
+    code = """
+import gc, os, signal, sys
+from cfb_mjx import cli
+signal.signal(signal.SIGINT, signal.default_int_handler)
+struck = []
+def strike(phase, details):
+    if not struck:
+        struck.append(phase)
+        os.kill(os.getpid(), signal.SIGINT)
+        for _ in range(1000): pass
+def command(arguments):
+    gc.callbacks.append(strike)
+    gc.collect()
+    assert struck
+    signal.sigtimedwait([], 60)
+    return 0
+cli._dispatch = command
+sys.exit(cli.main([]))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    assert done.returncode == 130, done.stderr
+    assert "interrupted" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import errno
 import os
-import signal
 import sys
 
 from cfb_mjx import __version__
+from cfb_mjx.cli.interrupts import heard
 from cfb_mjx.cli.runtime import set_up_xla
 from cfb_mjx.errors import CfbError
 
@@ -31,12 +31,10 @@ SUMMARY = {
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point. Exit status: 0 done, 1 a fault in the library, 2 bad input, 130 interrupted."""
-    # Ctrl-C must reach Python even where the caller's shell started us with it ignored (scripts, make -j).
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and sys.stdin is not None and sys.stdin.isatty():
-        signal.signal(signal.SIGINT, signal.default_int_handler)
     set_up_xla()
     try:
-        status = _dispatch(sys.argv[1:] if arguments is None else arguments)
+        with heard():
+            status = _dispatch(sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()
     except CfbError as error:
         return _fail(str(error), 2)

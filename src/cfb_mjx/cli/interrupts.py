@@ -1,0 +1,35 @@
+"""Ctrl-C that is not lost."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def heard() -> Iterator[None]:
+    """Let every Ctrl-C in this block end it with KeyboardInterrupt.
+
+    Two ways it would not: the caller's shell started us with the signal ignored (scripts, ``make -j``); and Python
+    discards an exception that is raised in a callback of the garbage collector or in a finaliser, of which jax has
+    several, so that the one Ctrl-C that lands there is gone. That one is sent again a moment later.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and sys.stdin is not None and sys.stdin.isatty():
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    before = sys.unraisablehook
+
+    def again(event: sys.UnraisableHookArgs) -> None:
+        if issubclass(event.exc_type, KeyboardInterrupt):
+            main = threading.main_thread().ident
+            threading.Timer(0.02, signal.pthread_kill, (main, signal.SIGINT)).start()
+        else:
+            before(event)
+
+    sys.unraisablehook = again
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
