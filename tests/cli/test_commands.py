@@ -85,3 +85,15 @@ def test_bench_writes_its_rows(cfb, tmp_path):
         assert row["compile_s"] > 0
         assert row["peak_mb"] > 0
     assert "steps/s" in (tmp_path / "b.md").read_text()
+
+
+def test_changes_may_be_given_together_or_one_by_one(monkeypatch, tmp_path):
+    """An argument given twice once replaced the first without a word."""
+    from cfb_mjx.cli import training
+    from cfb_mjx.cli.commands import run
+
+    seen = []
+    monkeypatch.setattr(training, "run_train", lambda config, output, changes, *rest: seen.append(changes))
+    run("train", ["target", "-o", str(tmp_path), "--set", "seed=1", "ppo.steps=9", "--set", "ppo.unroll=3"])
+    run("train", ["target", "-o", str(tmp_path)])
+    assert seen == [("seed=1", "ppo.steps=9", "ppo.unroll=3"), ()]

@@ -92,9 +92,27 @@ def test_the_firmwares_pid_holds_hover_and_steps_slowly(cfb, tmp_path):
     assert step["arrival_s"] is None
 
 
+def test_every_drone_of_a_set_is_flown(cfb, tmp_path):
+    """Told apart by what they do to a controller without integral action on thrust: a weaker drone hangs lower."""
+    (tmp_path / "set.yaml").write_text(
+        "format: cfb_mjx plants 1\nname: two\nplants:\n"
+        "  - {name: as it is, effects: []}\n"
+        "  - {name: heavy, effects: [{name: payload, parameters: {mass: 0.006, height: 0.0, offset: [0.0, 0.0]}}]}\n"
+    )
+    done = cfb("fly", "target", "--on", tmp_path / "set.yaml", "--plants", 2, "--json", tmp_path / "r.json")
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "r.json").read_text())
+    assert list(result["on"]) == ["as it is", "heavy"]
+    assert 2 * result["on"]["as it is"]["mean_distance_mm"] < result["on"]["heavy"]["mean_distance_mm"]
+    assert result["on"]["heavy"]["failure_rate"] == 0
+    assert "heavy     mean distance [mm]" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["fly", "pid", "--on", "nothing"], "nothing: no such set of plants"),
+        (["fly", "pid", "--on", "off-nominal", "--figure", "x.png"], "leave out --on"),
         (["fly", "nobody"], "no such controller"),
         (["fly", "nobody.npz"], "nobody.npz: there is no such file"),
         (["fly", "pid", "--plants", "0"], "at least one drone"),

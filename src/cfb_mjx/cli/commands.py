@@ -8,11 +8,9 @@ from typing import Annotated, Literal
 
 import tyro
 
+from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat
 from cfb_mjx.cli.learning_commands import fly, train
 from cfb_mjx.errors import CfbError
-
-Output = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")]
-Model = Annotated[str, tyro.conf.arg(metavar="MODEL")]
 
 
 def import_log(
@@ -20,8 +18,8 @@ def import_log(
     output: Output,
     format: Literal["auto", "tabular", "idsia", "mcap", "usd_card", "crazyswarm", "radio_csv"] = "auto",
     motor_shift: float | None = None,
-    mapping: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
-    topics_yaml: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    mapping: File = None,
+    topics_yaml: File = None,
     robot: str | None = None,
     time_unit: str | None = None,
 ) -> None:
@@ -48,9 +46,9 @@ def import_log(
 def evaluate(
     logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")],
     model: Model = "cfb-guards",
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
-    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
-    figure: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    set: Pairs = (),
+    json: File = None,
+    figure: File = None,
     observer: bool = False,
 ) -> None:
     """Measure how well a model predicts flights, open loop, at 50, 100, 200 and 500 ms.
@@ -70,13 +68,13 @@ def evaluate(
         raise CfbError("evaluate needs at least one log; see 'cfb evaluate --help'.")
     from cfb_mjx.cli.evaluating import run_evaluate
 
-    run_evaluate(list(logs), model, list(set), json, figure, observer)
+    run_evaluate(list(logs), model, list(flat(set)), json, figure, observer)
 
 
 def benchmark_nanodrone(
     folder: tyro.conf.Positional[Path],
     model: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None,
-    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    json: File = None,
     stride: int = 1,
 ) -> None:
     """Judge a model by the rules of the IDSIA nano-drone benchmark, beside the published results.
@@ -100,9 +98,9 @@ def fit(
     parameters: str | None = None,
     held_out: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG...")] = (),
     model: Model = "cfb-guards",
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
-    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
-    figure: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    set: Pairs = (),
+    json: File = None,
+    figure: File = None,
     estimator: Literal["auto", "innovation", "shooting"] = "auto",
     robust: bool = False,
     commands_only: bool = False,
@@ -140,7 +138,7 @@ def fit(
         output,
         parameters,
         model,
-        list(set),
+        list(flat(set)),
         json,
         commands_only,
         compare,
@@ -154,14 +152,14 @@ def fit_rotors(
     files: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")],
     output: Output,
     model: Model = "cfb-guards",
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    set: Pairs = (),
     offset: bool = False,
     asymmetric: bool = False,
     dead_time: bool = False,
     per_motor: bool = False,
     robust: bool = False,
-    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
-    figure: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    json: File = None,
+    figure: File = None,
 ) -> None:
     """Fit motors and rotor maps on their own, from flights with rotor speed and from bench tables.
 
@@ -186,7 +184,7 @@ def fit_rotors(
     from cfb_mjx.cli.rotor_fitting import run_fit_rotors
 
     run_fit_rotors(
-        list(files), output, model, list(set), offset, asymmetric, dead_time, per_motor, robust, json, figure
+        list(files), output, model, list(flat(set)), offset, asymmetric, dead_time, per_motor, robust, json, figure
     )
 
 
@@ -195,7 +193,7 @@ def excite(
     output: Output,
     parameters: str | None = None,
     model: Model = "cfb-guards",
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    set: Pairs = (),
     repetitions: int = 5,
     duration: float = 0.5,
     rate_limit: float = 12.0,
@@ -203,7 +201,7 @@ def excite(
     measured_rotors: bool = False,
     disturbance: float = 4.0,
     between: Annotated[str | None, tyro.conf.arg(metavar="EFFECT,EFFECT")] = None,
-    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    json: File = None,
 ) -> None:
     """Design a manoeuvre that identifies the drone, fly it in simulation, and predict what a fit will know.
 
@@ -238,14 +236,14 @@ def excite(
     if manoeuvre == "separate":
         from cfb_mjx.cli.separating import run_separate
 
-        run_separate(between, output, model, list(set), measured_rotors, disturbance, json)
+        run_separate(between, output, model, list(flat(set)), measured_rotors, disturbance, json)
         return
     run_excite(
         manoeuvre,
         output,
         parameters,
         model,
-        list(set),
+        list(flat(set)),
         repetitions,
         duration,
         rate_limit,
@@ -261,7 +259,7 @@ def close_loop(
     fit: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG...")] = (),
     held_out: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG...")] = (),
     model: Model = "cfb-guards",
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    set: Pairs = (),
 ) -> None:
     """Find which physical effect a model lacks, add it, and report the error before and after on other flights.
 
@@ -278,7 +276,7 @@ def close_loop(
     """
     from cfb_mjx.cli.closing import run_close_loop
 
-    run_close_loop(list(fit), list(held_out), output, model, list(set))
+    run_close_loop(list(fit), list(held_out), output, model, list(flat(set)))
 
 
 def refine(
@@ -287,12 +285,12 @@ def refine(
     effects: str | None = None,
     held_out: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG...")] = (),
     model: Model = "cfb-guards",
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    set: Pairs = (),
     estimator: Literal["predictions", "innovations"] = "predictions",
     predictor: bool = False,
-    weight: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME=VALUE...")] = (),
+    weight: Pairs = (),
     as_logged: bool = False,
-    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    json: File = None,
 ) -> None:
     """Fit the numbers of effects you name, where close-loop would search for them.
 
@@ -317,14 +315,16 @@ def refine(
     from cfb_mjx.cli.refining import run_refine
 
     paths = list(logs), list(held_out)
-    run_refine(*paths, output, model, list(set), effects, estimator, predictor, list(weight), as_logged, json)
+    run_refine(
+        *paths, output, model, list(flat(set)), effects, estimator, predictor, list(flat(weight)), as_logged, json
+    )
 
 
 def bench(
     drones: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N...")] = (1, 64, 1024, 8192, 65536),
-    json: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
-    markdown: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
-    peer_python: Annotated[Path | None, tyro.conf.arg(metavar="PATH")] = None,
+    json: File = None,
+    markdown: File = None,
+    peer_python: File = None,
     quick: bool = False,
 ) -> None:
     """Measure throughput: simulation steps per second of every body, compile time and memory.

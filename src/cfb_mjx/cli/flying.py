@@ -18,6 +18,7 @@ def run_fly(
     plants: int,
     magnitude: float,
     randomisation: str,
+    on: str | None,
     noise: bool,
     seed: int,
     json: Path | None,
@@ -29,6 +30,8 @@ def run_fly(
         CfbError: an unknown controller, model or randomisation, impossible numbers, or outputs without a folder.
     """
     require_folder(json, figure)
+    if on is not None and figure is not None:
+        raise CfbError("--figure shows the flights of one model; leave out --on, or give the drone with --model.")
     if plants < 1:
         raise CfbError(f"--plants {plants}: at least one drone must fly.")
     if magnitude < 0:
@@ -52,12 +55,27 @@ def run_fly(
         magnitude=magnitude,
         longest_delay_s=float(delay),
     )
+    # Scaled for the model that was named, whatever it is flown on.
     pilot = find_pilot(controller, nominal)
     keys = jax.random.split(jax.random.PRNGKey(seed), plants)
-    measured, flown = flying.TESTS[task](pilot, course, nominal, keys)
+
+    def fly(drone):
+        measured, flown = flying.TESTS[task](pilot, course, drone, keys)
+        return summary(task, {k: np.asarray(v) for k, v in measured._asdict().items()}), flown
+
     result = {"controller": controller, "task": task, "model": model, "plants": plants, "magnitude": magnitude}
-    result |= summary(task, {k: np.asarray(v) for k, v in measured._asdict().items()})
-    _print(result)
+    if on is None:
+        measured, flown = fly(nominal)
+        result |= measured
+        _print(result)
+    else:
+        from cfb_mjx.train.plants import load_plants
+
+        result |= {"set": on, "on": {}}
+        drones = load_plants(load_model_file(model), on)
+        for name, drone in drones.items():
+            result["on"][name], _ = fly(drone)
+            _print_row(name, result["on"][name], max(map(len, drones)))
     if json is not None:
         write_json(json, result | {"environment": environment()})
         print(f"results: {json}")
@@ -120,6 +138,11 @@ def summary(task: str, measured: dict) -> dict:
 _UNITS = {"mm": "mm", "s": "s", "mps": "m/s", "m": "m"}
 
 
+def _label(key: str) -> str:
+    name, _, unit = key.rpartition("_")
+    return (f"{name} [{_UNITS[unit]}]" if unit in _UNITS else key).replace("_", " ")
+
+
 def _print(result: dict) -> None:
     drones = "drone" if result["plants"] == 1 else "drones"
     print(f"{result['controller']}, {result['task']}: {result['plants']} {drones}, {result['model']}")
@@ -127,12 +150,21 @@ def _print(result: dict) -> None:
     for key, value in result.items():
         if key in ("controller", "task", "model", "plants", "magnitude", "quantiles"):
             continue
-        name, _, unit = key.rpartition("_")
-        unit = _UNITS.get(unit)
-        text = f"{name} [{unit}]" if unit else key
         shown = value if isinstance(value, bool) else f"{value:.4g}"
         spread = quantiles.get(key)
         more = (
             "" if not spread or spread["0.5"] is None else f"   median {spread['0.5']:.4g}, 95 % {spread['0.95']:.4g}"
         )
-        print(f"  {text.replace('_', ' '):<24}{shown}{more}")
+        print(f"  {_label(key):<24}{shown}{more}")
+
+
+def _print_row(name: str, measured: dict, width: int) -> None:
+    shown = [
+        f"{_label(key)} {value:.4g}"
+        for key, value in measured.items()
+        if isinstance(value, float) and key not in ("failure_rate", "success_rate")
+    ]
+    lost = "   failed" if measured["failed"] and "failure_rate" not in measured else ""
+    if measured.get("failure_rate"):
+        lost = f"   {measured['failure_rate']:.0%} failed"
+    print(f"  {name:<{width}}  {'   '.join(shown)}{lost}", flush=True)

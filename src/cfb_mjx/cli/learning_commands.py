@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
-Output = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="DIR")]
-File = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+from cfb_mjx.cli.argument_types import File, Output, Pairs, flat
 
 
 def train(
@@ -18,7 +16,7 @@ def train(
     model: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None,
     algorithm: Literal["ppo", "analytic"] | None = None,
     seed: int | None = None,
-    set: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE...")] = (),
+    set: Pairs = (),
     start: File = None,
     resume: bool = False,
     force: bool = False,
@@ -44,7 +42,7 @@ def train(
     from cfb_mjx.cli.training import run_train
 
     choices = {"model": model, "algorithm": algorithm, "seed": seed}
-    run_train(config or task, output, set, choices, start, resume, force, devices)
+    run_train(config or task, output, flat(set), choices, start, resume, force, devices)
 
 
 def fly(
@@ -54,6 +52,7 @@ def fly(
     plants: int = 1,
     magnitude: float = 0.0,
     randomisation: Annotated[str, tyro.conf.arg(metavar="NAME")] = "paper",
+    on: Annotated[str | None, tyro.conf.arg(metavar="SET")] = None,
     noise: bool = True,
     seed: int = 0,
     json: File = None,
@@ -71,6 +70,7 @@ def fly(
         plants: number of flights, each on a drone drawn anew.
         magnitude: factor on the randomisation of the drones; 0 flies the model itself.
         randomisation: which ranges: a shipped name or a YAML file.
+        on: fly the model with each list of effects of a set in turn: off-nominal (shipped) or a YAML file.
         noise: with the noise of state and estimates that policies are trained with.
         seed: of everything random.
         json: write the results here.
@@ -78,4 +78,4 @@ def fly(
     """
     from cfb_mjx.cli.flying import run_fly
 
-    run_fly(controller, task, model, plants, magnitude, randomisation, noise, seed, json, figure)
+    run_fly(controller, task, model, plants, magnitude, randomisation, on, noise, seed, json, figure)

@@ -41,6 +41,11 @@ class PaperReward:
     speed_limit_mps: float = 10.0
     rate_limit_radps: float = 30.0
 
+    @property
+    def largest(self) -> float:
+        """What a step at rest on the target is worth."""
+        return self.position + self.velocity + self.attitude + self.body_rate + self.torque
+
     def failed(self, state: State) -> Bool[Array, ""]:
         """Whether speed or body rate have passed their limits."""
         fast = jnp.sum(state.velocity**2) > self.speed_limit_mps**2

@@ -38,6 +38,14 @@ class DelayLine(eqx.Module):
         )
         return DelayLine(shifted, self.dt)
 
+    def push_all(self, samples: PyTree) -> DelayLine:
+        """`push` of several samples, oldest first along a leading axis."""
+        count = jax.tree.leaves(self.samples)[0].shape[0]
+        shifted = jax.tree.map(
+            lambda line, new: jnp.concatenate([jnp.asarray(new, line.dtype)[::-1], line])[:count], self.samples, samples
+        )
+        return DelayLine(shifted, self.dt)
+
     def read(self, delay: Float[Array, ""] | float) -> PyTree:
         """The sample ``delay`` seconds before the newest, linear between samples; longer delays give the oldest.
 

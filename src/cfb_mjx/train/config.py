@@ -86,6 +86,8 @@ class PpoSettings:
     """Commands in total."""
     learning_rate: float = 1e-3
     """At the start; it falls to a tenth along a line."""
+    value_learning_rate: float = 1e-3
+    """Of the value network, likewise."""
     discount: float = 0.99
     gae_lambda: float = 0.95
     clipping: float = 0.2
@@ -232,6 +234,7 @@ _POSITIVE = (
     "analytic.cost.position_width_m",
     "analytic.cost.velocity_width_mps",
     "ppo.learning_rate",
+    "ppo.value_learning_rate",
     "ppo.gradient_clip",
     "ppo.first_std",
 )

@@ -2,11 +2,12 @@
 
 Brax's own ``train`` hands out neither its optimizer nor its environments, so a run of it cannot go on where it was
 interrupted; this one is a page long, and its whole state is one pytree. Episodes are drawn anew at every reset, drone
-included. The value network also sees what the drone itself cannot: the true state, rotor speeds and the drawn drone.
+included. The value network sees what the drone itself cannot: the true state, rotor speeds and the drawn drone.
 """
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Any
 
@@ -18,6 +19,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import Network, NeuralController
 from cfb_mjx.envs.observation import Estimate, frame
+from cfb_mjx.envs.reward import length
 from cfb_mjx.envs.target import Episode, TargetTask, choose, observe, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters.parameters import SPECIFICATIONS
@@ -55,17 +57,26 @@ class Ppo:
         self.brax = parts()
         self.distribution = self.brax.distribution.NormalTanhDistribution(event_size=4)
         gradient_steps = self.updates * settings.epochs * settings.minibatches
-        schedule = optax.linear_schedule(settings.learning_rate, 0.1 * settings.learning_rate, gradient_steps)
+
+        def adam(rate: float) -> optax.GradientTransformation:
+            schedule = optax.linear_schedule(rate, 0.1 * rate, gradient_steps)
+            return optax.chain(optax.clip_by_global_norm(settings.gradient_clip), optax.adam(schedule, eps=1e-5))
+
         # Clipped apart: the value's gradient is far larger at first and would leave nothing of the policy's.
-        clipped = optax.chain(optax.clip_by_global_norm(settings.gradient_clip), optax.adam(schedule, eps=1e-5))
-        self.optimizer = optax.multi_transform({"actor": clipped, "critic": clipped}, ("actor", "critic"))
+        self.optimizer = optax.multi_transform(
+            {"actor": adam(settings.learning_rate), "critic": adam(settings.value_learning_rate)}, ("actor", "critic")
+        )
+        # The value of holding the target for ever: what the network has to learn is how much worse it is elsewhere.
+        ideal = settings.reward_scaling * task.reward.largest / max(1e-3, 1 - settings.discount)
         self._reset = jax.vmap(partial(reset, task, nominal))
         feed_forward = self.brax.networks.networks.FeedForwardNetwork
         self._loss = partial(
             self.brax.losses.compute_ppo_loss,
             ppo_network=self.brax.networks.PPONetworks(
                 policy_network=feed_forward(init=None, apply=lambda _, actor, shown: _logits(actor, shown["seen"])),
-                value_network=feed_forward(init=None, apply=lambda _, critic, shown: critic(_both(shown)).squeeze(-1)),
+                value_network=feed_forward(
+                    init=None, apply=lambda _, critic, shown: ideal + critic(shown["hidden"]).squeeze(-1)
+                ),
                 parametric_action_distribution=self.distribution,
             ),
             entropy_cost=settings.entropy_cost,
@@ -83,8 +94,8 @@ class Ppo:
         counts = jax.random.randint(of_counts, (self.settings.drones,), 0, self.task.episode_steps)
         episodes = eqx.tree_at(lambda e: e.count, episodes, counts)
         first = jax.tree.map(lambda x: x[0], episodes)
-        inputs = _both(self._show(first)).shape[-1]
-        critic = Network.random(of_critic, (inputs, *self.settings.value_hidden, 1), "tanh")
+        inputs = self._show(first)["hidden"].shape[-1]
+        critic = Network.random(of_critic, (inputs, *self.settings.value_hidden, 1), "swish")
         raw = jnp.log(jnp.expm1(jnp.full(4, self.settings.first_std)))
         actor = Actor(controller.network, raw)
         return PpoState(actor, critic, self.optimizer.init((actor, critic)), episodes, key, jnp.asarray(0))
@@ -116,15 +127,18 @@ class Ppo:
     def _collect(self, actor: Actor, episodes: Episode, key: PRNGKeyArray):
         """Fly ``unroll`` commands with every drone; data has axes (drones, unroll)."""
 
-        def one(episodes, key):
-            of_action, of_reset = jax.random.split(key)
+        def some(episodes, key):
+            of_reset, of_flight = jax.random.split(key)
+            fresh = self._reset(jax.random.split(of_reset, self.settings.drones))
+            return jax.lax.scan(partial(one, fresh), episodes, jax.random.split(of_flight, each))
+
+        def one(fresh, episodes, of_action):
             shown = jax.vmap(self._show)(episodes)
             logits = _logits(actor, shown["seen"])
             raw = self.distribution.sample_no_postprocessing(logits, of_action)
             action = self.distribution.postprocess(raw)
             after, outcome = jax.vmap(partial(step, self.task))(episodes, 0.5 * (1 + action))
             over = outcome.failed | outcome.timed_out
-            fresh = self._reset(jax.random.split(of_reset, self.settings.drones))
             kept = self.brax.types.Transition(
                 observation=shown,
                 action=action,
@@ -142,7 +156,11 @@ class Ppo:
             )
             return choose(over, fresh, after), (kept, outcome)
 
-        episodes, (data, outcome) = jax.lax.scan(one, episodes, jax.random.split(key, self.settings.unroll))
+        # Drawing drones and starts costs as much as flying: once per few commands is enough, as no drone fails twice
+        # within them.
+        each = math.gcd(self.settings.unroll, 8)
+        episodes, flown = jax.lax.scan(some, episodes, jax.random.split(key, self.settings.unroll // each))
+        data, outcome = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), flown)
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
         # Brax's loss reads the last of these only.
         last = jax.tree.map(lambda x: x[:, None], jax.vmap(self._show)(episodes))
@@ -171,12 +189,16 @@ class Ppo:
 
 
 def hidden(task: TargetTask, nominal: Quadrotor, episode: Episode) -> Float[Array, "n"]:
-    """What only the value network is shown: true frame, rotor speeds, and how the drone differs."""
+    """What the value network is shown: true frame, rotor speeds, integral, how the drone differs, and three lengths.
+
+    The reward falls with lengths, whose tips at zero a small network is slow to form by itself.
+    """
     state, parameters = episode.state, episode.model.parameters
-    true = frame(
-        task.layout, Estimate(state.position - episode.target, state.velocity, state.quaternion, state.body_rate)
-    )
-    parts = [true, state.rotor_speed / parameters.reference_rotor_speed]
+    position = state.position - episode.target
+    true = frame(task.layout, Estimate(position, state.velocity, state.quaternion, state.body_rate))
+    lengths = jnp.stack([length(position), length(state.velocity), length(state.body_rate) / 10])
+    parts = [true, lengths, jnp.sqrt(lengths), state.rotor_speed / parameters.reference_rotor_speed]
+    parts.append(episode.memory.integral / task.layout.integral_limit_ms)
     if task.randomisation is not None:
         for name, spread in task.randomisation.ranges:
             drawn, mean = getattr(parameters, name), getattr(nominal.parameters, name)
@@ -189,7 +211,3 @@ def hidden(task: TargetTask, nominal: Quadrotor, episode: Episode) -> Float[Arra
 def _logits(actor: Actor, seen: Array) -> Array:
     loc = actor.network(seen)
     return jnp.concatenate([loc, jnp.broadcast_to(actor.raw_std, loc.shape)], axis=-1)
-
-
-def _both(shown: dict[str, Array]) -> Array:
-    return jnp.concatenate([shown["seen"], shown["hidden"]], axis=-1)

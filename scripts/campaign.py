@@ -1,0 +1,120 @@
+"""Trainings of a study, one after the other: what is done is kept, so that an interrupted study goes on."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+from cfb_mjx.cli.runtime import environment, say
+
+ROOT = Path(__file__).resolve().parents[1]
+FLIGHTS, RANDOM_DRONES = 64, 512
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training: ``name`` is unique in its study; ``changes`` as for ``cfb train --set``."""
+
+    name: str
+    config: str
+    changes: tuple[str, ...]
+    seed: int
+    start: str | None = None
+    """Name of the run of the same study and seed whose policy it starts from."""
+
+
+def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> dict:
+    """Train what ``results`` does not hold yet, and judge it.
+
+    Args:
+        runs: of the study, in order.
+        results: JSON file that grows with every run.
+        folder: for checkpoints and policies.
+        judge: controller to numbers.
+
+    Returns:
+        Name to config, seed, changes, curve, score and environment.
+    """
+    from cfb_mjx.control.policy_file import load_policy
+    from cfb_mjx.files import write_json
+    from cfb_mjx.train.config import load_config, with_changes
+    from cfb_mjx.train.run import POLICY, Training, train
+
+    found = json.loads(results.read_text()) if results.exists() else {}
+    for run in runs:
+        config = with_changes(load_config(run.config, run.changes), seed=run.seed)
+        described = config.to_mapping()
+        if run.name in found and found[run.name]["config"] == json.loads(json.dumps(described)):
+            continue
+        say(f"{run.name} ({len(found)} of {len(runs)} done)")
+        start = None if run.start is None else folder / run.start / POLICY
+        training = Training.prepare(config, environment(), start)
+        rows = train(training, folder / run.name, resume=True, report=_report)
+        score = judge(load_policy(folder / run.name / POLICY).controller)
+        found[run.name] = {"seed": run.seed, "score": score, "curve": rows, "config": described} | {
+            "environment": environment()
+        }
+        write_json(results, found)
+    return {run.name: found[run.name] for run in runs}
+
+
+def _report(row: dict) -> None:
+    say(f"  {row['commands'] / 1e6:.3g} M commands, {row['seconds']:.0f} s, hover {row['hover_mm']:.4g} mm")
+
+
+class Judge:
+    """Flies a controller on the nominal drone, on randomised ones and on the off-nominal set."""
+
+    def __init__(self):
+        import jax
+
+        from cfb_mjx.envs import TargetTask
+        from cfb_mjx.model import Quadrotor
+        from cfb_mjx.parameters import load_model_file, load_randomisation
+        from cfb_mjx.train.plants import load_plants
+
+        described = load_model_file("cfb-guards")
+        self.nominal = Quadrotor.from_file(described)
+        self.plants = load_plants(described)
+        self.calm, self.wild = TargetTask(), TargetTask(randomisation=load_randomisation("paper"))
+        self.few = jax.random.split(jax.random.PRNGKey(0), FLIGHTS)
+        self.many = jax.random.split(jax.random.PRNGKey(1), RANDOM_DRONES)
+
+    def __call__(self, controller) -> dict:
+        """Hover error and command std of a network."""
+        from cfb_mjx.train.flying import Neural
+
+        return self.fly(Neural(controller))
+
+    def fly(self, pilot) -> dict:
+        """Hover error and command std of any pilot."""
+        import numpy as np
+
+        from cfb_mjx.train.flying import hover
+
+        def measure(task, drone, keys, kind):
+            measured = hover(pilot, task, drone, keys)[0]
+            well = ~np.asarray(measured.failed)
+            distance, std = np.asarray(measured.mean_distance_m)[well], np.asarray(measured.command_std)[well]
+            return {
+                "hover_mm": float(1e3 * kind(distance)) if well.any() else None,
+                "command_std": float(kind(std)) if well.any() else None,
+                "failed": float(1 - well.mean()),
+            }
+
+        return {
+            "nominal": measure(self.calm, self.nominal, self.few, np.mean),
+            "random": measure(self.wild, self.nominal, self.many, np.median),
+            "plants": {name: measure(self.calm, drone, self.few, np.mean) for name, drone in self.plants.items()},
+        }
+
+
+def facts_line(command: str, results: list[dict]) -> str:
+    """Which command wrote a page, when and on what."""
+    facts = [result["environment"] for result in results]
+    first, last = min(f["date"] for f in facts), max(f["date"] for f in facts)
+    when = first if first == last else f"{first} to {last}"
+    of = facts[-1]
+    return (
+        f"Written by `{command}`; trained {when}, {of['processor']}, Python {of['python']}, "
+        f"jax {of['jax']}, cfb_mjx {of['cfb_mjx']}."
+    )

@@ -1,0 +1,200 @@
+"""How much randomisation? The paper's study, in simulation, with PPO and with back-propagation.
+
+    python scripts/study_magnitudes.py [--algorithms analytic ppo] [--seeds 3] [--pages-only]
+
+Hours for all of it; what is done is kept in benchmarks/magnitudes-ALGORITHM.json, and a run begun anew goes on. Writes
+docs/magnitudes.md and its figure.
+"""
+
+import argparse
+import json
+
+from campaign import ROOT, Judge, Run, carry_out, facts_line
+
+from cfb_mjx.cli.runtime import configure_jax, set_up_xla
+
+MAGNITUDES = (0.0, 0.5, 1.0, 1.5)
+CONFIGS = {"analytic": "study-analytic", "ppo": "target"}
+TITLES = {"analytic": "back-propagation", "ppo": "PPO"}
+PAPER = {0.0: (284.76, 0.0203), 0.5: (100.07, 0.0245), 1.0: (43.16, 0.0197), 1.5: (71.39, 0.0548)}
+PAPER_FIRMWARE = {"pid": (27.81, 0.0226), "mellinger": (54.68, 0.0394)}
+
+
+def main() -> None:
+    """Train what is missing, judge, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--algorithms", nargs="+", default=list(CONFIGS), choices=list(CONFIGS))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--pages-only", action="store_true", help="write the page from the results that are there")
+    arguments = parser.parse_args()
+    set_up_xla()
+    configure_jax(x64=False)
+    from cfb_mjx.files import write_json, write_text
+
+    firmware = ROOT / "benchmarks" / "magnitudes-firmware.json"
+    if not arguments.pages_only:
+        judge = Judge()
+        if not firmware.exists():
+            from cfb_mjx.cli.flying import find_pilot
+
+            write_json(firmware, {name: judge.fly(find_pilot(name, judge.nominal)) for name in PAPER_FIRMWARE})
+        for algorithm in arguments.algorithms:
+            # By seed, so that an unfinished study has every magnitude.
+            runs = [
+                Run(f"{m:g}-{seed}", CONFIGS[algorithm], (f"randomisation.magnitude={m}",), seed)
+                for seed in range(arguments.seeds)
+                for m in MAGNITUDES
+            ]
+            carry_out(runs, _results(algorithm), ROOT / "out" / "magnitudes" / algorithm, judge)
+    found = {a: json.loads(_results(a).read_text()) for a in CONFIGS if _results(a).exists()}
+    figure(found, ROOT / "docs" / "magnitudes.png")
+    write_text(ROOT / "docs" / "magnitudes.md", page(found, json.loads(firmware.read_text())))
+    print("docs/magnitudes.md, docs/magnitudes.png")
+
+
+def _results(algorithm: str):
+    return ROOT / "benchmarks" / f"magnitudes-{algorithm}.json"
+
+
+def _scores(runs: dict, magnitude: float) -> list[dict]:
+    return [run["score"] for name, run in runs.items() if name.rpartition("-")[0] == f"{magnitude:g}"]
+
+
+def _away(score: dict, key: str) -> float | None:
+    """Mean over the off-nominal drones; None where one of them was lost."""
+    values = [plant[key] for plant in score["plants"].values()]
+    lost = any(plant["failed"] > 0 or plant[key] is None for plant in score["plants"].values())
+    return None if lost else sum(values) / len(values)
+
+
+def _of(scores: list[dict]) -> dict[str, list]:
+    return {
+        "nominal": [s["nominal"]["hover_mm"] for s in scores],
+        "nominal_std": [s["nominal"]["command_std"] for s in scores],
+        "away": [_away(s, "hover_mm") for s in scores],
+        "away_std": [_away(s, "command_std") for s in scores],
+        "random": [s["random"]["hover_mm"] for s in scores],
+        "random_failed": [s["random"]["failed"] for s in scores],
+    }
+
+
+def _span(values: list, digits: str) -> str:
+    """Mean of the seeds, and the least and greatest of them."""
+    there = [v for v in values if v is not None]
+    lost = f", {len(values) - len(there)} lost" if len(there) < len(values) else ""
+    if not there:
+        return "lost"
+    if len(there) == 1:
+        return format(there[0], digits) + lost
+    mean = format(sum(there) / len(there), digits)
+    return f"{mean} [{format(min(there), digits)}, {format(max(there), digits)}]{lost}"
+
+
+def page(found: dict, firmware: dict) -> str:
+    """The Markdown page."""
+    runs = [run for algorithm in found.values() for run in algorithm.values()]
+    lines = [
+        "# How much randomisation",
+        "",
+        facts_line("python scripts/study_magnitudes.py", runs),
+        "",
+        "The paper trains its position controller with its randomisation scaled by 0, 0.5, 1 and 1.5, flies each on "
+        "the real drone, and finds 1 best. Here the same networks fly in simulation: on the nominal drone, on ten drones "
+        "with effects of the catalogue that no randomisation contains (`configs/plants/off-nominal.yaml`; they stand "
+        "in for the real one), and on 512 drones of the paper's full randomisation. Hover test of the paper: mean "
+        "distance over the last 5 of 6 s, std of the commands. Mean of the seeds with the least and the greatest; "
+        "over randomised drones the median of those that did not fail. The paper's columns are its real flights.",
+        "",
+        "![hover error over magnitude](magnitudes.png)",
+    ]
+    for algorithm, of in found.items():
+        any_run = next(iter(of.values()))
+        last = any_run["curve"][-1]
+        lines += [
+            "",
+            f"## {TITLES[algorithm]}",
+            "",
+            f"Configuration `{CONFIGS[algorithm]}`: {last['commands'] / 1e6:.0f} M commands per policy, "
+            f"{min(r['curve'][-1]['seconds'] for r in of.values()):.0f} to "
+            f"{max(r['curve'][-1]['seconds'] for r in of.values()):.0f} s.",
+            "",
+            "| magnitude | seeds | nominal, mm | std | off-nominal, mm | std | randomised, mm | failed | paper, mm "
+            "| paper, std |",
+            "|---|---|---|---|---|---|---|---|---|---|",
+        ]
+        for magnitude in MAGNITUDES:
+            scores = _scores(of, magnitude)
+            if not scores:
+                continue
+            s = _of(scores)
+            cells = [f"{magnitude:g}", str(len(scores)), _span(s["nominal"], ".1f"), _span(s["nominal_std"], ".4f")]
+            cells += [_span(s["away"], ".1f"), _span(s["away_std"], ".4f"), _span(s["random"], ".0f")]
+            cells += [_span(s["random_failed"], ".2%"), *(f"{x:g}" for x in PAPER[magnitude])]
+            lines.append("| " + " | ".join(cells) + " |")
+    lines += [
+        "",
+        "## The firmware's controllers, same tests",
+        "",
+        "| controller | nominal, mm | std | off-nominal, mm | std | randomised, mm | failed | paper, mm | paper, std |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, paper in PAPER_FIRMWARE.items():
+        s = _of([firmware[name]])
+        cells = [name, _span(s["nominal"], ".1f"), _span(s["nominal_std"], ".4f"), _span(s["away"], ".1f")]
+        cells += [_span(s["away_std"], ".4f"), _span(s["random"], ".0f"), _span(s["random_failed"], ".2%")]
+        lines.append("| " + " | ".join([*cells, *(f"{x:g}" for x in paper)]) + " |")
+    for algorithm, of in found.items():
+        plants = list(next(iter(of.values()))["score"]["plants"])
+        lines += [
+            "",
+            f"## {TITLES[algorithm]}, drone by drone",
+            "",
+            "Hover error in mm, mean of the seeds with the least and the greatest.",
+            "",
+            "| drone | " + " | ".join(f"x {m:g}" for m in MAGNITUDES if _scores(of, m)) + " |",
+            "|---|" + "---|" * sum(bool(_scores(of, m)) for m in MAGNITUDES),
+        ]
+        for plant in plants:
+            cells = [
+                _span([None if s["plants"][plant]["failed"] else s["plants"][plant]["hover_mm"] for s in scores], ".0f")
+                for scores in (_scores(of, m) for m in MAGNITUDES)
+                if scores
+            ]
+            lines.append(f"| {plant} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def figure(found: dict, path) -> None:
+    """Hover error and command std over magnitude: seeds as points, their mean as a line, the paper as crosses."""
+    from cfb_mjx.view.style import COLOURS, context, new_figure, save
+
+    colours = dict(zip(("nominal", "away"), (COLOURS["hold"], COLOURS["commands_in"]), strict=True))
+    labels = {"nominal": "nominal drone", "away": "off-nominal drones"}
+    with context():
+        plot = new_figure(3.4 * len(found), 4.6)
+        axes = plot.subplots(2, len(found), squeeze=False, sharex=True)
+        for column, (algorithm, of) in enumerate(found.items()):
+            for row, (suffix, label) in enumerate((("", "mean distance, mm"), ("_std", "command std"))):
+                axis = axes[row][column]
+                for where, colour in colours.items():
+                    means = []
+                    for magnitude in MAGNITUDES:
+                        values = [v for v in _of(_scores(of, magnitude))[where + suffix] if v is not None]
+                        axis.plot([magnitude] * len(values), values, ".", color=colour)
+                        means.append(sum(values) / len(values) if values else float("nan"))
+                    axis.plot(MAGNITUDES, means, color=colour, label=labels[where])
+                paper = [PAPER[m][row] for m in MAGNITUDES]
+                axis.plot(MAGNITUDES, paper, "x:", color="black", label="paper, real drone")
+                axis.set_yscale("log")
+                axis.set_ylabel(label)
+                if row == 0:
+                    axis.set_title(TITLES[algorithm])
+                else:
+                    axis.set_xlabel("magnitude of the randomisation")
+        axes[0][0].legend(frameon=False, fontsize=8)
+        plot.subplots_adjust(left=0.3 / max(1, len(found)), right=0.98, bottom=0.1, top=0.93, wspace=0.35, hspace=0.12)
+        save(plot, path)
+
+
+if __name__ == "__main__":
+    main()
