@@ -99,10 +99,10 @@ def page(found: dict, firmware: dict) -> str:
         facts_line("python scripts/study_magnitudes.py", runs),
         "",
         "The paper trains its position controller with its randomisation scaled by 0, 0.5, 1 and 1.5, flies each on "
-        "the real drone, and finds 1 best. Here the same networks fly in simulation: on the nominal drone, on ten drones "
-        "with effects of the catalogue that no randomisation contains (`configs/plants/off-nominal.yaml`; they stand "
-        "in for the real one), and on 512 drones of the paper's full randomisation. Hover test of the paper: mean "
-        "distance over the last 5 of 6 s, std of the commands. Mean of the seeds with the least and the greatest; "
+        "the real drone, and finds 1 best. Here the same networks fly in simulation: on the nominal drone, on ten "
+        "drones with effects of the catalogue that no randomisation contains (`configs/plants/off-nominal.yaml`; they "
+        "stand in for the real one), and on 512 drones of the paper's full randomisation. Hover test of the paper: "
+        "mean distance over the last 5 of 6 s, std of the commands. Mean of the seeds with the least and the greatest; "
         "over randomised drones the median of those that did not fail. The paper's columns are its real flights.",
         "",
         "![hover error over magnitude](magnitudes.png)",

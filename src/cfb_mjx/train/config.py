@@ -77,19 +77,21 @@ class AnalyticSettings:
 class PpoSettings:
     """Proximal policy optimisation (Schulman et al. 2017) with Brax's loss."""
 
-    drones: int = 2048
-    unroll: int = 32
+    drones: int = 512
+    unroll: int = 128
     """Commands of every drone between two updates of the policy."""
     minibatches: int = 8
     epochs: int = 4
-    steps: int = 50_000_000
+    steps: int = 40_000_000
     """Commands in total."""
     learning_rate: float = 1e-3
-    """At the start; it falls to a tenth along a line."""
+    """At the start; it falls to ``last_rate`` of that along a line."""
     value_learning_rate: float = 1e-3
     """Of the value network, likewise."""
-    discount: float = 0.99
-    gae_lambda: float = 0.95
+    last_rate: float = 0.02
+    """Share of both rates that is left at the end: the smaller, the less the last policy is off by chance."""
+    discount: float = 0.995
+    gae_lambda: float = 0.99
     clipping: float = 0.2
     entropy_cost: float = 1e-3
     reward_scaling: float = 0.02
@@ -247,7 +249,7 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
     for key in _POSITIVE:
         if not _at(config, key) > 0:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be positive.")
-    for key in ("starts.near", "randomisation.graded", "ppo.discount", "ppo.gae_lambda"):
+    for key in ("ppo.last_rate", "starts.near", "randomisation.graded", "ppo.discount", "ppo.gae_lambda"):
         if not 0 <= _at(config, key) <= 1:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must lie between 0 and 1.")
     for key in ("network.hidden", "ppo.value_hidden"):

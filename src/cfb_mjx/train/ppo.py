@@ -59,7 +59,7 @@ class Ppo:
         gradient_steps = self.updates * settings.epochs * settings.minibatches
 
         def adam(rate: float) -> optax.GradientTransformation:
-            schedule = optax.linear_schedule(rate, 0.1 * rate, gradient_steps)
+            schedule = optax.linear_schedule(rate, settings.last_rate * rate, gradient_steps)
             return optax.chain(optax.clip_by_global_norm(settings.gradient_clip), optax.adam(schedule, eps=1e-5))
 
         # Clipped apart: the value's gradient is far larger at first and would leave nothing of the policy's.

@@ -1,0 +1,134 @@
+"""What each choice in the training is worth: learning curves of variants, three seeds each.
+
+    python scripts/learning_curves.py [--seeds 3] [--only VARIANT ...] [--page-only]
+
+On the nominal drone (no randomisation), where the time to a hover error says most. What is done is kept in
+benchmarks/learning-curves.json, and a run begun anew goes on. Writes docs/learning-curves.md and its figure.
+"""
+
+import argparse
+import json
+import statistics
+
+from campaign import ROOT, Judge, Run, carry_out, facts_line
+
+from cfb_mjx.cli.runtime import configure_jax, set_up_xla
+
+NOMINAL = ("randomisation.magnitude=0",)
+PPO = (*NOMINAL, "ppo.steps=16000000", "checkpoints=16")
+QUICK = (*NOMINAL, "checkpoints=16")
+VARIANTS = {
+    "analytic": ("quick-analytic", QUICK, "back-propagation, horizon 1 s"),
+    "analytic-short": ("quick-analytic", (*QUICK, "analytic.horizon_s=0.5", "analytic.drones=512"), "horizon 0.5 s"),
+    "ppo": ("target", PPO, "PPO as in `target`"),
+    "ppo-short-sight": ("target", (*PPO, "ppo.gae_lambda=0.95", "ppo.discount=0.99"), "gae_lambda 0.95, discount 0.99"),
+    "ppo-lambda": ("target", (*PPO, "ppo.gae_lambda=0.95"), "gae_lambda 0.95"),
+    "ppo-rare": ("target", (*PPO, "ppo.drones=2048"), "four times the drones, a quarter of the updates"),
+    "ppo-quiet": ("target", (*PPO, "ppo.first_std=0.1"), "half the exploration at the start"),
+}
+MARKS_MM = (100, 50, 25)
+
+
+def main() -> None:
+    """Train what is missing, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--only", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
+    parser.add_argument("--page-only", action="store_true", help="write the page from the results that are there")
+    arguments = parser.parse_args()
+    set_up_xla()
+    configure_jax(x64=False)
+    from cfb_mjx.files import write_text
+
+    results = ROOT / "benchmarks" / "learning-curves.json"
+    if not arguments.page_only:
+        runs = [
+            Run(f"{name}-{seed}", *VARIANTS[name][:2], seed)
+            for seed in range(arguments.seeds)
+            for name in arguments.only
+        ]
+        carry_out(runs, results, ROOT / "out" / "learning-curves", Judge(plants=None, random_drones=0))
+    found = {}
+    for key, run in json.loads(results.read_text()).items():
+        found.setdefault(key.rpartition("-")[0], []).append(run)
+    found = {name: found[name] for name in VARIANTS if name in found}
+    figure(found, ROOT / "docs" / "learning-curves.png")
+    write_text(ROOT / "docs" / "learning-curves.md", page(found))
+    print("docs/learning-curves.md, docs/learning-curves.png")
+
+
+def _reached(run: dict, mark: float) -> tuple[float, float] | None:
+    """Seconds and millions of commands at the first point of the curve from which it stays below ``mark``."""
+    stays = None
+    for row in run["curve"]:
+        if row["hover_mm"] > mark:
+            stays = None
+        elif stays is None:
+            stays = row["seconds"], row["commands"] / 1e6
+    return stays
+
+
+def _cell(runs: list[dict], mark: float) -> str:
+    there = [reached for reached in (_reached(run, mark) for run in runs) if reached is not None]
+    if not there:
+        return "not"
+    seconds, commands = (statistics.median(x) for x in zip(*there, strict=True))
+    lost = f" ({len(there)} of {len(runs)})" if len(there) < len(runs) else ""
+    return f"{seconds:.0f} s, {commands:.1f} M{lost}"
+
+
+def page(found: dict[str, list[dict]]) -> str:
+    """The Markdown page."""
+    lines = [
+        "# Learning curves",
+        "",
+        facts_line("python scripts/learning_curves.py", [run for runs in found.values() for run in runs]),
+        "",
+        "From random weights, on the nominal drone; hover error by the paper's test (mean of 64 flights with noise). "
+        "Time is that of the updates, compiling the first included, judging not. Reached: the first point of the curve from "
+        "which it stays below the mark, median over the seeds; where not all got there it says how many did.",
+        "",
+        "![learning curves](learning-curves.png)",
+        "",
+        "| variant | what it changes | seeds | "
+        + " | ".join(f"below {m} mm" for m in MARKS_MM)
+        + " | at the end, mm | s |",
+        "|---|---|---|" + "---|" * len(MARKS_MM) + "---|---|",
+    ]
+    for name, runs in found.items():
+        last = [run["curve"][-1]["hover_mm"] for run in runs]
+        cells = [name, VARIANTS[name][2], str(len(runs)), *(_cell(runs, mark) for mark in MARKS_MM)]
+        cells.append(f"{statistics.median(last):.1f} [{min(last):.1f}, {max(last):.1f}]")
+        cells.append(f"{statistics.median(run['curve'][-1]['seconds'] for run in runs):.0f}")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def figure(found: dict[str, list[dict]], path) -> None:
+    """Hover error over seconds and over commands: the seeds' median, and their span."""
+    import numpy as np
+
+    from cfb_mjx.view.style import context, new_figure, save
+
+    colours = ("#0072B2", "#56B4E9", "#D55E00", "#E69F00", "#CC79A7", "#009E73", "#8C8C8C")
+    with context():
+        plot = new_figure(7.6, 3.4)
+        axes = plot.subplots(1, 2, sharey=True)
+        for (name, runs), colour in zip(found.items(), colours, strict=False):
+            error = np.array([[row["hover_mm"] for row in run["curve"]] for run in runs])
+            for axis, key, scale in zip(axes, ("seconds", "commands"), (1, 1e-6), strict=True):
+                at = scale * np.median([[row[key] for row in run["curve"]] for run in runs], axis=0)
+                axis.plot(at, np.median(error, axis=0), color=colour, label=name)
+                axis.fill_between(at, error.min(axis=0), error.max(axis=0), color=colour, alpha=0.15, linewidth=0)
+        axes[0].set_xlabel("training, s")
+        axes[1].set_xlabel("commands flown, millions")
+        axes[0].set_ylabel("mean hover error, mm")
+        axes[0].set_yscale("log")
+        axes[0].set_ylim(2, 5000)
+        axes[1].legend(frameon=False, fontsize=8)
+        plot.subplots_adjust(left=0.1, right=0.98, bottom=0.15, top=0.96, wspace=0.08)
+        save(plot, path)
+
+
+if __name__ == "__main__":
+    main()
