@@ -85,8 +85,8 @@ def page(found: dict[str, list[dict]]) -> str:
         facts_line("python scripts/learning_curves.py", [run for runs in found.values() for run in runs]),
         "",
         "From random weights, on the nominal drone; hover error by the paper's test (mean of 64 flights with noise). "
-        "Time is that of the updates, compiling the first included, judging not. Reached: the first point of the curve from "
-        "which it stays below the mark, median over the seeds; where not all got there it says how many did.",
+        "Time is that of the updates, compiling the first included, judging not. Reached: the first point of the curve "
+        "from which it stays below the mark, median over the seeds; where not all got there it says how many did.",
         "",
         "![learning curves](learning-curves.png)",
         "",

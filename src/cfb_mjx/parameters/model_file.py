@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -12,8 +11,9 @@ from typing import Any
 import numpy as np
 import yaml
 
+from cfb_mjx.documents import load_named, refuse_unknown, shipped_names
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import shipped, write_text
+from cfb_mjx.files import write_text
 from cfb_mjx.parameters.parameters import DEFAULTS, SPECIFICATIONS, Parameters
 
 FORMAT = "cfb_mjx model 1"
@@ -81,7 +81,7 @@ class ModelFile:
 
 def preset_names() -> list[str]:
     """Names of the parameter sets shipped with the library."""
-    return sorted(path.stem for path in shipped("configs", "parameters").glob("*.yaml"))
+    return shipped_names("parameters")
 
 
 def load_model_file(name_or_path: str | Path) -> ModelFile:
@@ -91,24 +91,15 @@ def load_model_file(name_or_path: str | Path) -> ModelFile:
         CfbError: no such preset or file, broken YAML, unknown or missing keys, missing or wrong units,
             impossible values; the message names the file and the key.
     """
-    path = Path(name_or_path)
-    if path.suffix not in (".yaml", ".yml"):
-        if str(name_or_path) not in preset_names():
-            raise CfbError(
-                f"{name_or_path}: no such model; give a YAML file or one of the presets {', '.join(preset_names())}."
-            )
-        path = shipped("configs", "parameters", f"{name_or_path}.yaml")
-    document = load_yaml(path)
-    _refuse_unknown(document, _TOP_LEVEL, path, "")
-    if document.get("format") != FORMAT:
-        raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
+    path, document = load_named(name_or_path, "model", FORMAT, "parameters")
+    refuse_unknown(document, _TOP_LEVEL, path, "")
     kind = document.get("kind", "plant")
     if kind not in _KINDS:
         raise CfbError(f"{path}: 'kind' must be one of {', '.join(_KINDS)}, found {kind!r}.")
     raw = document.get("parameters")
     if not isinstance(raw, dict):
         raise CfbError(f"{path}: 'parameters' must be a mapping of names to {{value, unit, source}}.")
-    _refuse_unknown(raw, set(SPECIFICATIONS), path, "parameters.")
+    refuse_unknown(raw, set(SPECIFICATIONS), path, "parameters.")
     entries = {key: _entry(key, raw[key], path) for key in raw}
     missing = [key for key in SPECIFICATIONS if key not in raw and key not in DEFAULTS]
     if missing:
@@ -153,52 +144,10 @@ def save_model_file(model: ModelFile, path: str | Path) -> None:
     write_text(path, yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=110))
 
 
-def load_yaml(path: str | Path) -> dict:
-    """Read a YAML mapping.
-
-    Raises:
-        CfbError: the file is missing, unreadable, not YAML, not a mapping, or has a key twice.
-    """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise CfbError(f"{path}: no such file.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CfbError(f"{path}: cannot be read as text ({error}).") from None
-    try:
-        document = yaml.load(text, Loader=_StrictLoader)
-    # PyYAML lets through ValueError (a thirteenth month, !!int abc) and the interpreter's recursion limit.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise CfbError(f"{path}: is not valid YAML ({' '.join(str(error).split())}).") from None
-    if not isinstance(document, dict):
-        raise CfbError(f"{path}: must hold a YAML mapping, found {type(document).__name__}.")
-    return document
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """Refuses repeated keys, and reads 3.3e-5 as a number (YAML 1.1 wants 3.3e-05 with a dot and a sign)."""
-
-    def construct_mapping(self, node, deep=False):
-        seen = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, list | dict):
-                raise yaml.YAMLError("a key must be plain text")
-            if key in seen:
-                raise yaml.YAMLError(f"the key '{key}' appears twice (line {key_node.start_mark.line + 1})")
-            seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-_StrictLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-)
-
-
 def _entry(key: str, raw: Any, path: Path) -> Entry:
     if not isinstance(raw, dict):
         raise CfbError(f"{path}: parameters.{key} must be a mapping with value, unit and source.")
-    _refuse_unknown(raw, _ENTRY_KEYS, path, f"parameters.{key}.")
+    refuse_unknown(raw, _ENTRY_KEYS, path, f"parameters.{key}.")
     unit = SPECIFICATIONS[key].unit
     if "unit" not in raw:
         raise CfbError(f"{path}: parameters.{key} has no unit; write 'unit: {unit}'.")
@@ -246,15 +195,8 @@ def _finite(x: Any) -> bool:
 
 
 def _known(key: str, where: str) -> bool:
-    _refuse_unknown({key: None}, set(SPECIFICATIONS), where, "")
+    refuse_unknown({key: None}, set(SPECIFICATIONS), where, "")
     return True
-
-
-def _refuse_unknown(found: Mapping, known: set[str], path, prefix: str) -> None:
-    unknown = [str(key) for key in found if key not in known]
-    if unknown:
-        names = ", ".join(f"'{prefix}{key}'" for key in unknown)
-        raise CfbError(f"{path}: unknown key {names}; known here are {', '.join(sorted(known))}.")
 
 
 def _same_unit(unit: Any) -> str:

@@ -10,9 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from cfb_mjx.documents import load_named, refuse_unknown
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import shipped
-from cfb_mjx.parameters.model_file import _refuse_unknown, load_yaml
 from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters
 
 FORMAT = "cfb_mjx randomisation 1"
@@ -46,20 +45,12 @@ def load_randomisation(name_or_path: str | Path = "paper") -> Randomisation:
     Raises:
         CfbError: no such file, unknown keys or impossible widths, named.
     """
-    path = Path(name_or_path)
-    if path.suffix not in (".yaml", ".yml"):
-        names = sorted(file.stem for file in shipped("configs", "randomisation").glob("*.yaml"))
-        if str(name_or_path) not in names:
-            raise CfbError(f"{name_or_path}: no such randomisation; give a YAML file or one of {', '.join(names)}.")
-        path = shipped("configs", "randomisation", f"{name_or_path}.yaml")
-    document = load_yaml(path)
-    _refuse_unknown(document, {"format", "name", "description", "ranges"}, path, "")
-    if document.get("format") != FORMAT:
-        raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
+    path, document = load_named(name_or_path, "randomisation", FORMAT, "randomisation")
+    refuse_unknown(document, {"format", "name", "description", "ranges"}, path, "")
     ranges = document.get("ranges") or {}
     if not isinstance(ranges, dict):
         raise CfbError(f"{path}: 'ranges' must be a mapping of parameter names.")
-    _refuse_unknown(ranges, set(SPECIFICATIONS), path, "ranges.")
+    refuse_unknown(ranges, set(SPECIFICATIONS), path, "ranges.")
     return Randomisation(
         name=str(document.get("name", path.stem)),
         ranges=tuple((key, _range(key, raw, path)) for key, raw in ranges.items()),
@@ -69,7 +60,7 @@ def load_randomisation(name_or_path: str | Path = "paper") -> Randomisation:
 def _range(key: str, raw, path: Path) -> Range:
     if not isinstance(raw, dict):
         raise CfbError(f"{path}: ranges.{key} must be a mapping with half_width and unit.")
-    _refuse_unknown(raw, {"half_width", "unit", "shared", "source"}, path, f"ranges.{key}.")
+    refuse_unknown(raw, {"half_width", "unit", "shared", "source"}, path, f"ranges.{key}.")
     unit = SPECIFICATIONS[key].unit
     if raw.get("unit") not in ("relative", unit):
         raise CfbError(f"{path}: ranges.{key}.unit must be 'relative' or '{unit}', found {raw.get('unit')!r}.")

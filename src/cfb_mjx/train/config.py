@@ -9,10 +9,9 @@ from typing import Any, Literal
 
 import yaml
 
+from cfb_mjx.documents import load_named
 from cfb_mjx.envs import Layout, Noise, PaperReward, Starts, TargetTask
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import shipped
-from cfb_mjx.parameters.model_file import load_yaml
 from cfb_mjx.parameters.randomisation import load_randomisation
 from cfb_mjx.train.strict import build, plain
 
@@ -95,6 +94,9 @@ class PpoSettings:
     clipping: float = 0.2
     entropy_cost: float = 1e-3
     reward_scaling: float = 0.02
+    least_reward: float = -30.0
+    """Lower rewards count as this to the learner. Each advantage is divided by the spread of all: beside the paper's
+    failure of -300 nothing else would count until hardly any drone fails."""
     gradient_clip: float = 1.0
     first_std: float = 0.2
     """Of the Gaussian before the tanh, at the start."""
@@ -156,15 +158,7 @@ def load_config(name_or_path: str | Path = "target", changes: tuple[str, ...] = 
     Raises:
         CfbError: no such file, an unknown key, a value of the wrong type or out of range, named.
     """
-    path = Path(name_or_path)
-    if path.suffix not in (".yaml", ".yml"):
-        names = sorted(file.stem for file in shipped("configs").glob("*.yaml"))
-        if str(name_or_path) not in names:
-            raise CfbError(f"{name_or_path}: no such training; give a YAML file or one of {', '.join(names)}.")
-        path = shipped("configs", f"{name_or_path}.yaml")
-    document = load_yaml(path)
-    if document.get("format") != FORMAT:
-        raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
+    path, document = load_named(name_or_path, "training", FORMAT)
     # Checked before the changes go in, so that a fault of the file is not blamed on the command line.
     build(TrainingConfig, document, str(path))
     for change in changes:

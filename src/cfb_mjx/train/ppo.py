@@ -116,7 +116,7 @@ class Ppo:
             jax.random.split(of_learning, self.settings.epochs),
         )
         metrics = {
-            "reward": jnp.mean(data.reward),
+            "reward": jnp.mean(outcome.reward),
             "failing": jnp.mean(outcome.failed),
             "std": jnp.mean(jax.nn.softplus(learnt[0].raw_std)),
             "value_loss": jnp.mean(losses["v_loss"]),
@@ -142,7 +142,7 @@ class Ppo:
             kept = self.brax.types.Transition(
                 observation=shown,
                 action=action,
-                reward=outcome.reward,
+                reward=jnp.maximum(outcome.reward, self.settings.least_reward),
                 discount=1.0 - over,
                 next_observation=None,
                 extras={

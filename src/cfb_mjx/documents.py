@@ -1,0 +1,95 @@
+"""YAML documents, read strictly: shipped ones by name, users' by path."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import yaml
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import shipped
+
+
+def shipped_names(*folder: str) -> list[str]:
+    """Names of the YAML files in a folder of ``configs``."""
+    return sorted(path.stem for path in shipped("configs", *folder).glob("*.yaml"))
+
+
+def load_named(name_or_path: str | Path, what: str, format: str, *folder: str) -> tuple[Path, dict]:
+    """Path and content of a YAML file, or of a shipped one named without suffix.
+
+    Args:
+        name_or_path: of the document.
+        what: it is, for messages.
+        format: its entry of that name must say.
+        folder: of ``configs`` where the shipped ones lie.
+
+    Raises:
+        CfbError: no such file, not a YAML mapping, or another format.
+    """
+    path = Path(name_or_path)
+    if path.suffix not in (".yaml", ".yml"):
+        names = shipped_names(*folder)
+        if str(name_or_path) not in names:
+            raise CfbError(f"{name_or_path}: no such {what}; give a YAML file or one of {', '.join(names)}.")
+        path = shipped("configs", *folder, f"{name_or_path}.yaml")
+    document = load_yaml(path)
+    if document.get("format") != format:
+        raise CfbError(f"{path}: 'format' must be '{format}', found {document.get('format')!r}.")
+    return path, document
+
+
+def load_yaml(path: str | Path) -> dict:
+    """Read a YAML mapping.
+
+    Raises:
+        CfbError: the file is missing, unreadable, not YAML, not a mapping, or has a key twice.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise CfbError(f"{path}: no such file.") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise CfbError(f"{path}: cannot be read as text ({error}).") from None
+    try:
+        document = yaml.load(text, Loader=_StrictLoader)
+    # PyYAML lets through ValueError (a thirteenth month, !!int abc) and the interpreter's recursion limit.
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise CfbError(f"{path}: is not valid YAML ({' '.join(str(error).split())}).") from None
+    if not isinstance(document, dict):
+        raise CfbError(f"{path}: must hold a YAML mapping, found {type(document).__name__}.")
+    return document
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Refuses repeated keys, and reads 3.3e-5 as a number (YAML 1.1 wants 3.3e-05 with a dot and a sign)."""
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if isinstance(key, list | dict):
+                raise yaml.YAMLError("a key must be plain text")
+            if key in seen:
+                raise yaml.YAMLError(f"the key '{key}' appears twice (line {key_node.start_mark.line + 1})")
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
+)
+
+
+def refuse_unknown(found: Mapping, known: set[str], path, prefix: str) -> None:
+    """Name the keys of a mapping that are not among the known ones.
+
+    Raises:
+        CfbError: there are some.
+    """
+    unknown = [str(key) for key in found if key not in known]
+    if unknown:
+        names = ", ".join(f"'{prefix}{key}'" for key in unknown)
+        raise CfbError(f"{path}: unknown key {names}; known here are {', '.join(sorted(known))}.")
