@@ -214,13 +214,14 @@ def test_off_nominal_plants_differ_from_the_nominal_one_and_hover(tmp_path):
     plants = load_plants(base)
     assert len(plants) >= 8
     start = Quadrotor.from_file(base).hover_state()
-    commands = jnp.full((50, 4), 0.55)
+    # A change on the way: a late or slow drone hovers like any other.
+    commands = jnp.full((50, 4), 0.55).at[10:].add(jnp.array([0.0, 0.02, 0.0, 0.0]))
     plain = rollout_final(Quadrotor.from_file(base), start, commands)
     for name, drone in plants.items():
-        moved = rollout_final(drone, start, commands + jnp.array([0.0, 0.02, 0.0, 0.0]))
+        moved = rollout_final(drone, start, commands)
         assert bool(jnp.all(jnp.isfinite(moved.position))), name
-        same = rollout_final(drone, start, commands)
-        assert not np.allclose(same.position, plain.position, atol=1e-6) or name in ("drag", "yaw torque"), name
+        turned = np.abs(moved.quaternion - plain.quaternion).max()
+        assert max(turned, np.abs(moved.position - plain.position).max()) > 1e-5, name
     (tmp_path / "p.yaml").write_text("format: cfb_mjx plants 1\nplants: [{effects: []}]")
     with pytest.raises(CfbError, match=r"p\.yaml: every plant needs a name"):
         load_plants(base, tmp_path / "p.yaml")

@@ -41,19 +41,18 @@ def run_fly(
     import numpy as np
 
     from cfb_mjx.envs import Noise, TargetTask
-    from cfb_mjx.envs.target import QUIET
+    from cfb_mjx.envs.target import QUIET, longest_delay_s
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import load_model_file, load_randomisation
     from cfb_mjx.train import flying
 
     nominal = Quadrotor.from_file(load_model_file(model))
     spread = load_randomisation(randomisation)
-    delay = max(0.016, 0.004 * np.ceil(float(np.max(nominal.parameters.observation_delay)) / 0.004 - 1e-9))
     course = TargetTask(
         noise=Noise() if noise else QUIET,
         randomisation=spread if magnitude else None,
         magnitude=magnitude,
-        longest_delay_s=float(delay),
+        longest_delay_s=longest_delay_s(nominal),
     )
     # Scaled for the model that was named, whatever it is flown on.
     pilot = find_pilot(controller, nominal)

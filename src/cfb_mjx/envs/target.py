@@ -6,6 +6,7 @@ of one drone: ``vmap`` them over many. Each episode carries its own drone, so ra
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -78,6 +79,12 @@ class TargetTask:
                 f"control_dt_s = {self.layout.control_dt_s} is no multiple of the simulation step of {model.dt} s."
             )
         return round(steps)
+
+
+def longest_delay_s(model: Quadrotor) -> float:
+    """The ``TargetTask.longest_delay_s`` that holds ``model``: whole simulation steps, and no less than the default."""
+    delay = float(jnp.max(model.parameters.observation_delay))
+    return max(TargetTask.longest_delay_s, model.dt * math.ceil(delay / model.dt - 1e-9))
 
 
 class Pose(eqx.Module):

@@ -20,6 +20,7 @@ from cfb_mjx.envs.observation import rotation_matrix
 from cfb_mjx.envs.target import Episode, TargetTask, choose, observe, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.state import State
+from cfb_mjx.train.algorithm import in_progress, strong
 from cfb_mjx.train.config import AnalyticSettings, SmoothCost
 
 
@@ -60,7 +61,7 @@ class Analytic:
     """The algorithm; see `cfb_mjx.train.algorithm.Algorithm`."""
 
     def __init__(self, settings: AnalyticSettings, task: TargetTask, nominal: Quadrotor):
-        self.settings, self.task = settings, task
+        self.settings, self.task, self.nominal = settings, task, nominal
         self.updates = settings.updates
         self.horizon = max(1, round(settings.horizon_s / task.layout.control_dt_s))
         self.steps_per_update = settings.drones * self.horizon
@@ -70,12 +71,11 @@ class Analytic:
         self.update = eqx.filter_jit(self._update)
 
     def begin(self, key: PRNGKeyArray, controller: NeuralController) -> AnalyticState:
-        """Drones at random moments of their episodes, so that they do not all end at once."""
-        of_episodes, of_counts, key = jax.random.split(key, 3)
-        episodes = eqx.filter_jit(self._reset)(jax.random.split(of_episodes, self.settings.drones))
-        counts = jax.random.randint(of_counts, (self.settings.drones,), 0, self.task.episode_steps)
-        episodes = eqx.tree_at(lambda e: e.count, episodes, counts)
-        return AnalyticState(controller, self.optimizer.init(_arrays(controller)), episodes, key, jnp.asarray(0))
+        """Drones in flight, and an optimizer that has seen nothing."""
+        of_episodes, key = jax.random.split(key)
+        episodes = in_progress(self.task, self.nominal, self.settings.drones, of_episodes)
+        optimizer = self.optimizer.init(_arrays(controller))
+        return strong(AnalyticState(controller, optimizer, episodes, key, jnp.asarray(0)))
 
     def controller(self, state: AnalyticState) -> NeuralController:
         """The controller as it stands."""

@@ -23,6 +23,7 @@ from cfb_mjx.envs.reward import length
 from cfb_mjx.envs.target import Episode, TargetTask, choose, observe, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters.parameters import SPECIFICATIONS
+from cfb_mjx.train.algorithm import in_progress, strong
 from cfb_mjx.train.brax_compat import parts
 from cfb_mjx.train.config import PpoSettings
 
@@ -88,17 +89,15 @@ class Ppo:
         self.update = eqx.filter_jit(self._update)
 
     def begin(self, key: PRNGKeyArray, controller: NeuralController) -> PpoState:
-        """Drones at random moments of their episodes; a value network that knows nothing."""
-        of_episodes, of_counts, of_critic, key = jax.random.split(key, 4)
-        episodes = eqx.filter_jit(self._reset)(jax.random.split(of_episodes, self.settings.drones))
-        counts = jax.random.randint(of_counts, (self.settings.drones,), 0, self.task.episode_steps)
-        episodes = eqx.tree_at(lambda e: e.count, episodes, counts)
+        """Drones in flight, and a value network that knows nothing."""
+        of_episodes, of_critic, key = jax.random.split(key, 3)
+        episodes = in_progress(self.task, self.nominal, self.settings.drones, of_episodes)
         first = jax.tree.map(lambda x: x[0], episodes)
         inputs = self._show(first)["hidden"].shape[-1]
         critic = Network.random(of_critic, (inputs, *self.settings.value_hidden, 1), "swish")
         raw = jnp.log(jnp.expm1(jnp.full(4, self.settings.first_std)))
         actor = Actor(controller.network, raw)
-        return PpoState(actor, critic, self.optimizer.init((actor, critic)), episodes, key, jnp.asarray(0))
+        return strong(PpoState(actor, critic, self.optimizer.init((actor, critic)), episodes, key, jnp.asarray(0)))
 
     def controller(self, state: PpoState) -> NeuralController:
         """The mean of the policy."""

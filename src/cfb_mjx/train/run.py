@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import yaml
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
+from cfb_mjx.envs.target import longest_delay_s
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, write_text
 from cfb_mjx.model.quadrotor import Quadrotor
@@ -138,12 +138,11 @@ def train(
     checkpoint = output / CHECKPOINT
     about = _found(checkpoint, output, training, resume)
     nominal = training.nominal()
-    delay = float(jnp.max(nominal.parameters.observation_delay))
-    task = training.config.build_task(max(0.016, 0.004 * math.ceil(delay / 0.004 - 1e-9)))
+    task = training.config.build_task(longest_delay_s(nominal))
     task.hold(nominal)
     algorithm = build(training.config, task, nominal)
     key = jax.random.fold_in(jax.random.PRNGKey(training.config.seed), 1)
-    state = _strong(algorithm.begin(key, training.first_controller(nominal)))
+    state = algorithm.begin(key, training.first_controller(nominal))
     done, seconds, rows = 0, 0.0, []
     if about is not None:
         state = load_state(checkpoint, state)
@@ -190,11 +189,6 @@ def build(config: TrainingConfig, task, nominal: Quadrotor) -> Algorithm:
 def segments(updates: int, count: int) -> list[int]:
     """After which updates checkpoints are written; the last is ``updates``."""
     return sorted({round(updates * (i + 1) / count) for i in range(count)} - {0})
-
-
-def _strong(state: Any) -> Any:
-    # A weakly typed number becomes a strong one in the first update, and the second would be compiled afresh.
-    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype) if eqx.is_array(x) else x, state)
 
 
 def _spread(state: Any, devices: int) -> Any:
