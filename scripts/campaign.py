@@ -79,13 +79,7 @@ class Judge:
         self.few = jax.random.split(jax.random.PRNGKey(0), FLIGHTS)
         self.many = jax.random.split(jax.random.PRNGKey(1), random_drones)
 
-    def __call__(self, controller) -> dict:
-        """Hover error and command std of a network."""
-        from cfb_mjx.train.flying import Neural
-
-        return self.fly(Neural(controller))
-
-    def fly(self, pilot) -> dict:
+    def __call__(self, pilot) -> dict:
         """Hover error and command std of any pilot."""
         import numpy as np
 

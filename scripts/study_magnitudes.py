@@ -37,7 +37,7 @@ def main() -> None:
         if not firmware.exists():
             from cfb_mjx.cli.flying import find_pilot
 
-            write_json(firmware, {name: judge.fly(find_pilot(name, judge.nominal)) for name in PAPER_FIRMWARE})
+            write_json(firmware, {name: judge(find_pilot(name, judge.nominal)) for name in PAPER_FIRMWARE})
         for algorithm in arguments.algorithms:
             # By seed, so that an unfinished study has every magnitude.
             runs = [

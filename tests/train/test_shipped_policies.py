@@ -4,21 +4,22 @@ import jax
 import numpy as np
 import pytest
 
+from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_randomisation
-from cfb_mjx.train.flying import Neural, hover, six_metres
+from cfb_mjx.train.flying import hover, six_metres
 
 pytestmark = pytest.mark.xdist_group("training")
 
 DRONE = Quadrotor.from_file("cfb-guards")
 
 
-def pilot_of(name: str) -> Neural:
+def pilot_of(name: str) -> NeuralController:
     policy = load_policy(shipped_policies()[name])
     assert policy.training["config"]["seed"] == 0
-    return Neural(policy.controller)
+    return policy.controller
 
 
 @pytest.mark.parametrize("name", ["target", "target-adaptive"])

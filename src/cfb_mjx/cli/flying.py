@@ -93,7 +93,7 @@ def find_pilot(controller: str, nominal):
     """
     from cfb_mjx.control import FirmwarePid, Mellinger
     from cfb_mjx.control.policy_file import load_policy, shipped_policies
-    from cfb_mjx.train.flying import MellingerPilot, Neural, Pid
+    from cfb_mjx.train.flying import MellingerPilot, Pid
 
     if controller == "pid":
         return Pid(FirmwarePid.hovering(nominal.changed_parameters()))
@@ -101,11 +101,11 @@ def find_pilot(controller: str, nominal):
         return MellingerPilot(Mellinger())
     found = shipped_policies()
     if controller in found:
-        return Neural(load_policy(found[controller]).controller)
+        return load_policy(found[controller]).controller
     if Path(controller).suffix != ".npz":
         names = ", ".join(["pid", "mellinger", *found])
         raise CfbError(f"{controller}: no such controller; give a policy file (.npz) or one of {names}.")
-    return Neural(load_policy(controller).controller)
+    return load_policy(controller).controller
 
 
 def summary(task: str, measured: dict) -> dict:

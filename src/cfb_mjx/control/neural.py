@@ -58,6 +58,11 @@ class NeuralController(eqx.Module):
         bias = jnp.full(4, jnp.arctanh(2 * hover - 1))
         return cls(eqx.tree_at(lambda n: n.biases[-1], network, bias), layout)
 
+    @property
+    def control_dt_s(self) -> float:
+        """Time between two commands, s."""
+        return self.layout.control_dt_s
+
     def act(self, shown: Float[Array, "size"]) -> Float[Array, "4"]:
         """Command in (0, 1) on an observation."""
         return 0.5 * (1 + jnp.tanh(self.network(shown)))

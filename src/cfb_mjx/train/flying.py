@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cfb_mjx.control.mellinger import Mellinger
 from cfb_mjx.control.mellinger import init as mellinger_init
 from cfb_mjx.control.mellinger import step as mellinger_step
-from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.pid import DT as PID_DT
 from cfb_mjx.control.pid import FirmwarePid, Setpoint, init
 from cfb_mjx.control.pid import step as pid_step
@@ -30,7 +29,7 @@ STEP_DISTANCE_M, ARRIVED_M, STEP_S = 6.0, 0.10, 4.0
 
 
 class Pilot(Protocol):
-    """A controller that holds the target: what it sees is relative to it."""
+    """A controller that holds the target: what it sees is relative to it. `NeuralController` is one."""
 
     control_dt_s: float
 
@@ -39,25 +38,6 @@ class Pilot(Protocol):
 
     def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
         """New memory and command."""
-
-
-class Neural(eqx.Module):
-    """A `NeuralController` as a pilot."""
-
-    controller: NeuralController
-
-    @property
-    def control_dt_s(self) -> float:
-        """Time between two commands, s."""
-        return self.controller.layout.control_dt_s
-
-    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
-        """Memory at take-over."""
-        return self.controller.start(estimate, command)
-
-    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
-        """New memory and command."""
-        return self.controller.command(memory, estimate)
 
 
 class Pid(eqx.Module):

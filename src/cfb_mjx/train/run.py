@@ -27,7 +27,7 @@ from cfb_mjx.parameters import ModelFile, load_model_file
 from cfb_mjx.train.algorithm import Algorithm
 from cfb_mjx.train.checkpoint import load_state, read_about, save_checkpoint
 from cfb_mjx.train.config import TrainingConfig
-from cfb_mjx.train.flying import Neural, hover, nominal_task
+from cfb_mjx.train.flying import hover, nominal_task
 
 CHECKPOINT, POLICY, CURVE, CONFIG = "checkpoint.npz", "policy.npz", "curve.csv", "config.yaml"
 _JUDGED_ON = 64
@@ -235,7 +235,7 @@ def _differences(before: Any, now: Any, path: str) -> list[str]:
 
 def _judged(controller: NeuralController, training: Training, task, nominal: Quadrotor) -> Row:
     keys = jax.random.split(jax.random.PRNGKey(training.config.seed + 1), _JUDGED_ON)
-    measured, _ = hover(Neural(controller), nominal_task(task), nominal, keys)
+    measured, _ = hover(controller, nominal_task(task), nominal, keys)
     return {
         "hover_mm": 1e3 * float(jnp.mean(measured.mean_distance_m)),
         "command_std": float(jnp.mean(measured.command_std)),
