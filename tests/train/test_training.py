@@ -118,6 +118,23 @@ def test_ppo_finds_the_command_that_is_rewarded():
     assert np.mean(rewards[-3:]) > 0.75
 
 
+def test_the_learner_is_shown_no_reward_below_the_least_and_failed_drones_begin_anew():
+    config = load_config("target", (*SMALL, "ppo.least_reward=-7"))
+    task = config.build_task()
+    ppo = Ppo(config.ppo, task, Quadrotor.from_file("cfb-guards"))
+    state = ppo.begin(jax.random.PRNGKey(0), NeuralController.random(jax.random.PRNGKey(1), task.layout, (8, 8)))
+    fast = state.episodes.state.velocity.at[:3].set(50.0)
+    episodes = eqx.tree_at(lambda e: e.state.velocity, state.episodes, fast)
+    after, data, outcome = eqx.filter_jit(ppo._collect)(state.actor, episodes, jax.random.PRNGKey(2))
+    np.testing.assert_array_equal(outcome.failed[0, :3], True)
+    assert float(outcome.reward[0, :3].max()) < -298
+    np.testing.assert_array_equal(data.reward[:3, 0], -7)
+    np.testing.assert_array_equal(data.reward[:, 1:], outcome.reward[1:].T)
+    # Another drone each, and the rest of the commands flown with it.
+    assert not np.any(np.asarray(after.model.parameters.mass)[:3] == np.asarray(episodes.model.parameters.mass)[:3])
+    np.testing.assert_array_equal(after.count[:3], config.ppo.unroll - 1)
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, algorithm):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
