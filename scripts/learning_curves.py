@@ -85,8 +85,9 @@ def page(found: dict[str, list[dict]]) -> str:
         facts_line("python scripts/learning_curves.py", [run for runs in found.values() for run in runs]),
         "",
         "From random weights, on the nominal drone; hover error by the paper's test (mean of 64 flights with noise). "
-        "Time is that of the updates, compiling the first included, judging not. Reached: the first point of the curve "
-        "from which it stays below the mark, median over the seeds; where not all got there it says how many did.",
+        "Time is that of the updates, compiling the first included, judging not, on a machine that did other things "
+        "beside. Reached: the first point of the curve from which it stays below the mark, median over the seeds; "
+        "where not all got there it says how many did.",
         "",
         "![learning curves](learning-curves.png)",
         "",
@@ -107,10 +108,11 @@ def page(found: dict[str, list[dict]]) -> str:
 def figure(found: dict[str, list[dict]], path) -> None:
     """Hover error over seconds and over commands: the seeds' median, and their span."""
     import numpy as np
+    from matplotlib.ticker import FormatStrFormatter
 
     from cfb_mjx.view.style import context, new_figure, save
 
-    colours = ("#0072B2", "#56B4E9", "#D55E00", "#E69F00", "#CC79A7", "#009E73", "#8C8C8C")
+    colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C8C8C")
     with context():
         plot = new_figure(7.6, 3.4)
         axes = plot.subplots(1, 2, sharey=True)
@@ -125,6 +127,7 @@ def figure(found: dict[str, list[dict]], path) -> None:
         axes[0].set_ylabel("mean hover error, mm")
         axes[0].set_yscale("log")
         axes[0].set_ylim(2, 5000)
+        axes[0].yaxis.set_major_formatter(FormatStrFormatter("%g"))
         axes[1].legend(frameon=False, fontsize=8)
         plot.subplots_adjust(left=0.1, right=0.98, bottom=0.15, top=0.96, wspace=0.08)
         save(plot, path)
