@@ -1,6 +1,7 @@
 """The commands as scripts call them: results, help, and how light they start."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -97,3 +98,13 @@ def test_changes_may_be_given_together_or_one_by_one(monkeypatch, tmp_path):
     run("train", ["target", "-o", str(tmp_path), "--set", "seed=1", "ppo.steps=9", "--set", "ppo.unroll=3"])
     run("train", ["target", "-o", str(tmp_path)])
     assert seen == [("seed=1", "ppo.steps=9", "ppo.unroll=3"), ()]
+
+
+def test_the_flag_that_breaks_derivatives_of_the_mjx_body_is_taken_back(monkeypatch):
+    from cfb_mjx.cli import runtime
+
+    monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+    runtime.set_up_xla()
+    assert runtime.XLA_CPU_FLAGS in os.environ["XLA_FLAGS"]
+    runtime.differentiate_mjx()
+    assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=2"

@@ -68,6 +68,19 @@ def test_the_gradient_of_a_flight_is_that_of_differences():
         np.testing.assert_allclose(along, (loss(ahead) - loss(behind)) / 2e-5, rtol=1e-5)
 
 
+def test_both_bodies_give_the_same_gradient():
+    config = load_config("target", ("analytic.drones=2", "analytic.horizon_s=0.016", "network.hidden=[8]", "body=mjx"))
+    found = []
+    for training in (Training.prepare(config, {}), Training.prepare(replace(config, body="rigid"), {})):
+        nominal, task = training.nominal(), training.config.build_task()
+        analytic = Analytic(config.analytic, task, nominal)
+        controller = training.first_controller(nominal)
+        episodes = analytic.begin(jax.random.PRNGKey(1), controller).episodes
+        found.append(jax.jit(jax.grad(lambda c, a=analytic, e=episodes: a._loss(c, e)[0]))(controller))
+    for mjx, rigid in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(mjx, rigid, rtol=1e-6, atol=1e-9)
+
+
 def test_a_failed_drone_pays_for_the_rest_of_the_horizon_and_harms_no_gradient():
     task = TargetTask()
     settings = AnalyticSettings(drones=2, horizon_s=0.08)

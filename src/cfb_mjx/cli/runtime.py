@@ -11,9 +11,9 @@ from pathlib import Path
 
 XLA_CPU_FLAGS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
 """On CPU a time step then becomes a few kernels that share what they compute, instead of some thirty that repeat it:
-up to 4 times faster; nothing changes elsewhere. XLA reads it when jaxlib loads, so the commands set it for themselves;
-scripts put it into XLA_FLAGS (docs/model.md). Not for derivatives of the MJX body: jaxlib 0.10.1 aborts while compiling
-some of them with it."""
+up to 4 times faster; nothing changes elsewhere. XLA reads it when jax starts its first backend, so the commands set it
+for themselves; scripts put it into XLA_FLAGS (docs/model.md). Not for derivatives of the MJX body: jaxlib 0.10.1 aborts
+while compiling some of them with it (`differentiate_mjx`)."""
 
 
 def configure_jax(x64: bool) -> None:
@@ -48,6 +48,11 @@ def set_up_xla() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     if "xla_backend_extra_options" not in os.environ.get("XLA_FLAGS", ""):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {XLA_CPU_FLAGS}".strip()
+
+
+def differentiate_mjx() -> None:
+    """Take `XLA_CPU_FLAGS` back, before jax has computed anything."""
+    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "").replace(XLA_CPU_FLAGS, "").strip()
 
 
 def say(text: str) -> None:

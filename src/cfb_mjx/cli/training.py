@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import Progress, configure_jax, environment, say
+from cfb_mjx.cli.runtime import Progress, configure_jax, differentiate_mjx, environment, say
 from cfb_mjx.files import require_no_file, write_json
 
 NEWEST = "training.json"
@@ -36,6 +36,8 @@ def run_train(
     from cfb_mjx.view.learning import learning_figure
 
     settings = with_changes(load_config(config, changes), **choices)
+    if settings.body == "mjx" and settings.algorithm == "analytic":
+        differentiate_mjx()
     facts = environment()
     versions = {name: facts[name] for name in ("cfb_mjx", "jax", "jaxlib", "python")}
     training = Training.prepare(settings, versions, start, force)
