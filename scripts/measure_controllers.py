@@ -26,7 +26,7 @@ def main() -> None:
     import jax
     import numpy as np
 
-    from cfb_mjx.cli.flying import find_pilot
+    from cfb_mjx.control.pilot import find_pilot
     from cfb_mjx.envs import TargetTask, reset
     from cfb_mjx.files import write_json, write_text
     from cfb_mjx.model import Quadrotor

@@ -35,7 +35,7 @@ def main() -> None:
     if not arguments.pages_only:
         judge = Judge()
         if not firmware.exists():
-            from cfb_mjx.cli.flying import find_pilot
+            from cfb_mjx.control.pilot import find_pilot
 
             write_json(firmware, {name: judge(find_pilot(name, judge.nominal)) for name in PAPER_FIRMWARE})
         for algorithm in arguments.algorithms:

@@ -40,6 +40,7 @@ def run_fly(
     import jax
     import numpy as np
 
+    from cfb_mjx.control.pilot import find_pilot
     from cfb_mjx.envs import Noise, TargetTask
     from cfb_mjx.envs.target import QUIET, longest_delay_s
     from cfb_mjx.model import Quadrotor
@@ -83,29 +84,6 @@ def run_fly(
 
         flight_figure(flown, pilot.control_dt_s, figure, f"{controller}, {task}, {model}")
         print(f"figure: {figure}")
-
-
-def find_pilot(controller: str, nominal):
-    """The pilot of a name or a policy file.
-
-    Raises:
-        CfbError: there is no such controller, or the file is no policy.
-    """
-    from cfb_mjx.control import FirmwarePid, Mellinger
-    from cfb_mjx.control.policy_file import load_policy, shipped_policies
-    from cfb_mjx.train.flying import MellingerPilot, Pid
-
-    if controller == "pid":
-        return Pid(FirmwarePid.hovering(nominal.changed_parameters()))
-    if controller == "mellinger":
-        return MellingerPilot(Mellinger())
-    found = shipped_policies()
-    if controller in found:
-        return load_policy(found[controller]).controller
-    if Path(controller).suffix != ".npz":
-        names = ", ".join(["pid", "mellinger", *found])
-        raise CfbError(f"{controller}: no such controller; give a policy file (.npz) or one of {names}.")
-    return load_policy(controller).controller
 
 
 def summary(task: str, measured: dict) -> dict:

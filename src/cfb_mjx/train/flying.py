@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple, Protocol
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,13 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cfb_mjx.control.mellinger import Mellinger
-from cfb_mjx.control.mellinger import init as mellinger_init
-from cfb_mjx.control.mellinger import step as mellinger_step
-from cfb_mjx.control.pid import DT as PID_DT
-from cfb_mjx.control.pid import FirmwarePid, Setpoint, init
-from cfb_mjx.control.pid import step as pid_step
-from cfb_mjx.envs.observation import Estimate, Layout
+from cfb_mjx.control.pilot import Pilot
+from cfb_mjx.envs.observation import Layout
 from cfb_mjx.envs.target import TargetTask, reset, settled_command, step
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
@@ -26,52 +21,6 @@ HOVER_S, SETTLING_S = 6.0, 1.0
 """The paper's hover test: so long, of which the first second is not counted."""
 STEP_DISTANCE_M, ARRIVED_M, STEP_S = 6.0, 0.10, 4.0
 """The paper's back-and-forth: how far, what counts as there, and how long it is watched."""
-
-
-class Pilot(Protocol):
-    """A controller that holds the target: what it sees is relative to it. `NeuralController` is one."""
-
-    control_dt_s: float
-
-    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
-        """Memory at take-over; ``command`` is what the rotors turn at."""
-
-    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
-        """New memory and command."""
-
-
-class Pid(eqx.Module):
-    """The firmware's PID as a pilot, heading kept at zero."""
-
-    pid: FirmwarePid
-    control_dt_s: float = eqx.field(static=True, default=PID_DT)
-
-    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
-        """Empty integrators."""
-        return init(self.pid, _measured(estimate))
-
-    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
-        """New memory and command."""
-        return pid_step(self.pid, memory, _measured(estimate), Setpoint.hover(jnp.zeros(3)))
-
-
-class MellingerPilot(eqx.Module):
-    """The firmware's Mellinger controller as a pilot, heading kept at zero."""
-
-    mellinger: Mellinger
-    control_dt_s: float = eqx.field(static=True, default=PID_DT)
-
-    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
-        """Empty integrators."""
-        return mellinger_init(_measured(estimate))
-
-    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
-        """New memory and command."""
-        return mellinger_step(self.mellinger, memory, _measured(estimate), jnp.zeros(3))
-
-
-def _measured(estimate: Estimate) -> State:
-    return State(estimate.position, estimate.velocity, estimate.quaternion, estimate.body_rate, jnp.zeros(4))
 
 
 class Flight(NamedTuple):

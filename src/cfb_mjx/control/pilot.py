@@ -1,0 +1,87 @@
+"""Controllers as pilots: what holds a target on late estimates relative to it, network or firmware alike."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cfb_mjx.control import mellinger, pid
+from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.envs.observation import Estimate
+from cfb_mjx.errors import CfbError
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.state import State
+
+
+@runtime_checkable
+class Pilot(Protocol):
+    """A controller that holds the target: what it sees is relative to it. `NeuralController` is one."""
+
+    control_dt_s: float
+
+    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
+        """Memory at take-over; ``command`` is what the rotors turn at."""
+
+    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
+        """New memory and command."""
+
+
+class PidPilot(eqx.Module):
+    """The firmware's PID as a pilot, heading kept at zero."""
+
+    firmware: pid.FirmwarePid
+    control_dt_s: float = eqx.field(static=True, default=pid.DT)
+
+    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
+        """Empty integrators."""
+        return pid.init(self.firmware, _measured(estimate))
+
+    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
+        """New memory and command."""
+        return pid.step(self.firmware, memory, _measured(estimate), pid.Setpoint.hover(jnp.zeros(3)))
+
+
+class MellingerPilot(eqx.Module):
+    """The firmware's Mellinger controller as a pilot, heading kept at zero."""
+
+    firmware: mellinger.Mellinger
+    control_dt_s: float = eqx.field(static=True, default=pid.DT)
+
+    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
+        """Empty integrators."""
+        return mellinger.init(_measured(estimate))
+
+    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
+        """New memory and command."""
+        return mellinger.step(self.firmware, memory, _measured(estimate), jnp.zeros(3))
+
+
+def _measured(estimate: Estimate) -> State:
+    return State(estimate.position, estimate.velocity, estimate.quaternion, estimate.body_rate, jnp.zeros(4))
+
+
+def find_pilot(controller: str | Path, nominal: Quadrotor) -> Pilot:
+    """The pilot of a name (pid, mellinger, a shipped policy) or of a policy file.
+
+    Args:
+        controller: name or file.
+        nominal: the drone that the PID's base thrust is set for.
+
+    Raises:
+        CfbError: there is no such controller, or the file is no policy.
+    """
+    if controller == "pid":
+        return PidPilot(pid.FirmwarePid.hovering(nominal.changed_parameters()))
+    if controller == "mellinger":
+        return MellingerPilot(mellinger.Mellinger())
+    found = shipped_policies()
+    if controller in found:
+        return load_policy(found[controller]).controller
+    if Path(controller).suffix != ".npz":
+        names = ", ".join(["pid", "mellinger", *found])
+        raise CfbError(f"{controller}: no such controller; give a policy file (.npz) or one of {names}.")
+    return load_policy(controller).controller
