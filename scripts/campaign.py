@@ -43,7 +43,7 @@ def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> dict:
     for run in runs:
         config = with_changes(load_config(run.config, run.changes), seed=run.seed)
         described = config.to_mapping()
-        if run.name in found and found[run.name]["config"] == json.loads(json.dumps(described)):
+        if run.name in found and _what_counts(found[run.name]["config"]) == _what_counts(described):
             continue
         say(f"{run.name} ({len(found)} of {len(runs)} done)")
         start = None if run.start is None else folder / run.start / POLICY
@@ -55,6 +55,12 @@ def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> dict:
         }
         write_json(results, found)
     return {run.name: found[run.name] for run in runs}
+
+
+def _what_counts(config: dict) -> dict:
+    """Without the settings of the algorithm that is not used."""
+    other = {"ppo": "analytic", "analytic": "ppo"}[config["algorithm"]]
+    return json.loads(json.dumps({k: v for k, v in config.items() if k not in (other, "description")}))
 
 
 def _report(row: dict) -> None:

@@ -14,7 +14,7 @@ from campaign import ROOT, Judge, Run, carry_out, facts_line
 
 from cfb_mjx.cli.runtime import configure_jax, set_up_xla
 
-NOMINAL = ("randomisation.magnitude=0",)
+NOMINAL = ("randomisation.magnitude=0", "randomisation.graded=0.0")
 PPO = (*NOMINAL, "ppo.steps=16000000", "checkpoints=16")
 QUICK = (*NOMINAL, "checkpoints=16")
 VARIANTS = {

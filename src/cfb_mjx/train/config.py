@@ -34,7 +34,7 @@ class RandomisationSettings:
     """A shipped randomisation or a YAML file."""
     magnitude: float = 1.0
     """Factor on all ranges; 0 trains on the nominal drone alone."""
-    graded: float = 0.0
+    graded: float = 0.5
     """Share of the episodes that draw their own factor between 0 and ``magnitude``: uniform draws of a dozen numbers
     are never all near their means, and without this the nominal drone itself would never be flown."""
 
@@ -81,7 +81,7 @@ class PpoSettings:
     """Commands of every drone between two updates of the policy."""
     minibatches: int = 8
     epochs: int = 4
-    steps: int = 40_000_000
+    steps: int = 100_000_000
     """Commands in total."""
     learning_rate: float = 1e-3
     """At the start; it falls to ``last_rate`` of that along a line."""
