@@ -90,6 +90,19 @@ def _span(values: list, digits: str) -> str:
     return f"{mean} [{format(min(there), digits)}, {format(max(there), digits)}]{lost}"
 
 
+def _best(runs: dict) -> list[str]:
+    """Which magnitude holds the off-nominal drones best: on the mean of the seeds, and seed by seed."""
+    away = {m: _of(_scores(runs, m))["away"] for m in MAGNITUDES if _scores(runs, m)}
+    if any(None in values for values in away.values()):
+        return []
+    best = min(away, key=lambda m: sum(away[m]) / len(away[m]))
+    each = zip(*(away[m] for m in away), strict=False)
+    seeds = ", ".join(f"{list(away)[values.index(min(values))]:g}" for values in each)
+    return [
+        f"Off-nominal drones are held best with magnitude {best:g} (seed by seed: {seeds}; the paper's real one: 1)."
+    ]
+
+
 def page(found: dict, firmware: dict) -> str:
     """The Markdown page."""
     runs = [run for algorithm in found.values() for run in algorithm.values()]
@@ -131,6 +144,7 @@ def page(found: dict, firmware: dict) -> str:
             cells += [_span(s["away"], ".1f"), _span(s["away_std"], ".4f"), _span(s["random"], ".0f")]
             cells += [_span(s["random_failed"], ".2%"), *(f"{x:g}" for x in PAPER[magnitude])]
             lines.append("| " + " | ".join(cells) + " |")
+        lines += ["", *_best(of)]
     lines += [
         "",
         "## The firmware's controllers, same tests",
@@ -166,13 +180,15 @@ def page(found: dict, firmware: dict) -> str:
 
 def figure(found: dict, path) -> None:
     """Hover error and command std over magnitude: seeds as points, their mean as a line, the paper as crosses."""
+    from matplotlib.ticker import FormatStrFormatter
+
     from cfb_mjx.view.style import COLOURS, context, new_figure, save
 
     colours = dict(zip(("nominal", "away"), (COLOURS["hold"], COLOURS["commands_in"]), strict=True))
     labels = {"nominal": "nominal drone", "away": "off-nominal drones"}
     with context():
-        plot = new_figure(3.4 * len(found), 4.6)
-        axes = plot.subplots(2, len(found), squeeze=False, sharex=True)
+        plot = new_figure(4.2 * len(found), 4.8)
+        axes = plot.subplots(2, len(found), squeeze=False, sharex=True, sharey="row")
         for column, (algorithm, of) in enumerate(found.items()):
             for row, (suffix, label) in enumerate((("", "mean distance, mm"), ("_std", "command std"))):
                 axis = axes[row][column]
@@ -185,14 +201,19 @@ def figure(found: dict, path) -> None:
                     axis.plot(MAGNITUDES, means, color=colour, label=labels[where])
                 paper = [PAPER[m][row] for m in MAGNITUDES]
                 axis.plot(MAGNITUDES, paper, "x:", color="black", label="paper, real drone")
-                axis.set_yscale("log")
+                if row == 0:
+                    axis.set_yscale("log")
+                    axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+                else:
+                    axis.set_ylim(bottom=0)
                 axis.set_ylabel(label)
                 if row == 0:
                     axis.set_title(TITLES[algorithm])
                 else:
                     axis.set_xlabel("magnitude of the randomisation")
-        axes[0][0].legend(frameon=False, fontsize=8)
-        plot.subplots_adjust(left=0.3 / max(1, len(found)), right=0.98, bottom=0.1, top=0.93, wspace=0.35, hspace=0.12)
+        axes[0][0].set_ylim(top=2000)
+        axes[0][0].legend(frameon=False, fontsize=8, loc="upper right")
+        plot.subplots_adjust(left=0.17 / len(found), right=0.98, bottom=0.1, top=0.93, wspace=0.3, hspace=0.12)
         save(plot, path)
 
 
