@@ -80,8 +80,9 @@ def main() -> None:
     print("docs/controllers.md")
 
 
-def _factors(drones, nominal, distance, well) -> dict[str, float]:
-    """Spearman's rank correlation of the hover error with the size of each factor's departure."""
+def _factors(drones, nominal, distance, well) -> dict[str, dict[str, float]]:
+    """Of each factor: Spearman's rank correlation of the hover error with the size of its departure, and the median
+    error of the third of the drones that depart least and of the third that departs most."""
     import numpy as np
     from scipy.stats import spearmanr
 
@@ -99,7 +100,16 @@ def _factors(drones, nominal, distance, well) -> dict[str, float]:
         "motor time constant": np.abs(departure("motor_time_constant")[:, 0]),
         "inertia, roll and pitch": np.abs(departure("inertia")[:, :2]).sum(axis=1),
     }
-    return {name: float(spearmanr(value[well], distance[well]).statistic) for name, value in size.items()}
+    found = {}
+    for name, value in size.items():
+        value, error = value[well], distance[well]
+        low, high = np.quantile(value, (1 / 3, 2 / 3))
+        found[name] = {
+            "rank_correlation": float(spearmanr(value, error).statistic),
+            "least_third_mm": float(np.median(error[value <= low])),
+            "most_third_mm": float(np.median(error[value >= high])),
+        }
+    return found
 
 
 def _hover_squared(parameters):
@@ -154,12 +164,16 @@ def page(results: dict, facts: dict, plants: int, described) -> str:
     factors = list(results[names[0]]["factors"])
     lines += [
         "",
-        "Which factor sets the error: Spearman's rank correlation of the hover error with the size of each departure.",
+        "Which factor sets the error: median of the third of the drones that depart least by it and of the third that "
+        "departs most, mm; in brackets Spearman's rank correlation of the error with the size of the departure.",
         "",
         "| factor | " + " | ".join(names) + " |",
         "|---|" + "---|" * len(names),
     ]
-    lines += [f"| {f} | " + " | ".join(f"{results[n]['factors'][f]:+.2f}" for n in names) + " |" for f in factors]
+    for factor in factors:
+        of = [results[name]["factors"][factor] for name in names]
+        cells = [f"{x['least_third_mm']:.0f} to {x['most_third_mm']:.0f} ({x['rank_correlation']:+.2f})" for x in of]
+        lines.append(f"| {factor} | " + " | ".join(cells) + " |")
     lines += [
         "",
         "## On drones that nothing was trained on",
