@@ -1,13 +1,18 @@
 """Trainings of a study, one after the other: what is done is kept, so that an interrupted study goes on."""
 
+import argparse
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import environment, say
+from cfb_mjx.cli.runtime import configure_jax, environment, say
 
 ROOT = Path(__file__).resolve().parents[1]
 FLIGHTS, RANDOM_DRONES = 64, 512
+PAPER = {0.0: (284.76, 0.0203), 0.5: (100.07, 0.0245), 1.0: (43.16, 0.0197), 1.5: (71.39, 0.0548)}
+PAPER_FIRMWARE = {"pid": (27.81, 0.0226), "mellinger": (54.68, 0.0394)}
+"""The paper's hover tests on its real drone, networks by magnitude: mean distance in mm, command std."""
 
 
 @dataclass(frozen=True)
@@ -18,21 +23,27 @@ class Run:
     config: str
     changes: tuple[str, ...]
     seed: int
-    start: str | None = None
-    """Name of the run of the same study and seed whose policy it starts from."""
 
 
-def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> dict:
+def study_arguments(description: str, option: str, choices: Iterable[str]) -> argparse.Namespace:
+    """Read a study's command line: which of ``choices`` to run, how many seeds, or only the page; set jax up for it."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(option, nargs="+", choices=list(choices), default=list(choices), dest="chosen")
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--page-only", action="store_true", help="write the page from the results that are there")
+    arguments = parser.parse_args()
+    configure_jax(x64=False)
+    return arguments
+
+
+def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> None:
     """Train what ``results`` does not hold yet, and judge it.
 
     Args:
         runs: of the study, in order.
-        results: JSON file that grows with every run.
+        results: JSON file that grows with every run: name to seed, score, curve, config and environment.
         folder: for checkpoints and policies.
         judge: controller to numbers.
-
-    Returns:
-        Name to config, seed, changes, curve, score and environment.
     """
     from cfb_mjx.control.policy_file import load_policy
     from cfb_mjx.files import write_json
@@ -40,21 +51,24 @@ def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> dict:
     from cfb_mjx.train.run import POLICY, Training, train
 
     found = json.loads(results.read_text()) if results.exists() else {}
+    facts = environment()
     for run in runs:
         config = with_changes(load_config(run.config, run.changes), seed=run.seed)
         described = config.to_mapping()
         if run.name in found and _what_counts(found[run.name]["config"]) == _what_counts(described):
             continue
         say(f"{run.name} ({len(found)} of {len(runs)} done)")
-        start = None if run.start is None else folder / run.start / POLICY
-        training = Training.prepare(config, environment(), start)
+        training = Training.prepare(config, facts)
         rows = train(training, folder / run.name, resume=True, report=_report)
         score = judge(load_policy(folder / run.name / POLICY).controller)
-        found[run.name] = {"seed": run.seed, "score": score, "curve": rows, "config": described} | {
-            "environment": environment()
+        found[run.name] = {
+            "seed": run.seed,
+            "score": score,
+            "curve": rows,
+            "config": described,
+            "environment": facts,
         }
         write_json(results, found)
-    return {run.name: found[run.name] for run in runs}
 
 
 def _what_counts(config: dict) -> dict:
@@ -78,9 +92,9 @@ class Judge:
         from cfb_mjx.parameters import load_model_file, load_randomisation
         from cfb_mjx.train.plants import load_plants
 
-        described = load_model_file("cfb-guards")
-        self.nominal = Quadrotor.from_file(described)
-        self.plants = {} if plants is None else load_plants(described, plants)
+        self.described = load_model_file("cfb-guards")
+        self.nominal = Quadrotor.from_file(self.described)
+        self.plants = {} if plants is None else load_plants(self.described, plants)
         self.calm, self.wild = TargetTask(), TargetTask(randomisation=load_randomisation("paper"))
         self.few = jax.random.split(jax.random.PRNGKey(0), FLIGHTS)
         self.many = jax.random.split(jax.random.PRNGKey(1), random_drones)

@@ -6,13 +6,10 @@ On the nominal drone (no randomisation), where the time to a hover error says mo
 benchmarks/learning-curves.json, and a run begun anew goes on. Writes docs/learning-curves.md and its figure.
 """
 
-import argparse
 import json
 import statistics
 
-from campaign import ROOT, Judge, Run, carry_out, facts_line
-
-from cfb_mjx.cli.runtime import configure_jax, set_up_xla
+from campaign import ROOT, Judge, Run, carry_out, facts_line, study_arguments
 
 NOMINAL = ("randomisation.magnitude=0", "randomisation.graded=0.0")
 PPO = (*NOMINAL, "ppo.steps=16000000", "checkpoints=16")
@@ -31,13 +28,7 @@ MARKS_MM = (100, 50, 25)
 
 def main() -> None:
     """Train what is missing, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--only", nargs="+", choices=list(VARIANTS), default=list(VARIANTS))
-    parser.add_argument("--page-only", action="store_true", help="write the page from the results that are there")
-    arguments = parser.parse_args()
-    set_up_xla()
-    configure_jax(x64=False)
+    arguments = study_arguments(__doc__, "--only", VARIANTS)
     from cfb_mjx.files import write_text
 
     results = ROOT / "benchmarks" / "learning-curves.json"
@@ -45,7 +36,7 @@ def main() -> None:
         runs = [
             Run(f"{name}-{seed}", *VARIANTS[name][:2], seed)
             for seed in range(arguments.seeds)
-            for name in arguments.only
+            for name in arguments.chosen
         ]
         carry_out(runs, results, ROOT / "out" / "learning-curves", Judge(plants=None, random_drones=0))
     found = {}

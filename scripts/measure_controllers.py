@@ -7,13 +7,13 @@ Minutes. The paper's own numbers are of the real drone and stand beside.
 
 import argparse
 import sys
-from pathlib import Path
+
+from campaign import PAPER, PAPER_FIRMWARE, ROOT, Judge
 
 from cfb_mjx.cli.runtime import configure_jax, environment, say
 
-ROOT = Path(__file__).resolve().parents[1]
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-PAPER = {"target": (43.16, 0.0197), "pid": (27.81, 0.0226), "mellinger": (54.68, 0.0394)}
+PAPER_OF = {"target": PAPER[1.0], **PAPER_FIRMWARE}
 
 
 def main() -> None:
@@ -27,20 +27,14 @@ def main() -> None:
     import numpy as np
 
     from cfb_mjx.control.pilot import find_pilot
-    from cfb_mjx.envs import TargetTask, reset
+    from cfb_mjx.envs import reset
     from cfb_mjx.files import write_json, write_text
-    from cfb_mjx.model import Quadrotor
-    from cfb_mjx.parameters import load_model_file, load_randomisation
     from cfb_mjx.train.flying import hover, recovery, six_metres
-    from cfb_mjx.train.plants import load_plants
 
-    described = load_model_file("cfb-guards")
-    nominal, spread = Quadrotor.from_file(described), load_randomisation("paper")
-    calm, wild = TargetTask(), TargetTask(randomisation=spread)
-    few = jax.random.split(jax.random.PRNGKey(0), 64)
-    many = jax.random.split(jax.random.PRNGKey(1), arguments.plants)
+    judge = Judge(random_drones=arguments.plants)
+    described, nominal, plants = judge.described, judge.nominal, judge.plants
+    calm, wild, few, many = judge.calm, judge.wild, judge.few, judge.many
     drones = jax.jit(jax.vmap(lambda key: reset(wild, nominal, key).model.parameters))(many)
-    plants = load_plants(described)
     results = {}
     for name in arguments.controllers:
         say(name)
@@ -140,7 +134,7 @@ def page(results: dict, facts: dict, plants: int, described) -> str:
     ]
     for name in names:
         r = results[name]
-        paper = [f"{x:g}" for x in PAPER.get(name, ())] or ["", ""]
+        paper = [f"{x:g}" for x in PAPER_OF.get(name, ())] or ["", ""]
         arrival = f"{r['arrival_s']:.2f}" if r["arrival_s"] < 1e6 else "not within 4"
         cells = [name, f"{r['hover_mm']:.1f}", f"{r['command_std']:.4f}", *paper, arrival]
         cells += [f"{r['peak_speed_mps']:.2f}", f"{r['overshoot_m']:.2f}"]

@@ -1,44 +1,33 @@
 """How much randomisation? The paper's study, in simulation, with PPO and with back-propagation.
 
-    python scripts/study_magnitudes.py [--algorithms analytic ppo] [--seeds 3] [--pages-only]
+    python scripts/study_magnitudes.py [--algorithms analytic ppo] [--seeds 3] [--page-only]
 
 Hours for all of it; what is done is kept in benchmarks/magnitudes-ALGORITHM.json, and a run begun anew goes on. Writes
 docs/magnitudes.md and its figure.
 """
 
-import argparse
 import json
 
-from campaign import ROOT, Judge, Run, carry_out, facts_line
-
-from cfb_mjx.cli.runtime import configure_jax, set_up_xla
+from campaign import PAPER, PAPER_FIRMWARE, ROOT, Judge, Run, carry_out, facts_line, study_arguments
 
 MAGNITUDES = (0.0, 0.5, 1.0, 1.5)
 CONFIGS = {"analytic": "study-analytic", "ppo": "target"}
 TITLES = {"analytic": "back-propagation", "ppo": "PPO"}
-PAPER = {0.0: (284.76, 0.0203), 0.5: (100.07, 0.0245), 1.0: (43.16, 0.0197), 1.5: (71.39, 0.0548)}
-PAPER_FIRMWARE = {"pid": (27.81, 0.0226), "mellinger": (54.68, 0.0394)}
 
 
 def main() -> None:
     """Train what is missing, judge, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--algorithms", nargs="+", default=list(CONFIGS), choices=list(CONFIGS))
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--pages-only", action="store_true", help="write the page from the results that are there")
-    arguments = parser.parse_args()
-    set_up_xla()
-    configure_jax(x64=False)
+    arguments = study_arguments(__doc__, "--algorithms", CONFIGS)
     from cfb_mjx.files import write_json, write_text
 
     firmware = ROOT / "benchmarks" / "magnitudes-firmware.json"
-    if not arguments.pages_only:
+    if not arguments.page_only:
         judge = Judge()
         if not firmware.exists():
             from cfb_mjx.control.pilot import find_pilot
 
             write_json(firmware, {name: judge(find_pilot(name, judge.nominal)) for name in PAPER_FIRMWARE})
-        for algorithm in arguments.algorithms:
+        for algorithm in arguments.chosen:
             # By seed, so that an unfinished study has every magnitude.
             runs = [
                 Run(f"{m:g}-{seed}", CONFIGS[algorithm], (f"randomisation.magnitude={m}",), seed)

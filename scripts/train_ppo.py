@@ -9,7 +9,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import configure_jax, environment, set_up_xla
+from cfb_mjx.cli.runtime import configure_jax, environment
 
 
 def main() -> None:
@@ -20,7 +20,6 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="changes to the configuration")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder")
     arguments = parser.parse_args()
-    set_up_xla()
     configure_jax(x64=False)
     from cfb_mjx.train.config import load_config
     from cfb_mjx.train.run import Training, train

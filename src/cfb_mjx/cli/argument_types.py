@@ -19,6 +19,6 @@ Pairs = Annotated[
 """``--set A=1 B=2`` and ``--set A=1 --set B=2`` mean the same; the later of two of one name counts."""
 
 
-def flat(pairs: tuple[tuple[str, ...], ...]) -> tuple[str, ...]:
-    """One tuple of what every occurrence of the argument gave."""
-    return tuple(chain.from_iterable(pairs))
+def flat(pairs: tuple[tuple[str, ...], ...]) -> list[str]:
+    """One list of what every occurrence of the argument gave."""
+    return list(chain.from_iterable(pairs))

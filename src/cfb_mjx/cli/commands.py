@@ -68,7 +68,7 @@ def evaluate(
         raise CfbError("evaluate needs at least one log; see 'cfb evaluate --help'.")
     from cfb_mjx.cli.evaluating import run_evaluate
 
-    run_evaluate(list(logs), model, list(flat(set)), json, figure, observer)
+    run_evaluate(list(logs), model, flat(set), json, figure, observer)
 
 
 def benchmark_nanodrone(
@@ -138,7 +138,7 @@ def fit(
         output,
         parameters,
         model,
-        list(flat(set)),
+        flat(set),
         json,
         commands_only,
         compare,
@@ -184,7 +184,7 @@ def fit_rotors(
     from cfb_mjx.cli.rotor_fitting import run_fit_rotors
 
     run_fit_rotors(
-        list(files), output, model, list(flat(set)), offset, asymmetric, dead_time, per_motor, robust, json, figure
+        list(files), output, model, flat(set), offset, asymmetric, dead_time, per_motor, robust, json, figure
     )
 
 
@@ -236,14 +236,14 @@ def excite(
     if manoeuvre == "separate":
         from cfb_mjx.cli.separating import run_separate
 
-        run_separate(between, output, model, list(flat(set)), measured_rotors, disturbance, json)
+        run_separate(between, output, model, flat(set), measured_rotors, disturbance, json)
         return
     run_excite(
         manoeuvre,
         output,
         parameters,
         model,
-        list(flat(set)),
+        flat(set),
         repetitions,
         duration,
         rate_limit,
@@ -276,7 +276,7 @@ def close_loop(
     """
     from cfb_mjx.cli.closing import run_close_loop
 
-    run_close_loop(list(fit), list(held_out), output, model, list(flat(set)))
+    run_close_loop(list(fit), list(held_out), output, model, flat(set))
 
 
 def refine(
@@ -315,9 +315,7 @@ def refine(
     from cfb_mjx.cli.refining import run_refine
 
     paths = list(logs), list(held_out)
-    run_refine(
-        *paths, output, model, list(flat(set)), effects, estimator, predictor, list(flat(weight)), as_logged, json
-    )
+    run_refine(*paths, output, model, flat(set), effects, estimator, predictor, flat(weight), as_logged, json)
 
 
 def bench(

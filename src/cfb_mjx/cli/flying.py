@@ -47,7 +47,8 @@ def run_fly(
     from cfb_mjx.parameters import load_model_file, load_randomisation
     from cfb_mjx.train import flying
 
-    nominal = Quadrotor.from_file(load_model_file(model))
+    described = load_model_file(model)
+    nominal = Quadrotor.from_file(described)
     spread = load_randomisation(randomisation)
     course = TargetTask(
         noise=Noise() if noise else QUIET,
@@ -72,7 +73,7 @@ def run_fly(
         from cfb_mjx.train.plants import load_plants
 
         result |= {"set": on, "on": {}}
-        drones = load_plants(load_model_file(model), on)
+        drones = load_plants(described, on)
         for name, drone in drones.items():
             result["on"][name], _ = fly(drone)
             _print_row(name, result["on"][name], max(map(len, drones)))
