@@ -11,7 +11,7 @@ import json
 from campaign import PAPER, PAPER_FIRMWARE, ROOT, Judge, Run, carry_out, facts_line, study_arguments
 
 MAGNITUDES = (0.0, 0.5, 1.0, 1.5)
-CONFIGS = {"analytic": "study-analytic", "ppo": "target"}
+CONFIGS = {"analytic": "study-analytic", "ppo": "study-ppo"}
 TITLES = {"analytic": "back-propagation", "ppo": "PPO"}
 
 

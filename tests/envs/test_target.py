@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cfb_mjx.envs import Layout, Noise, PaperReward, TargetTask, observe, reset, step
-from cfb_mjx.envs.target import QUIET
+from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, State, rollout
 from cfb_mjx.parameters import load_randomisation

@@ -42,7 +42,7 @@ def run_fly(
 
     from cfb_mjx.control.pilot import find_pilot
     from cfb_mjx.envs import Noise, TargetTask
-    from cfb_mjx.envs.target import QUIET, longest_delay_s
+    from cfb_mjx.envs.episode import QUIET, longest_delay_s
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import load_model_file, load_randomisation
     from cfb_mjx.train import flying

@@ -10,7 +10,7 @@ from cfb_mjx.cli.argument_types import File, Output, Pairs, flat
 
 
 def train(
-    task: Annotated[Literal["target"], tyro.conf.Positional],
+    task: Annotated[Literal["target", "flip"], tyro.conf.Positional],
     output: Output,
     config: Annotated[str | None, tyro.conf.arg(metavar="CONFIG")] = None,
     model: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None,
@@ -27,7 +27,7 @@ def train(
     Writes policy.npz (what `cfb fly` flies), curve.csv and curve.png (learning curve), config.yaml and checkpoint.npz.
 
     Args:
-        task: what to learn: fly to a target and hold it.
+        task: what to learn: fly to a target and hold it, or turn about the x axis at a rate that is asked for.
         output: folder for the results.
         config: training YAML, or the name of a shipped one; the task's own by default.
         model: preset or model YAML of the drone, with its effects; in place of the configuration's.

@@ -9,6 +9,12 @@ from cfb_mjx.cli.runtime import Progress, configure_jax, differentiate_mjx, envi
 from cfb_mjx.files import require_no_file, write_json
 
 NEWEST = "training.json"
+_JUDGED = (
+    ("hover_mm", "hover", " mm"),
+    ("command_std", "command std", ""),
+    ("rate_error_radps", "rate error", " rad/s"),
+    ("axis_error", "axis error", ""),
+)
 
 
 def run_train(
@@ -48,8 +54,8 @@ def run_train(
         bar(done, total, f"{rate / 1e3:.0f} k commands/s, {_clock(left)} left")
 
     def reported(row: dict) -> None:
-        hover = f", hover {row['hover_mm']:.3g} mm, command std {row['command_std']:.3g}" if "hover_mm" in row else ""
-        say(f"{_clock(row['seconds'])}: {row['commands'] / 1e6:.3g} M commands, loss {row['loss']:.3g}{hover}")
+        judged = "".join(f", {label} {row[key]:.3g}{unit}" for key, label, unit in _JUDGED if key in row)
+        say(f"{_clock(row['seconds'])}: {row['commands'] / 1e6:.3g} M commands, loss {row['loss']:.3g}{judged}")
 
     rows = train(training, output, resume, advanced, reported, devices=devices)
     learning_figure(rows, output / "curve.png", f"{settings.algorithm}, {training.described.name}")

@@ -71,7 +71,9 @@ class NeuralController(eqx.Module):
         """Memory of a controller that takes over: it has commanded ``command`` on ``estimate`` for long."""
         return start(self.layout, estimate, command)
 
-    def command(self, memory: Memory, estimate: Estimate) -> tuple[Memory, Float[Array, "4"]]:
-        """New memory and command; called every ``layout.control_dt_s``."""
-        u = self.act(observation(self.layout, memory, estimate))
+    def command(
+        self, memory: Memory, estimate: Estimate, setpoint: Float[Array, "setpoints"] | None = None
+    ) -> tuple[Memory, Float[Array, "4"]]:
+        """New memory and command; called every ``layout.control_dt_s``. Policies with set-points need them."""
+        u = self.act(observation(self.layout, memory, estimate, setpoint))
         return remember(self.layout, memory, estimate, u), u

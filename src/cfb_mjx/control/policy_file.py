@@ -83,7 +83,8 @@ def load_policy(path: str | Path) -> PolicyFile:
             about = json.loads(archive["about"].tobytes())
             if about["format"] != FORMAT:
                 raise CfbError(f"{path}: is a policy of another format ({about['format']!r}, not {FORMAT!r}).")
-            layout, activation = Layout(**about["observation"]), about["activation"]
+            shown, activation = about["observation"], about["activation"]
+            layout = Layout(**shown | {"setpoint_scales": tuple(shown.get("setpoint_scales", ()))})
             weights = tuple(archive[f"weight_{i}"] for i in range(about["layers"]))
             biases = tuple(archive[f"bias_{i}"] for i in range(about["layers"]))
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):

@@ -1,19 +1,26 @@
 """Tasks to train on: what the controller sees, what it is rewarded for, how episodes begin and end."""
 
+from cfb_mjx.envs.episode import Episode, Noise, Task, observe, reset, step
+from cfb_mjx.envs.flip import FlipReward, FlipStarts, FlipTask, Setpoints
 from cfb_mjx.envs.observation import Estimate, Layout, Memory
 from cfb_mjx.envs.reward import PaperReward
 from cfb_mjx.envs.starts import Starts
-from cfb_mjx.envs.target import Episode, Noise, TargetTask, observe, reset, step
+from cfb_mjx.envs.target import TargetTask
 
 __all__ = [
     "Episode",
     "Estimate",
+    "FlipReward",
+    "FlipStarts",
+    "FlipTask",
     "Layout",
     "Memory",
     "Noise",
     "PaperReward",
+    "Setpoints",
     "Starts",
     "TargetTask",
+    "Task",
     "observe",
     "reset",
     "step",

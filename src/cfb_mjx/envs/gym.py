@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.envs.target import TargetTask, choose, observe, reset, step
+from cfb_mjx.envs.episode import choose, observe, reset, step
+from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 

@@ -1,9 +1,9 @@
-"""What a neural controller sees: the newest estimate, some past ones, its own past commands, and an optional integral.
+"""What a neural controller sees: the newest estimate, some past ones, its own past commands, and what it is asked for.
 
 One contract for training, simulation and the exported C: `Layout` says what goes in, in which order and scale.
-Order: newest frame, past frames (newest first), past commands (newest first), integral. A frame is position relative to
-the target, velocity (world axes), the nine entries of the rotation matrix body to world by rows (the same for q and
--q), and the body rate.
+Order: newest frame, past frames (newest first), past commands (newest first), integral, set-points. A frame is the
+position relative to the target, velocity (world or body axes), the nine entries of the rotation matrix body to world by
+rows (the same for q and -q), and the body rate.
 """
 
 from __future__ import annotations
@@ -13,9 +13,6 @@ from dataclasses import dataclass
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-
-FRAME = 18
-"""Numbers in a frame."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +36,23 @@ class Layout:
     """The integral of each axis grows no faster than if the drone were this far away."""
     integral_limit_ms: float = 0.6
     """Largest integral of each axis, m s."""
+    position: bool = True
+    """Show the position at all."""
+    body_velocity: bool = False
+    """Velocity in body axes, not the world's."""
+    setpoint_scales: tuple[float, ...] = ()
+    """One per set-point, which is divided by it."""
+
+    @property
+    def frame(self) -> int:
+        """Numbers in a frame."""
+        return 15 + 3 * self.position
 
     @property
     def size(self) -> int:
         """Length of the observation."""
-        return FRAME * (1 + self.past_estimates) + 4 * self.past_commands + 3 * self.integral
+        past = self.frame * (1 + self.past_estimates) + 4 * self.past_commands
+        return past + 3 * self.integral + len(self.setpoint_scales)
 
 
 class Estimate(eqx.Module):
@@ -62,7 +71,7 @@ class Estimate(eqx.Module):
 class Memory(eqx.Module):
     """What the controller keeps between two steps."""
 
-    frames: Float[Array, "estimates 18"]
+    frames: Float[Array, "estimates frame"]
     """Of every control step, shown or not, newest first."""
     commands: Float[Array, "commands 4"]
     """As the observation shows them: 2 u - 1."""
@@ -82,20 +91,18 @@ def rotation_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
     )
 
 
-def frame(layout: Layout, estimate: Estimate) -> Float[Array, "18"]:
+def frame(layout: Layout, estimate: Estimate) -> Float[Array, "frame"]:
     """The numbers of one estimate, scaled."""
-    p = estimate.position
-    # The square root has no slope at zero; the small number keeps the gradient finite there.
-    distance = jnp.sqrt(jnp.sum(p * p) + 1e-12)
-    p = p * jnp.minimum(1.0, layout.position_limit_m / distance)
-    return jnp.concatenate(
-        [
-            p / layout.position_scale_m,
-            estimate.velocity / layout.velocity_scale_mps,
-            rotation_matrix(estimate.quaternion).reshape(9),
-            estimate.body_rate / layout.rate_scale_radps,
-        ]
-    )
+    turn = rotation_matrix(estimate.quaternion)
+    velocity = estimate.velocity @ turn if layout.body_velocity else estimate.velocity
+    parts = [velocity / layout.velocity_scale_mps, turn.reshape(9), estimate.body_rate / layout.rate_scale_radps]
+    if layout.position:
+        p = estimate.position
+        # The square root has no slope at zero; the small number keeps the gradient finite there.
+        distance = jnp.sqrt(jnp.sum(p * p) + 1e-12)
+        p = p * jnp.minimum(1.0, layout.position_limit_m / distance)
+        parts.insert(0, p / layout.position_scale_m)
+    return jnp.concatenate(parts)
 
 
 def start(layout: Layout, estimate: Estimate, command: Float[Array, "4"] | float) -> Memory:
@@ -103,15 +110,26 @@ def start(layout: Layout, estimate: Estimate, command: Float[Array, "4"] | float
     shown = frame(layout, estimate)
     past = jnp.broadcast_to(2 * jnp.asarray(command, shown.dtype) - 1, (layout.past_commands, 4))
     kept = layout.past_estimates * layout.estimate_stride
-    return Memory(jnp.broadcast_to(shown, (kept, FRAME)), past, jnp.zeros(3, shown.dtype))
+    return Memory(jnp.broadcast_to(shown, (kept, layout.frame)), past, jnp.zeros(3, shown.dtype))
 
 
-def observation(layout: Layout, memory: Memory, estimate: Estimate) -> Float[Array, "size"]:
-    """What the network is given, (``layout.size``,)."""
+def observation(
+    layout: Layout, memory: Memory, estimate: Estimate, setpoint: Float[Array, "setpoints"] | None = None
+) -> Float[Array, "size"]:
+    """What the network is given, (``layout.size``,).
+
+    Args:
+        layout: what goes in.
+        memory: of the controller.
+        estimate: the newest.
+        setpoint: what is asked for, one number for each of ``layout.setpoint_scales``.
+    """
     shown = memory.frames[layout.estimate_stride - 1 :: layout.estimate_stride]
     parts = [frame(layout, estimate), shown.reshape(-1), memory.commands.reshape(-1)]
     if layout.integral:
         parts.append(memory.integral / layout.integral_limit_ms)
+    if layout.setpoint_scales:
+        parts.append(setpoint / jnp.asarray(layout.setpoint_scales, estimate.velocity.dtype))
     return jnp.concatenate(parts)
 
 

@@ -1,4 +1,4 @@
-"""The paper's reward for flying to a target, and when an episode fails."""
+"""The paper's reward for flying to a target, when an episode fails, and what rewards are made of."""
 
 from __future__ import annotations
 
@@ -48,8 +48,7 @@ class PaperReward:
 
     def failed(self, state: State) -> Bool[Array, ""]:
         """Whether speed or body rate have passed their limits."""
-        fast = jnp.sum(state.velocity**2) > self.speed_limit_mps**2
-        return fast | (jnp.sum(state.body_rate**2) > self.rate_limit_radps**2)
+        return too_fast(state, self.speed_limit_mps, self.rate_limit_radps)
 
     def __call__(
         self, state: State, target: Float[Array, "3"], command: Float[Array, "4"], parameters: Parameters
@@ -64,6 +63,12 @@ class PaperReward:
             + self.torque * triangle(length(commanded_torque(parameters, command)), self.torque_width_nm)
         )
         return reward - self.failure * self.failed(state)
+
+
+def too_fast(state: State, speed_limit_mps: float, rate_limit_radps: float) -> Bool[Array, ""]:
+    """Whether speed or body rate have passed their limits."""
+    fast = jnp.sum(state.velocity**2) > speed_limit_mps**2
+    return fast | (jnp.sum(state.body_rate**2) > rate_limit_radps**2)
 
 
 def commanded_torque(parameters: Parameters, command: Float[Array, "4"]) -> Float[Array, "2"]:

@@ -10,7 +10,7 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.envs.target import Episode, TargetTask, reset
+from cfb_mjx.envs.episode import Episode, Task, reset
 from cfb_mjx.model.quadrotor import Quadrotor
 
 
@@ -32,7 +32,7 @@ class Algorithm(Protocol):
         """The controller as it stands."""
 
 
-def in_progress(task: TargetTask, nominal: Quadrotor, drones: int, key: PRNGKeyArray) -> Episode:
+def in_progress(task: Task, nominal: Quadrotor, drones: int, key: PRNGKeyArray) -> Episode:
     """Drones at random moments of their episodes, so that they do not all end at once."""
     of_episodes, of_counts = jax.random.split(key)
     begin = eqx.filter_jit(jax.vmap(partial(reset, task, nominal)))

@@ -13,15 +13,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.envs.observation import rotation_matrix
-from cfb_mjx.envs.target import Episode, TargetTask, choose, observe, reset, step
+from cfb_mjx.envs.episode import Episode, Task, choose, observe, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
-from cfb_mjx.model.state import State
 from cfb_mjx.train.algorithm import in_progress, strong
-from cfb_mjx.train.config import AnalyticSettings, SmoothCost
+from cfb_mjx.train.config import AnalyticSettings
 
 
 class AnalyticState(eqx.Module):
@@ -35,32 +33,10 @@ class AnalyticState(eqx.Module):
     count: Int[Array, ""]
 
 
-def smooth_cost(
-    cost: SmoothCost,
-    state: State,
-    target: Float[Array, "3"],
-    command: Float[Array, "4"],
-    last: Float[Array, "4"],
-) -> Float[Array, ""]:
-    """Of one control step that ended in ``state`` after ``command``, with ``last`` the command before."""
-    attitude = rotation_matrix(state.quaternion)
-    return (
-        cost.position * _rounded(state.position - target, cost.position_width_m)
-        + cost.velocity * _rounded(state.velocity, cost.velocity_width_mps)
-        + cost.heading * (1 - attitude[0, 0])
-        + cost.body_rate * jnp.sum(state.body_rate**2)
-        + cost.command_change * jnp.sum((command - last) ** 2)
-    )
-
-
-def _rounded(x: Float[Array, "3"], width: float) -> Float[Array, ""]:
-    return jnp.sqrt(jnp.sum(x**2) + width**2) - width
-
-
 class Analytic:
     """The algorithm; see `cfb_mjx.train.algorithm.Algorithm`."""
 
-    def __init__(self, settings: AnalyticSettings, task: TargetTask, nominal: Quadrotor):
+    def __init__(self, settings: AnalyticSettings, task: Task, nominal: Quadrotor):
         self.settings, self.task, self.nominal = settings, task, nominal
         self.updates = settings.updates
         self.horizon = max(1, round(settings.horizon_s / task.layout.control_dt_s))
@@ -107,7 +83,7 @@ class Analytic:
             after, outcome = step(self.task, episode, command, prepared)
             alive = alive & ~outcome.failed
             last = episode.memory.commands[0] if self.task.layout.past_commands else 2 * command - 1
-            paid = smooth_cost(cost, after.state, episode.target, command, (1 + last) / 2)
+            paid = cost(after.state, episode.target, episode.setpoint, command, (1 + last) / 2)
             # A failed drone stays where it was: what comes after must neither count nor overflow.
             after = choose(alive, after, jax.lax.stop_gradient(episode))
             return (after, alive), jnp.where(alive, paid, cost.failure)

@@ -10,9 +10,11 @@ from typing import Any, Literal
 import yaml
 
 from cfb_mjx.documents import load_named
-from cfb_mjx.envs import Layout, Noise, PaperReward, Starts, TargetTask
+from cfb_mjx.envs import FlipReward, FlipStarts, FlipTask, Layout, Noise, PaperReward, Setpoints, Starts, TargetTask
+from cfb_mjx.envs.flip import FLIP_LAYOUT
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters.randomisation import load_randomisation
+from cfb_mjx.train.cost import FlipCost, SmoothCost
 from cfb_mjx.train.strict import build, plain
 
 FORMAT = "cfb_mjx training 1"
@@ -40,26 +42,6 @@ class RandomisationSettings:
 
 
 @dataclass(frozen=True)
-class SmoothCost:
-    """What back-propagation minimises: the paper's wishes with a slope that does not vanish near the target.
-
-    Per control step, with s(x, w) = sqrt(|x|^2 + w^2) - w: ``position`` s(p, width) + ``velocity`` s(v, width) +
-    ``heading`` (1 - R_xx) + ``body_rate`` |omega|^2 + ``command_change`` |u_k - u_(k-1)|^2; a failed drone costs
-    ``failure`` per step. Summed over a flight s(v, w) is nearly the length of the way: it leaves a fast approach alone
-    and stops swinging about the target.
-    """
-
-    position: float = 1.0
-    position_width_m: float = 0.05
-    velocity: float = 0.1
-    velocity_width_mps: float = 0.1
-    heading: float = 0.2
-    body_rate: float = 0.002
-    command_change: float = 20.0
-    failure: float = 5.0
-
-
-@dataclass(frozen=True)
 class AnalyticSettings:
     """Back-propagation through the simulator."""
 
@@ -73,8 +55,15 @@ class AnalyticSettings:
 
 
 @dataclass(frozen=True)
+class FlipAnalyticSettings(AnalyticSettings):
+    """The same for flips."""
+
+    cost: FlipCost = field(default_factory=FlipCost)
+
+
+@dataclass(frozen=True)
 class PpoSettings:
-    """Proximal policy optimisation (Schulman et al. 2017) with Brax's loss."""
+    """Proximal policy optimisation (Schulman et al. 2017)."""
 
     drones: int = 512
     unroll: int = 128
@@ -92,11 +81,13 @@ class PpoSettings:
     discount: float = 0.995
     gae_lambda: float = 0.99
     clipping: float = 0.2
+    advantage_limit: float = 3.0
+    """Advantages larger than so many times their mean magnitude count as that: the few drones that fail, by a lot,
+    would otherwise drown what all the others have to learn about their last decimetre."""
     entropy_cost: float = 1e-3
     reward_scaling: float = 0.02
     least_reward: float = -30.0
-    """Lower rewards count as this to the learner. Each advantage is divided by the spread of all: beside the paper's
-    failure of -300 nothing else would count until hardly any drone fails."""
+    """Lower rewards, the paper's failure of -300, count as this to the learner."""
     gradient_clip: float = 1.0
     first_std: float = 0.2
     """Of the Gaussian before the tanh, at the start."""
@@ -134,36 +125,61 @@ class TrainingConfig:
 
     def build_task(self, longest_delay_s: float = 0.016) -> TargetTask:
         """The task that is trained on."""
-        spread = load_randomisation(self.randomisation.ranges) if self.randomisation.magnitude else None
-        return TargetTask(
-            self.observation,
-            self.reward,
-            self.starts,
-            self.noise,
-            spread,
-            self.randomisation.magnitude,
-            self.randomisation.graded,
-            self.episode_s,
-            longest_delay_s,
-        )
+        return TargetTask(reward=self.reward, starts=self.starts, **self._common(longest_delay_s))
+
+    def _common(self, longest_delay_s: float) -> dict[str, Any]:
+        chosen = self.randomisation
+        return {
+            "layout": self.observation,
+            "noise": self.noise,
+            "randomisation": load_randomisation(chosen.ranges) if chosen.magnitude else None,
+            "magnitude": chosen.magnitude,
+            "graded": chosen.graded,
+            "episode_s": self.episode_s,
+            "longest_delay_s": longest_delay_s,
+        }
 
     def to_mapping(self) -> dict[str, Any]:
         """What its YAML file would hold."""
         return plain(self)
 
 
+@dataclass(frozen=True)
+class FlipTrainingConfig(TrainingConfig):
+    """A training to flip. The defaults are those of ``configs/flip.yaml``."""
+
+    task: Literal["flip"] = "flip"
+    episode_s: float = FlipTask.episode_s
+    observation: Layout = FLIP_LAYOUT
+    reward: FlipReward = field(default_factory=FlipReward)
+    starts: FlipStarts = field(default_factory=FlipStarts)
+    setpoints: Setpoints = field(default_factory=Setpoints)
+    analytic: FlipAnalyticSettings = field(default_factory=FlipAnalyticSettings)
+
+    def build_task(self, longest_delay_s: float = 0.016) -> FlipTask:
+        """The task that is trained on."""
+        own = {"reward": self.reward, "starts": self.starts, "setpoints": self.setpoints}
+        return FlipTask(**own, **self._common(longest_delay_s))
+
+
+_KINDS = {"target": TrainingConfig, "flip": FlipTrainingConfig}
+
+
 def load_config(name_or_path: str | Path = "target", changes: tuple[str, ...] = ()) -> TrainingConfig:
-    """Read a shipped training (``target``) or a YAML file, with ``KEY=VALUE`` changes (dotted keys, YAML values).
+    """Read a shipped training (``target``, ``flip``) or a YAML file, with ``KEY=VALUE`` changes (dotted, YAML values).
 
     Raises:
         CfbError: no such file, an unknown key, a value of the wrong type or out of range, named.
     """
     path, document = load_named(name_or_path, "training", FORMAT)
+    task = document.get("task", "target")
+    if task not in _KINDS:
+        raise CfbError(f"{path}: task must be one of {', '.join(_KINDS)}, found {task!r}.")
     # Checked before the changes go in, so that a fault of the file is not blamed on the command line.
-    build(TrainingConfig, document, str(path))
+    build(_KINDS[task], document, str(path))
     for change in changes:
         _change(document, change)
-    config = build(TrainingConfig, document, str(path) if not changes else f"{path} with {', '.join(changes)}")
+    config = build(_KINDS[task], document, str(path) if not changes else f"{path} with {', '.join(changes)}")
     _require_sense(config, str(path))
     return config
 
@@ -217,33 +233,52 @@ _POSITIVE = (
     "observation.velocity_scale_mps",
     "observation.rate_scale_radps",
     "observation.integral_limit_ms",
-    "reward.position_width_m",
     "reward.velocity_width_mps",
-    "reward.attitude_width",
     "reward.body_rate_width_radps",
-    "reward.torque_width_nm",
     "reward.speed_limit_mps",
     "reward.rate_limit_radps",
     "analytic.horizon_s",
     "analytic.learning_rate",
     "analytic.gradient_clip",
-    "analytic.cost.position_width_m",
     "analytic.cost.velocity_width_mps",
     "ppo.learning_rate",
     "ppo.value_learning_rate",
     "ppo.gradient_clip",
+    "ppo.advantage_limit",
     "ppo.first_std",
 )
+
+
+_POSITIVE_OF = {
+    "target": (
+        "reward.position_width_m",
+        "reward.attitude_width",
+        "reward.torque_width_nm",
+        "analytic.cost.position_width_m",
+    ),
+    "flip": ("reward.axis_width", "analytic.cost.axis_width", "analytic.cost.body_rate_width_radps"),
+}
+_PAIRS = ("setpoints.speed_mps", "setpoints.rate_radps", "starts.rotor_speed")
 
 
 def _require_sense(config: TrainingConfig, where: str) -> None:
     for key, least in _AT_LEAST.items():
         if _at(config, key) < least:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be at least {least}.")
-    for key in _POSITIVE:
+    for key in _POSITIVE + _POSITIVE_OF[config.task]:
         if not _at(config, key) > 0:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be positive.")
-    for key in ("ppo.last_rate", "starts.near", "randomisation.graded", "ppo.discount", "ppo.gae_lambda"):
+    if config.task == "flip":
+        for key in _PAIRS:
+            pair = _at(config, key)
+            if len(pair) != 2 or pair[0] > pair[1]:
+                raise CfbError(f"{where}: {key} must be two numbers, the smaller first, found {list(pair)}.")
+        if len(config.reward.axis_direction) != 3:
+            raise CfbError(f"{where}: reward.axis_direction must be three numbers.")
+    if len(config.observation.setpoint_scales) != (2 if config.task == "flip" else 0):
+        raise CfbError(f"{where}: observation.setpoint_scales needs one number for each set-point of {config.task}.")
+    near = "starts.entering" if config.task == "flip" else "starts.near"
+    for key in ("ppo.last_rate", near, "randomisation.graded", "ppo.discount", "ppo.gae_lambda"):
         if not 0 <= _at(config, key) <= 1:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must lie between 0 and 1.")
     for key in ("network.hidden", "ppo.value_hidden"):

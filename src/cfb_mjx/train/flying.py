@@ -12,8 +12,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.control.pilot import Pilot
+from cfb_mjx.envs.episode import reset, settled_command, step
 from cfb_mjx.envs.observation import Layout
-from cfb_mjx.envs.target import TargetTask, reset, settled_command, step
+from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
 

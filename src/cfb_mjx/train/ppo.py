@@ -1,7 +1,8 @@
-"""Proximal policy optimisation on Brax's loss, networks' interface and action distribution.
+"""Proximal policy optimisation (Schulman et al. 2017) on Brax's action distribution and advantages.
 
 Brax's own ``train`` hands out neither its optimizer nor its environments, so a run of it cannot go on where it was
-interrupted; this one is a page long, and its whole state is one pytree. Episodes are drawn anew at every reset, drone
+interrupted; this one is a page long, and its whole state is one pytree. Brax's loss divides advantages by a spread that
+a few failures decide; here they are limited first. Episodes are drawn anew at every reset, drone
 included. The value network sees what the drone itself cannot: the true state, rotor speeds and the drawn drone.
 """
 
@@ -18,9 +19,8 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import Network, NeuralController
+from cfb_mjx.envs.episode import Episode, Task, choose, observe, reset, step
 from cfb_mjx.envs.observation import Estimate, frame
-from cfb_mjx.envs.reward import length
-from cfb_mjx.envs.target import Episode, TargetTask, choose, observe, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters.parameters import SPECIFICATIONS
 from cfb_mjx.train.algorithm import in_progress, strong
@@ -51,7 +51,7 @@ class PpoState(eqx.Module):
 class Ppo:
     """The algorithm; see `cfb_mjx.train.algorithm.Algorithm`."""
 
-    def __init__(self, settings: PpoSettings, task: TargetTask, nominal: Quadrotor):
+    def __init__(self, settings: PpoSettings, task: Task, nominal: Quadrotor):
         self.settings, self.task, self.nominal = settings, task, nominal
         self.updates = settings.updates
         self.steps_per_update = settings.drones * settings.unroll
@@ -67,25 +67,9 @@ class Ppo:
         self.optimizer = optax.multi_transform(
             {"actor": adam(settings.learning_rate), "critic": adam(settings.value_learning_rate)}, ("actor", "critic")
         )
-        # The value of holding the target for ever: what the network has to learn is how much worse it is elsewhere.
-        ideal = settings.reward_scaling * task.reward.largest / max(1e-3, 1 - settings.discount)
+        # The value of the best step for ever: what the network has to learn is how much worse it is elsewhere.
+        self.ideal = settings.reward_scaling * task.largest_reward / max(1e-3, 1 - settings.discount)
         self._reset = jax.vmap(partial(reset, task, nominal))
-        feed_forward = self.brax.networks.networks.FeedForwardNetwork
-        self._loss = partial(
-            self.brax.losses.compute_ppo_loss,
-            ppo_network=self.brax.networks.PPONetworks(
-                policy_network=feed_forward(init=None, apply=lambda _, actor, shown: _logits(actor, shown["seen"])),
-                value_network=feed_forward(
-                    init=None, apply=lambda _, critic, shown: ideal + critic(shown["hidden"]).squeeze(-1)
-                ),
-                parametric_action_distribution=self.distribution,
-            ),
-            entropy_cost=settings.entropy_cost,
-            discounting=settings.discount,
-            reward_scaling=settings.reward_scaling,
-            gae_lambda=settings.gae_lambda,
-            clipping_epsilon=settings.clipping,
-        )
         self.update = eqx.filter_jit(self._update)
 
     def begin(self, key: PRNGKeyArray, controller: NeuralController) -> PpoState:
@@ -109,8 +93,9 @@ class Ppo:
     def _update(self, state: PpoState) -> tuple[PpoState, dict]:
         of_flight, of_learning, key = jax.random.split(state.key, 3)
         episodes, data, outcome = self._collect(state.actor, state.episodes, of_flight)
+        last = jax.vmap(self._show)(episodes)["hidden"]
         learnt, losses = jax.lax.scan(
-            partial(self._epoch, data),
+            partial(self._epoch, data, last),
             (state.actor, state.critic, state.optimizer),
             jax.random.split(of_learning, self.settings.epochs),
         )
@@ -118,13 +103,12 @@ class Ppo:
             "reward": jnp.mean(outcome.reward),
             "failing": jnp.mean(outcome.failed),
             "std": jnp.mean(jax.nn.softplus(learnt[0].raw_std)),
-            "value_loss": jnp.mean(losses["v_loss"]),
-            "loss": jnp.mean(losses["total_loss"]),
+            **jax.tree.map(jnp.mean, losses),
         }
         return PpoState(*learnt, episodes, key, state.count + 1), metrics
 
     def _collect(self, actor: Actor, episodes: Episode, key: PRNGKeyArray):
-        """Fly ``unroll`` commands with every drone; data has axes (drones, unroll)."""
+        """Fly ``unroll`` commands with every drone; data has axes (unroll, drones)."""
 
         def some(episodes, key):
             of_reset, of_flight = jax.random.split(key)
@@ -138,21 +122,13 @@ class Ppo:
             action = self.distribution.postprocess(raw)
             after, outcome = jax.vmap(partial(step, self.task))(episodes, 0.5 * (1 + action))
             over = outcome.failed | outcome.timed_out
-            kept = self.brax.types.Transition(
-                observation=shown,
-                action=action,
-                reward=jnp.maximum(outcome.reward, self.settings.least_reward),
-                discount=1.0 - over,
-                next_observation=None,
-                extras={
-                    "policy_extras": {
-                        "log_prob": self.distribution.log_prob(logits, raw),
-                        "raw_action": raw,
-                        "distribution_params": logits,
-                    },
-                    "state_extras": {"truncation": 1.0 * (outcome.timed_out & ~outcome.failed)},
-                },
-            )
+            kept = shown | {
+                "raw": raw,
+                "log_prob": self.distribution.log_prob(logits, raw),
+                "reward": self.settings.reward_scaling * jnp.maximum(outcome.reward, self.settings.least_reward),
+                "failed": 1.0 * outcome.failed,
+                "cut": 1.0 * (outcome.timed_out & ~outcome.failed),
+            }
             return choose(over, fresh, after), (kept, outcome)
 
         # Drawing drones and starts costs as much as flying: once per few commands is enough, as no drone fails twice
@@ -160,44 +136,66 @@ class Ppo:
         each = math.gcd(self.settings.unroll, 8)
         episodes, flown = jax.lax.scan(some, episodes, jax.random.split(key, self.settings.unroll // each))
         data, outcome = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), flown)
-        data = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data)
-        # Brax's loss reads the last of these only.
-        last = jax.tree.map(lambda x: x[:, None], jax.vmap(self._show)(episodes))
-        return episodes, data._replace(next_observation=last), outcome
+        return episodes, data, outcome
 
-    def _epoch(self, data: Any, learnt: tuple, key: PRNGKeyArray) -> tuple[tuple, dict]:
+    def _epoch(self, data: dict[str, Array], last: Array, learnt: tuple, key: PRNGKeyArray) -> tuple[tuple, dict]:
         of_order, of_entropy = jax.random.split(key)
         order = jax.random.permutation(of_order, self.settings.drones)
         count = self.settings.minibatches
-        batches = jax.tree.map(lambda x: x[order].reshape(count, -1, *x.shape[1:]), data)
+        # Whole flights of some of the drones make a batch.
+        batches = jax.tree.map(lambda x: jnp.moveaxis(x[:, order].reshape(len(x), count, -1, *x.shape[2:]), 1, 0), data)
+        batches = batches, last[order].reshape(count, -1, last.shape[-1]), jax.random.split(of_entropy, count)
 
         def one(learnt, batch):
             actor, critic, optimizer = learnt
-            data, key = batch
-
-            def loss(both):
-                params = self.brax.losses.PPONetworkParams(policy=both[0], value=both[1])
-                return self._loss(params, None, data, key)
-
-            gradient, metrics = jax.grad(loss, has_aux=True)((actor, critic))
+            gradient, metrics = jax.grad(self._loss, has_aux=True)((actor, critic), *batch)
             changes, optimizer = self.optimizer.update(gradient, optimizer)
             actor, critic = eqx.apply_updates((actor, critic), changes)
             return (actor, critic, optimizer), metrics
 
-        return jax.lax.scan(one, learnt, (batches, jax.random.split(of_entropy, count)))
+        return jax.lax.scan(one, learnt, batches)
+
+    def _loss(self, both: tuple[Actor, Network], data: dict, last: Array, key: PRNGKeyArray) -> tuple[Array, dict]:
+        logits = _logits(both[0], data["seen"])
+        values = self._value(both[1], data["hidden"])
+        # Anew for every batch: the value network learns from the very same flights.
+        returns, advantage = self.brax.losses.compute_gae(
+            truncation=data["cut"],
+            termination=data["failed"],
+            rewards=data["reward"],
+            values=values,
+            bootstrap_value=self._value(both[1], last),
+            lambda_=self.settings.gae_lambda,
+            discount=self.settings.discount,
+        )
+        most = self.settings.advantage_limit * jnp.mean(jnp.abs(advantage))
+        advantage = jnp.clip(advantage, -most, most)
+        advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+        ratio = jnp.exp(self.distribution.log_prob(logits, data["raw"]) - data["log_prob"])
+        near = self.settings.clipping
+        gain = jnp.mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - near, 1 + near) * advantage))
+        value_loss = jnp.mean((returns - values) ** 2) / 4
+        entropy = jnp.mean(self.distribution.entropy(logits, key))
+        loss = value_loss - gain - self.settings.entropy_cost * entropy
+        return loss, {"value_loss": value_loss, "loss": loss}
+
+    def _value(self, critic: Network, shown: Array) -> Array:
+        return self.ideal + critic(shown)[..., 0]
 
 
-def hidden(task: TargetTask, nominal: Quadrotor, episode: Episode) -> Float[Array, "n"]:
-    """What the value network is shown: true frame, rotor speeds, integral, how the drone differs, and three lengths.
+def hidden(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array, "n"]:
+    """What the value network is shown: true frame, rotor speeds, integral, how the drone differs, set-points, errors.
 
-    The reward falls with lengths, whose tips at zero a small network is slow to form by itself.
+    The reward falls with lengths of errors, whose tips at zero a small network is slow to form by itself.
     """
     state, parameters = episode.state, episode.model.parameters
     position = state.position - episode.target
     true = frame(task.layout, Estimate(position, state.velocity, state.quaternion, state.body_rate))
-    lengths = jnp.stack([length(position), length(state.velocity), length(state.body_rate) / 10])
-    parts = [true, lengths, jnp.sqrt(lengths), state.rotor_speed / parameters.reference_rotor_speed]
+    errors = task.errors(state, episode.target, episode.setpoint)
+    parts = [true, errors, jnp.sqrt(errors), state.rotor_speed / parameters.reference_rotor_speed]
     parts.append(episode.memory.integral / task.layout.integral_limit_ms)
+    if task.layout.setpoint_scales:
+        parts.append(episode.setpoint / jnp.asarray(task.layout.setpoint_scales))
     if task.randomisation is not None:
         for name, spread in task.randomisation.ranges:
             drawn, mean = getattr(parameters, name), getattr(nominal.parameters, name)

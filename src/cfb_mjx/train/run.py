@@ -18,7 +18,7 @@ import yaml
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
-from cfb_mjx.envs.target import longest_delay_s
+from cfb_mjx.envs.episode import longest_delay_s
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, write_text
 from cfb_mjx.model.quadrotor import Quadrotor
@@ -27,6 +27,7 @@ from cfb_mjx.parameters import ModelFile, load_model_file
 from cfb_mjx.train.algorithm import Algorithm
 from cfb_mjx.train.checkpoint import load_state, read_about, save_checkpoint
 from cfb_mjx.train.config import TrainingConfig
+from cfb_mjx.train.flips import turning
 from cfb_mjx.train.flying import hover, nominal_task
 
 CHECKPOINT, POLICY, CURVE, CONFIG = "checkpoint.npz", "policy.npz", "curve.csv", "config.yaml"
@@ -235,6 +236,9 @@ def _differences(before: Any, now: Any, path: str) -> list[str]:
 
 def _judged(controller: NeuralController, training: Training, task, nominal: Quadrotor) -> Row:
     keys = jax.random.split(jax.random.PRNGKey(training.config.seed + 1), _JUDGED_ON)
+    if training.config.task == "flip":
+        measured = turning(controller, nominal_task(task), nominal, keys)
+        return {name: float(jnp.mean(value)) for name, value in measured._asdict().items()}
     measured, _ = hover(controller, nominal_task(task), nominal, keys)
     return {
         "hover_mm": 1e3 * float(jnp.mean(measured.mean_distance_m)),

@@ -9,12 +9,14 @@ from cfb_mjx.view.style import COLOURS, check_path, context, new_figure, save
 _PANELS = (
     ("hover_mm", "mean hover error, mm", True),
     ("command_std", "command std", False),
+    ("rate_error_radps", "rate error, rad/s", True),
+    ("axis_error", "axis error", False),
     ("loss", "loss", False),
 )
 
 
 def learning_figure(rows: list[dict[str, float]], path: str | Path, title: str = "") -> None:
-    """Draw hover error, command noise and loss over commands flown, seconds on top.
+    """Draw what flights were judged by, and the loss, over commands flown, seconds on top.
 
     Args:
         rows: of `cfb_mjx.train.run.train`.

@@ -1,0 +1,275 @@
+"""Episodes of any task: on drones drawn anew, seen through late, offset and noisy estimates.
+
+`reset` begins an episode, `observe` gives what the controller sees, `step` flies one command. All are pure functions
+of one drone: ``vmap`` them over many. Each episode carries its own drone, so randomisation needs nothing else. What is
+wanted of the drone is said by a `Task`: `cfb_mjx.envs.target` and `cfb_mjx.envs.flip`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from cfb_mjx.envs import observation as seen
+from cfb_mjx.envs.observation import Estimate, Layout, Memory
+from cfb_mjx.errors import CfbError
+from cfb_mjx.model.delay import DelayLine
+from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
+from cfb_mjx.model.rotors import steady_command
+from cfb_mjx.model.state import AnyArray, Components, State, stack, unstack
+from cfb_mjx.model.vector import Vec, exponential, multiply
+from cfb_mjx.parameters import Parameters, Randomisation, sample_parameters
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations. Of the state: added in every simulation step (paper). Of the estimate: in every reading."""
+
+    state_velocity_mps: float = 0.001
+    state_rate_radps: float = 0.001
+    position_m: float = 0.001
+    velocity_mps: float = 0.005
+    attitude_rad: float = 0.001
+    rate_radps: float = 0.01
+
+
+QUIET = Noise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""No noise at all."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """Everything about a task but the drone. Hashable, so it can be closed over under ``jit``.
+
+    A task of one's own says what its flights ask for, how they begin, what a state is worth and when it is lost.
+    """
+
+    layout: Layout = field(default_factory=Layout)
+    noise: Noise = field(default_factory=Noise)
+    randomisation: Randomisation | None = None
+    """What varies from episode to episode; None: nothing does."""
+    magnitude: float = 1.0
+    """Factor on all ranges of ``randomisation``."""
+    graded: float = 0.0
+    """Share of the episodes that draw their own factor between 0 and ``magnitude``."""
+    episode_s: float = 6.0
+    longest_delay_s: float = 0.016
+    """The longest observation delay any drone of the task may have; longer ones count as this."""
+
+    @property
+    def episode_steps(self) -> int:
+        """Commands in a full episode."""
+        return round(self.episode_s / self.layout.control_dt_s)
+
+    def hold(self, model: Quadrotor) -> int:
+        """Simulation steps per command.
+
+        Raises:
+            CfbError: the control step is no multiple of the simulation step.
+        """
+        steps = self.layout.control_dt_s / model.dt
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
+            raise CfbError(
+                f"control_dt_s = {self.layout.control_dt_s} is no multiple of the simulation step of {model.dt} s."
+            )
+        return round(steps)
+
+    @property
+    def largest_reward(self) -> float:
+        """What the best step is worth."""
+        raise NotImplementedError
+
+    def draw_setpoint(self, key: PRNGKeyArray) -> Float[Array, "setpoints"]:
+        """What an episode asks for beside its target; ``layout.setpoint_scales`` has one scale for each number."""
+        return jnp.zeros(0)
+
+    def draw_start(
+        self, model: Quadrotor, target: Float[Array, "3"], setpoint: Float[Array, "setpoints"], key: PRNGKeyArray
+    ) -> State:
+        """A random initial state."""
+        raise NotImplementedError
+
+    def judge(
+        self,
+        state: State,
+        target: Float[Array, "3"],
+        setpoint: Float[Array, "setpoints"],
+        command: Float[Array, "4"],
+        parameters: Parameters,
+    ) -> Float[Array, ""]:
+        """Reward of ``state`` after ``command`` [0 to 1]; what is judged is the true state, not its estimate."""
+        raise NotImplementedError
+
+    def failed(self, state: State) -> Bool[Array, ""]:
+        """Whether ``state`` ends the episode."""
+        raise NotImplementedError
+
+    def errors(
+        self, state: State, target: Float[Array, "3"], setpoint: Float[Array, "setpoints"]
+    ) -> Float[Array, "errors"]:
+        """The distances that the reward falls with, each scaled to about one: what a value network is told."""
+        raise NotImplementedError
+
+
+def longest_delay_s(model: Quadrotor) -> float:
+    """The ``Task.longest_delay_s`` that holds ``model``: whole simulation steps, and no less than the default."""
+    delay = float(jnp.max(model.parameters.observation_delay))
+    return max(Task.longest_delay_s, model.dt * math.ceil(delay / model.dt - 1e-9))
+
+
+class Pose(eqx.Module):
+    """What of the state an estimator could know."""
+
+    position: Array
+    velocity: Array
+    quaternion: Array
+    body_rate: Array
+
+
+class Episode(eqx.Module):
+    """One flight in progress."""
+
+    model: Quadrotor
+    """The drone of this episode."""
+    state: State
+    target: Float[Array, "3"]
+    setpoint: Float[Array, "setpoints"]
+    """What is asked for beside the target; empty for tasks that ask for nothing else."""
+    past: DelayLine
+    """Of `Pose`: estimates arrive late."""
+    memory: Memory
+    estimate: Estimate
+    """What the controller sees now."""
+    count: Int[Array, ""]
+    key: PRNGKeyArray
+
+
+class Outcome(NamedTuple):
+    """What a step led to."""
+
+    reward: Float[Array, ""]
+    failed: Bool[Array, ""]
+    """The episode is over: too fast."""
+    timed_out: Bool[Array, ""]
+    """The episode is over: its time is up."""
+
+
+def reset(
+    task: Task,
+    nominal: Quadrotor,
+    key: PRNGKeyArray,
+    state: State | None = None,
+    target: Float[AnyArray, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
+    magnitude: Float[Array, ""] | float | None = None,
+    setpoint: Float[AnyArray, "setpoints"] | tuple[float, ...] | None = None,
+) -> Episode:
+    """Begin an episode.
+
+    Args:
+        task: the task.
+        nominal: the drone about which this episode's is drawn.
+        key: decides the drone, the start and all noise.
+        state: where it begins; drawn by default.
+        target: position that estimates are relative to, world, m.
+        magnitude: of the randomisation, in place of the task's; may be traced.
+        setpoint: what is asked for beside the target; drawn by default.
+    """
+    of_drone, of_start, of_noise, of_first = jax.random.split(key, 4)
+    model = nominal
+    if task.randomisation is not None:
+        factor = task.magnitude if magnitude is None else magnitude
+        if task.graded:
+            which, grade = jax.random.uniform(jax.random.fold_in(of_drone, 0), (2,))
+            factor = factor * jnp.where(which < task.graded, grade, 1.0)
+        drawn = sample_parameters(of_drone, nominal.parameters, task.randomisation, factor)
+        model = eqx.tree_at(lambda m: m.parameters, nominal, drawn)
+    target = jnp.asarray(target, model.parameters.mass.dtype)
+    drawn = task.draw_setpoint(jax.random.fold_in(of_start, 1)) if setpoint is None else setpoint
+    setpoint = jnp.asarray(drawn, target.dtype)
+    state = task.draw_start(model, target, setpoint, of_start) if state is None else state
+    state = begin(model, state)
+    past = DelayLine.filled(_pose(state), model.dt, task.longest_delay_s)
+    estimate = _estimate(task, model, past, target, of_first)
+    memory = seen.start(task.layout, estimate, settled_command(model, state))
+    return Episode(model, state, target, setpoint, past, memory, estimate, jnp.asarray(0), of_noise)
+
+
+def settled_command(model: Quadrotor, state: State) -> Float[Array, "4"]:
+    """The command [0 to 1] that keeps the rotors as they turn: what a controller that takes over finds."""
+    return jnp.clip(steady_command(model.parameters, state.rotor_speed), 0.0, 1.0)
+
+
+def choose(condition: Array, yes: Any, no: Any) -> Any:
+    """``jnp.where`` on every array of two like pytrees; the condition's axes come first."""
+    return jax.tree.map(
+        lambda a, b: jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim)), a, b), yes, no
+    )
+
+
+def observe(task: Task, episode: Episode) -> Float[Array, "size"]:
+    """What the controller's network is given now."""
+    return seen.observation(task.layout, episode.memory, episode.estimate, episode.setpoint)
+
+
+def step(
+    task: Task, episode: Episode, command: Float[Array, "4"], prepared: Prepared | None = None
+) -> tuple[Episode, Outcome]:
+    """Fly ``command`` [0 to 1] for one control step.
+
+    Args:
+        task: the task.
+        episode: the flight so far.
+        command: of M1..M4; clipped to [0, 1].
+        prepared: `prepare(episode.model)`, where the caller has it already.
+    """
+    model = episode.model
+    prepared = prepare(model) if prepared is None else prepared
+    command = jnp.clip(command, 0.0, 1.0)
+    of_state, of_estimate = jax.random.split(jax.random.fold_in(episode.key, episode.count))
+    hold, noise = task.hold(model), task.noise
+    scale = jnp.array([noise.state_velocity_mps] * 3 + [noise.state_rate_radps] * 3, command.dtype)
+    kicks = scale * jax.random.normal(of_state, (hold, 6), command.dtype)
+    row, center = Vec.unstack(command), prepared.parameters.center_of_gravity
+
+    def fly(at: Components, kick: Vec) -> tuple[Components, Components]:
+        at = advance(prepared, at, row)
+        velocity, body_rate = at.velocity + Vec(*kick[:3]), at.body_rate + Vec(*kick[3:])
+        at = Components(at.position, velocity, at.quaternion, body_rate, at.rotor_speed, at.memory)
+        return at, at
+
+    # A loop, however short, and arrays put together only after it: else XLA fuses the dynamics into every such array
+    # and, on CPU without its multi-output fusion, computes them once for each number in it, twenty times slower.
+    moved, passed = jax.lax.scan(fly, unstack(episode.state, center), Vec.unstack(kicks))
+    state = stack(moved, center)
+    past = episode.past.push_all(_pose(stack(passed, center)))
+    memory = seen.remember(task.layout, episode.memory, episode.estimate, command)
+    estimate = _estimate(task, model, past, episode.target, of_estimate)
+    count = episode.count + 1
+    after = Episode(model, state, episode.target, episode.setpoint, past, memory, estimate, count, episode.key)
+    reward = task.judge(state, episode.target, episode.setpoint, command, model.parameters)
+    return after, Outcome(reward, task.failed(state), count >= task.episode_steps)
+
+
+def _pose(state: State) -> Pose:
+    return Pose(state.position, state.velocity, state.quaternion, state.body_rate)
+
+
+def _estimate(task: Task, model: Quadrotor, past: DelayLine, target: Array, key: PRNGKeyArray) -> Estimate:
+    parameters, noise = model.parameters, task.noise
+    late = past.read(parameters.observation_delay)
+    draws = jax.random.normal(key, (12,), late.position.dtype)
+    # Between two samples the blend of unit quaternions is a little short.
+    q = late.quaternion / jnp.sqrt(jnp.sum(late.quaternion**2))
+    turned = Vec.unstack(parameters.attitude_offset + noise.attitude_rad * draws[6:9])
+    return Estimate(
+        late.position - target + noise.position_m * draws[:3],
+        late.velocity + noise.velocity_mps * draws[3:6],
+        multiply(Vec.unstack(q), exponential(turned * 0.5)).stack(),
+        late.body_rate + noise.rate_radps * draws[9:],
+    )

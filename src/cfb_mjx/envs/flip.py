@@ -1,0 +1,191 @@
+"""The task of turning about the body's x axis at a rate that is asked for (paper section V, its flips).
+
+Set-points are [v_target, rate_target]: speed along the body's z axis, m/s, and rate about its x axis, rad/s. Position
+is neither rewarded nor shown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from cfb_mjx.envs.episode import Task
+from cfb_mjx.envs.observation import Layout, rotation_matrix
+from cfb_mjx.envs.reward import length, too_fast, triangle
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.rotors import hover_rotor_speed
+from cfb_mjx.model.state import State
+from cfb_mjx.parameters import Parameters
+
+SETPOINTS = ("speed_mps", "rate_radps")
+"""What they are, in order."""
+FLIP_LAYOUT = Layout(position=False, body_velocity=True, velocity_scale_mps=3.0, setpoint_scales=(3.0, 10.0))
+"""What a flip policy sees."""
+
+
+@dataclass(frozen=True)
+class FlipReward:
+    """Weights, widths and limits of the paper, per control step:
+
+        0.6 Lambda(|R^T v - [0, 0, v_target]|, 20 m/s) + 0.15 Lambda(|R e_x - axis|, 3)
+        + Lambda(|omega - [rate_target, 0, 0]|, e_omega) - 300 fail
+
+    Two values cannot be as printed (docs/deviations.md): e_omega is given in N m, and an axis [0, 1, 0] would turn the
+    drone out of the plane of the paper's figures.
+    """
+
+    velocity: float = 0.6
+    velocity_width_mps: float = 20.0
+    axis: float = 0.15
+    axis_width: float = 3.0
+    axis_direction: tuple[float, ...] = (1.0, 0.0, 0.0)
+    """Of the body's x axis, in the world."""
+    body_rate: float = 1.0
+    body_rate_width_radps: float = 20.0
+    failure: float = 300.0
+    """Subtracted in the step that ends an episode."""
+    speed_limit_mps: float = 10.0
+    rate_limit_radps: float = 30.0
+
+    @property
+    def largest(self) -> float:
+        """What a step at the set-points is worth."""
+        return self.velocity + self.axis + self.body_rate
+
+    def failed(self, state: State) -> Bool[Array, ""]:
+        """Whether speed or body rate have passed their limits."""
+        return too_fast(state, self.speed_limit_mps, self.rate_limit_radps)
+
+    def __call__(self, state: State, setpoint: Float[Array, "2"]) -> Float[Array, ""]:
+        """Reward of ``state``."""
+        velocity, axis, body_rate = deviations(state, setpoint, self.axis_direction)
+        reward = (
+            self.velocity * triangle(length(velocity), self.velocity_width_mps)
+            + self.axis * triangle(length(axis), self.axis_width)
+            + self.body_rate * triangle(length(body_rate), self.body_rate_width_radps)
+        )
+        return reward - self.failure * self.failed(state)
+
+
+def deviations(
+    state: State, setpoint: Float[Array, "2"], axis_direction: tuple[float, ...] = (1.0, 0.0, 0.0)
+) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+    """Of velocity (body axes, m/s), of the body's x axis (world), and of the body rate (rad/s)."""
+    turn = rotation_matrix(state.quaternion)
+    speed, rate = setpoint
+    nothing = jnp.zeros_like(speed)
+    velocity = state.velocity @ turn - jnp.stack([nothing, nothing, speed])
+    axis = turn[:, 0] - jnp.asarray(axis_direction, turn.dtype)
+    return velocity, axis, state.body_rate - jnp.stack([rate, nothing, nothing])
+
+
+@dataclass(frozen=True)
+class Setpoints:
+    """What users will ask for; each episode draws its own, uniformly between the two numbers."""
+
+    speed_mps: tuple[float, ...] = (-3.0, 5.0)
+    rate_radps: tuple[float, ...] = (8.0, 22.0)
+
+
+@dataclass(frozen=True)
+class FlipStarts:
+    """How flips begin: a share ``entering`` as a climb leaves the drone, the rest in the middle of a turn.
+
+    Largest values; all draws are uniform.
+    """
+
+    entering: float = 0.5
+    climb_mps: float = 6.0
+    """Upward speed when entering, from zero on; in a turn, the vertical speed either way."""
+    level_mps: float = 1.0
+    """Horizontal speed, per axis, in a turn twice that across the axis."""
+    tilt_rad: float = 0.3
+    """About each axis when entering; in a turn any roll, and this about the other two."""
+    rate_radps: float = 1.5
+    """About each axis; in a turn beside the rate that is asked for."""
+    rotor_speed: tuple[float, ...] = (0.2, 1.7)
+    """Least and largest, relative to hover."""
+
+
+def draw_flip(
+    starts: FlipStarts, model: Quadrotor, target: Float[Array, "3"], rate: Float[Array, ""], key: PRNGKeyArray
+) -> State:
+    """A random initial state of ``model`` about to turn, or turning, at ``rate`` [rad/s]."""
+    unit = jax.random.uniform(key, (17,), jnp.result_type(float))
+    entering = unit[0] < starts.entering
+    both = 2 * unit - 1
+    climb = jnp.where(entering, unit[1], both[1]) * starts.climb_mps
+    across = jnp.where(entering, 1.0, 2.0)
+    velocity = jnp.stack([starts.level_mps * both[2], starts.level_mps * across * both[3], climb])
+    roll = jnp.where(entering, starts.tilt_rad, jnp.pi) * both[4]
+    attitude = _from_roll_pitch_yaw(roll, starts.tilt_rad * both[5], starts.tilt_rad * both[6])
+    turning = jnp.where(entering, 0.0, 1.2 * unit[7] * rate)
+    body_rate = starts.rate_radps * both[8:11] + jnp.stack([turning, jnp.zeros_like(rate), jnp.zeros_like(rate)])
+    low, high = starts.rotor_speed
+    # Rotors of one drone run at much the same speed, whatever that is.
+    spread = low + (high - low) * (0.7 * unit[11] + 0.3 * unit[12:16])
+    rotor_speed = hover_rotor_speed(model.changed_parameters()) * spread
+    return State(target, velocity, attitude, body_rate, rotor_speed)
+
+
+def _from_roll_pitch_yaw(roll: Array, pitch: Array, yaw: Array) -> Float[Array, "4"]:
+    """Yaw about the world's z, then pitch, then roll about the body's axes."""
+    (cr, sr), (cp, sp), (cy, sy) = ((jnp.cos(a / 2), jnp.sin(a / 2)) for a in (roll, pitch, yaw))
+    return jnp.stack(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class FlipTask(Task):
+    """The paper's second task."""
+
+    layout: Layout = FLIP_LAYOUT
+    reward: FlipReward = field(default_factory=FlipReward)
+    starts: FlipStarts = field(default_factory=FlipStarts)
+    setpoints: Setpoints = field(default_factory=Setpoints)
+    episode_s: float = 1.5
+
+    @property
+    def largest_reward(self) -> float:
+        """What a step at the set-points is worth."""
+        return self.reward.largest
+
+    def draw_setpoint(self, key: PRNGKeyArray) -> Float[Array, "2"]:
+        """Speed and rate, uniformly within their ranges."""
+        low, high = jnp.array([self.setpoints.speed_mps, self.setpoints.rate_radps]).T
+        return jax.random.uniform(key, (2,), low.dtype, low, high)
+
+    def draw_start(
+        self, model: Quadrotor, target: Float[Array, "3"], setpoint: Float[Array, "2"], key: PRNGKeyArray
+    ) -> State:
+        """As ``starts`` says."""
+        return draw_flip(self.starts, model, target, setpoint[1], key)
+
+    def judge(
+        self,
+        state: State,
+        target: Float[Array, "3"],
+        setpoint: Float[Array, "2"],
+        command: Array,
+        parameters: Parameters,
+    ) -> Float[Array, ""]:
+        """The paper's reward."""
+        return self.reward(state, setpoint)
+
+    def failed(self, state: State) -> Bool[Array, ""]:
+        """Too fast."""
+        return self.reward.failed(state)
+
+    def errors(self, state: State, target: Float[Array, "3"], setpoint: Float[Array, "2"]) -> Float[Array, "3"]:
+        """Of velocity, axis and body rate."""
+        velocity, axis, body_rate = deviations(state, setpoint, self.reward.axis_direction)
+        return jnp.stack([length(velocity) / 3, length(axis), length(body_rate) / 10])
