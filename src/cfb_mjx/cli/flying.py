@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+DEFAULT_TASK = "hover"
+
+
+@dataclass(frozen=True)
+class Turn:
+    """What only flips take: see ``cfb fly --help``."""
+
+    knobs: str | None = None
+    changes: tuple[str, ...] = ()
+    holder: str = "target"
+    search: Literal["height", "margin"] | None = None
+    keep: Path | None = None
 
 
 def run_fly(
     controller: str,
-    task: str,
+    task: str | None,
     model: str,
     plants: int,
     magnitude: float,
@@ -23,15 +38,20 @@ def run_fly(
     seed: int,
     json: Path | None,
     figure: Path | None,
+    recording: Path | None,
+    turn: Turn,
 ) -> None:
     """Fly, print what was measured, write what was asked for.
 
     Raises:
-        CfbError: an unknown controller, model or randomisation, impossible numbers, or outputs without a folder.
+        CfbError: an unknown controller, model or randomisation, impossible numbers, options that do nothing, or outputs
+            without a folder.
     """
-    require_folder(json, figure)
-    if on is not None and figure is not None:
-        raise CfbError("--figure shows the flights of one model; leave out --on, or give the drone with --model.")
+    require_folder(json, figure, recording, turn.keep)
+    if on is not None and (figure is not None or recording is not None):
+        raise CfbError(
+            "--figure and --recording show the flights of one model; leave out --on, or give the drone with --model."
+        )
     if plants < 1:
         raise CfbError(f"--plants {plants}: at least one drone must fly.")
     if magnitude < 0:
@@ -46,7 +66,10 @@ def run_fly(
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import load_model_file, load_randomisation
     from cfb_mjx.train import flying
+    from cfb_mjx.train.flips import FLIPS, flips
 
+    if task is None and controller in FLIPS:
+        controller, task = "flip", controller
     described = load_model_file(model)
     nominal = Quadrotor.from_file(described)
     spread = load_randomisation(randomisation)
@@ -58,13 +81,30 @@ def run_fly(
     )
     # Scaled for the model that was named, whatever it is flown on.
     pilot = find_pilot(controller, nominal)
+    if task is None:
+        task = "flip" if asks_for_setpoints(pilot) else DEFAULT_TASK
+    rotations = None
+    if task in FLIPS:
+        from cfb_mjx.cli.flipping import prepared
+
+        wild = replace(course, randomisation=spread, magnitude=magnitude or 1.0)
+        pilot, rotations = prepared(pilot, controller, task, turn, wild, nominal, seed)
+    else:
+        if asks_for_setpoints(pilot):
+            raise CfbError(f"{controller}: is a flip policy and cannot fly --task {task}; fly flip or double-flip.")
+        if turn != Turn():
+            raise CfbError(f"--knobs, --set, --holder, --search and --keep are for flips, not for --task {task}.")
+    test = flips if task in FLIPS else flying.TESTS[task]
     keys = jax.random.split(jax.random.PRNGKey(seed), plants)
 
     def fly(drone):
-        measured, flown = flying.TESTS[task](pilot, course, drone, keys)
-        return summary(task, {k: np.asarray(v) for k, v in measured._asdict().items()}), flown
+        measured, flown = test(pilot, course, drone, keys)
+        good = None if rotations is None else np.asarray(measured.completed(rotations))
+        return summary(task, {k: np.asarray(v) for k, v in measured._asdict().items()}, good), flown
 
     result = {"controller": controller, "task": task, "model": model, "plants": plants, "magnitude": magnitude}
+    if rotations is not None:
+        result["knobs"] = {name: float(x) for name, x in pilot.knobs._asdict().items() if np.isfinite(x)}
     if on is None:
         measured, flown = fly(nominal)
         result |= measured
@@ -82,13 +122,31 @@ def run_fly(
         print(f"results: {json}")
     if figure is not None:
         from cfb_mjx.view.flight import flight_figure
+        from cfb_mjx.view.flip import flip_figure
 
-        flight_figure(flown, pilot.control_dt_s, figure, f"{controller}, {task}, {model}")
+        draw = flight_figure if rotations is None else flip_figure
+        draw(flown, pilot.control_dt_s, figure, f"{controller}, {task}, {model}")
         print(f"figure: {figure}")
+    if recording is not None:
+        from cfb_mjx.view.flight_recording import write_flight_recording
+
+        write_flight_recording(recording, flown, pilot.control_dt_s)
+        print(f"recording: {recording}")
 
 
-def summary(task: str, measured: dict) -> dict:
-    """JSON of a test: means over the flights, and over many also quantiles and the rate of success."""
+def asks_for_setpoints(pilot) -> bool:
+    """Whether this is a flip policy."""
+    return bool(getattr(getattr(pilot, "layout", None), "setpoint_scales", ()))
+
+
+def summary(task: str, measured: dict, completed=None) -> dict:
+    """JSON of a test: means over the flights, and over many also quantiles and the rate of success.
+
+    Args:
+        task: what was flown.
+        measured: arrays, one number per flight.
+        completed: for flips, who completed them.
+    """
     import numpy as np
 
     failed = measured["failed"]
@@ -98,22 +156,33 @@ def summary(task: str, measured: dict) -> dict:
     elif task == "step":
         values = {key: measured[key] for key in ("arrival_s", "peak_speed_mps", "overshoot_m")}
         good = ~failed & np.isfinite(measured["arrival_s"])
-    else:
+    elif task == "recover":
         values = {key: measured[key] for key in ("lost_height_m", "final_distance_m")}
         good = measured["recovered"]
-    result = {key: float(np.mean(value)) for key, value in values.items()} | {"failed": bool(failed.any())}
+    else:
+        values = {key: value for key, value in measured.items() if key != "failed"}
+        good = completed
+    # A lost flip's numbers say nothing, and some are infinite.
+    counted = good if completed is not None and good.any() else np.ones_like(good)
+    result = {key: _finite(np.mean(value[counted])) for key, value in values.items()} | {"failed": bool(failed.any())}
     if len(failed) > 1:
         result |= {"failure_rate": float(failed.mean()), "success_rate": float(good.mean())}
         result["quantiles"] = {
-            key: {f"{q:g}": float(np.quantile(value[good], q)) if good.any() else None for q in QUANTILES}
+            key: {f"{q:g}": _finite(np.quantile(value[good], q)) if good.any() else None for q in QUANTILES}
             for key, value in values.items()
         }
     elif task == "recover":
         result["recovered"] = bool(good[0])
+    elif completed is not None:
+        result["completed"] = bool(good[0])
     return result
 
 
-_UNITS = {"mm": "mm", "s": "s", "mps": "m/s", "m": "m"}
+def _finite(number) -> float | None:
+    return float(number) if math.isfinite(number) else None
+
+
+_UNITS = {"mm": "mm", "s": "s", "mps": "m/s", "m": "m", "radps": "rad/s"}
 
 
 def _label(key: str) -> str:
@@ -126,9 +195,9 @@ def _print(result: dict) -> None:
     print(f"{result['controller']}, {result['task']}: {result['plants']} {drones}, {result['model']}")
     quantiles = result.get("quantiles", {})
     for key, value in result.items():
-        if key in ("controller", "task", "model", "plants", "magnitude", "quantiles"):
+        if key in ("controller", "task", "model", "plants", "magnitude", "quantiles", "knobs"):
             continue
-        shown = value if isinstance(value, bool) else f"{value:.4g}"
+        shown = value if isinstance(value, bool) else "never" if value is None else f"{value:.4g}"
         spread = quantiles.get(key)
         more = (
             "" if not spread or spread["0.5"] is None else f"   median {spread['0.5']:.4g}, 95 % {spread['0.95']:.4g}"

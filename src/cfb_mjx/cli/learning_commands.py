@@ -47,7 +47,7 @@ def train(
 
 def fly(
     controller: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONTROLLER")],
-    task: Literal["hover", "step", "recover"] = "hover",
+    task: Literal["hover", "step", "recover", "flip", "double-flip", "triple-flip"] | None = None,
     model: Annotated[str, tyro.conf.arg(metavar="MODEL")] = "cfb-guards",
     plants: int = 1,
     magnitude: float = 0.0,
@@ -57,15 +57,22 @@ def fly(
     seed: int = 0,
     json: File = None,
     figure: File = None,
+    recording: File = None,
+    knobs: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
+    set: Pairs = (),
+    holder: Annotated[str, tyro.conf.arg(metavar="CONTROLLER")] = "target",
+    search: Literal["height", "margin"] | None = None,
+    keep: File = None,
 ) -> None:
     """Fly a controller in simulation and measure it.
 
     hover: 6 s at the target, the first second not counted. step: 6 m to one side. recover: thrown at 3 m/s, tilted 60
-    deg.
+    deg. flip, double-flip, triple-flip: climb, turn about the x axis, return to the start; `cfb fly double-flip` is
+    short for `cfb fly flip --task double-flip`.
 
     Args:
         controller: pid or mellinger (the firmware's), a shipped policy, or a policy file of `cfb train`.
-        task: what to fly.
+        task: what to fly; hover by default, and flip with a flip policy.
         model: preset or model YAML of the drone, with its effects.
         plants: number of flights, each on a drone drawn anew.
         magnitude: factor on the randomisation of the drones; 0 flies the model itself.
@@ -75,7 +82,16 @@ def fly(
         seed: of everything random.
         json: write the results here.
         figure: draw the flights here.
+        recording: write the flights here, for rerun (.rrd).
+        knobs: of a flip: when it switches and what it asks for, a shipped manoeuvre or a YAML file; the task's own by
+            default.
+        set: changes to the knobs of a flip, for instance rate_radps=18 climb_s=0.4; a search leaves these alone.
+        holder: the target policy that climbs and catches in a flip.
+        search: look for the knobs of a flip first: least height on the model, or largest margin on drones of the
+            randomisation.
+        keep: write the knobs that were flown here, for --knobs.
     """
-    from cfb_mjx.cli.flying import run_fly
+    from cfb_mjx.cli.flying import Turn, run_fly
 
-    run_fly(controller, task, model, plants, magnitude, randomisation, on, noise, seed, json, figure)
+    turn = Turn(knobs, tuple(flat(set)), holder, search, keep)
+    run_fly(controller, task, model, plants, magnitude, randomisation, on, noise, seed, json, figure, recording, turn)

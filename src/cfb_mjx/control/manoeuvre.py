@@ -6,10 +6,10 @@ flies wherever other controllers do.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -22,33 +22,38 @@ CLIMB, TURN, CATCH = range(3)
 
 
 class Knobs(NamedTuple):
-    """What of a flip its user may set."""
+    """What of a flip its user may set. A phase ends with its time, or earlier with the speed or angle of its own."""
 
     climb_m: Float[Array, ""] | float
     """How far above the start the target of the climb is: the farther, the harder the drone climbs."""
     climb_s: Float[Array, ""] | float
-    """How long it climbs."""
+    """How long it climbs at most."""
     turn_s: Float[Array, ""] | float
-    """How long it turns after that."""
+    """How long it turns after that at most."""
     speed_mps: Float[Array, ""] | float
     """Along the body's z axis, asked of the flip policy."""
     rate_radps: Float[Array, ""] | float
     """About the body's x axis, asked of the flip policy."""
-
-    def phase(self, time: Float[Array, "*times"]) -> Int[Array, "*times"]:
-        """`CLIMB`, `TURN` or `CATCH` for the command given at ``time`` [s]."""
-        # Half a nanosecond: a switching time on a command's own time counts as reached.
-        time = time + 5e-10
-        return (time >= self.climb_s).astype(int) + (time >= self.climb_s + self.turn_s)
+    climb_mps: Float[Array, ""] | float = math.inf
+    """The climb is over once the drone rises so fast."""
+    turn_rad: Float[Array, ""] | float = math.inf
+    """The turn is over once the drone has turned so far."""
 
 
 class ManoeuvreMemory(NamedTuple):
-    """What each phase's policy remembers, kept up to date in all of them, and the number of commands given."""
+    """What each phase's policy remembers, kept up to date in all of them, and how far the manoeuvre is."""
 
     climb: Memory
     turn: Memory
     catch: Memory
+    phase: Int[Array, ""]
+    """Of the last command."""
     count: Int[Array, ""]
+    """Commands given in this phase."""
+    roll: Float[Array, ""]
+    """Of the last estimate, rad."""
+    turned: Float[Array, ""]
+    """Since the turn began, rad."""
 
 
 class Manoeuvre(eqx.Module):
@@ -81,25 +86,36 @@ class Manoeuvre(eqx.Module):
     def start(self, estimate: Estimate, command: Float[Array, "4"]) -> ManoeuvreMemory:
         """Memory at take-over."""
         climb, catch = (self.holder.start(seen, command) for seen in (self._raised(estimate), estimate))
-        return ManoeuvreMemory(climb, self.turner.start(estimate, command), catch, jnp.asarray(0))
+        turn, roll = self.turner.start(estimate, command), roll_angle(estimate.quaternion)
+        nothing = jnp.asarray(0)
+        return ManoeuvreMemory(climb, turn, catch, nothing, nothing, roll, jnp.zeros_like(roll))
 
     def command(self, memory: ManoeuvreMemory, estimate: Estimate) -> tuple[ManoeuvreMemory, Float[Array, "4"]]:
         """New memory and command."""
-        phase, raised = self.knobs.phase(memory.count * self.control_dt_s), self._raised(estimate)
-        held, turned = self.holder.layout, self.turner.layout
+        phase, count, roll, turned = self._advance(memory, estimate)
+        raised, held, turning = self._raised(estimate), self.holder.layout, self.turner.layout
         climbing, catching = observation(held, memory.climb, raised), observation(held, memory.catch, estimate)
         holding = self.holder.act(jnp.where(phase == CLIMB, climbing, catching))
         setpoint = jnp.stack([jnp.asarray(x, holding.dtype) for x in (self.knobs.speed_mps, self.knobs.rate_radps)])
-        u = jnp.where(phase == TURN, self.turner.act(observation(turned, memory.turn, estimate, setpoint)), holding)
-        after = ManoeuvreMemory(
-            remember(held, memory.climb, raised, u),
-            remember(turned, memory.turn, estimate, u),
-            remember(held, memory.catch, estimate, u),
-            memory.count + 1,
-        )
+        spinning = self.turner.act(observation(turning, memory.turn, estimate, setpoint))
+        u = jnp.where(phase == TURN, spinning, holding)
+        caught = remember(held, memory.catch, estimate, u)
         # An integral gathered while turning says nothing about what holding needs.
-        still = jnp.where(phase == CATCH, after.catch.integral, 0.0)
-        return after._replace(catch=eqx.tree_at(lambda m: m.integral, after.catch, still)), u
+        still = jnp.where(phase == CATCH, caught.integral, jnp.zeros_like(caught.integral))
+        caught = eqx.tree_at(lambda m: m.integral, caught, still)
+        climbed, spun = remember(held, memory.climb, raised, u), remember(turning, memory.turn, estimate, u)
+        return ManoeuvreMemory(climbed, spun, caught, phase, count, roll, turned), u
+
+    def _advance(self, memory: ManoeuvreMemory, estimate: Estimate):
+        """Phase of the command that is due, commands given in it so far, roll, and angle turned."""
+        roll, knobs = roll_angle(estimate.quaternion), self.knobs
+        turned = jnp.where(memory.phase == TURN, memory.turned + nearest(roll - memory.roll), 0.0)
+        # A little more, so that a time that ends with a command's own is not missed by a rounding.
+        elapsed = memory.count * self.control_dt_s + 1e-6
+        climbed = (elapsed >= knobs.climb_s) | (estimate.velocity[2] >= knobs.climb_mps)
+        round_about = (elapsed >= knobs.turn_s) | (turned >= knobs.turn_rad)
+        over = ((memory.phase == CLIMB) & climbed) | ((memory.phase == TURN) & round_about)
+        return memory.phase + over, jnp.where(over, 1, memory.count + 1), roll, turned
 
     def _raised(self, estimate: Estimate) -> Estimate:
         up = jnp.zeros_like(estimate.position).at[2].set(self.knobs.climb_m)
@@ -112,13 +128,12 @@ def roll_angle(quaternion: Float[Array, "*times 4"]) -> Float[Array, "*times"]:
     return jnp.arctan2(2 * (w * x - y * z), 1 - 2 * (x * x + y * y))
 
 
+def nearest(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """The same angle between -pi and pi."""
+    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+
+
 def unwrapped(angle: Float[Array, "*batch times"]) -> Float[Array, "*batch times"]:
     """The angle without jumps of a whole turn, from its first value on, rad."""
-    steps = jnp.diff(angle, axis=-1)
-    steps = steps - 2 * jnp.pi * jnp.round(steps / (2 * jnp.pi))
+    steps = nearest(jnp.diff(angle, axis=-1))
     return angle[..., :1] + jnp.concatenate([jnp.zeros_like(angle[..., :1]), jnp.cumsum(steps, axis=-1)], axis=-1)
-
-
-def as_knobs(values: dict[str, float]) -> Knobs:
-    """Knobs of plain numbers, as arrays."""
-    return jax.tree.map(jnp.asarray, Knobs(**values))

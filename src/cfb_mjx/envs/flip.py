@@ -99,7 +99,9 @@ class FlipStarts:
 
     entering: float = 0.5
     climb_mps: float = 6.0
-    """Upward speed when entering, from zero on; in a turn, the vertical speed either way."""
+    """Upward speed, from zero on when entering."""
+    fall_mps: float = 2.0
+    """Downward speed in a turn. What falls faster reaches the limit of speed before the episode is over."""
     level_mps: float = 1.0
     """Horizontal speed, per axis, in a turn twice that across the axis."""
     tilt_rad: float = 0.3
@@ -117,7 +119,8 @@ def draw_flip(
     unit = jax.random.uniform(key, (17,), jnp.result_type(float))
     entering = unit[0] < starts.entering
     both = 2 * unit - 1
-    climb = jnp.where(entering, unit[1], both[1]) * starts.climb_mps
+    slowest = jnp.where(entering, 0.0, -starts.fall_mps)
+    climb = slowest + (starts.climb_mps - slowest) * unit[1]
     across = jnp.where(entering, 1.0, 2.0)
     velocity = jnp.stack([starts.level_mps * both[2], starts.level_mps * across * both[3], climb])
     roll = jnp.where(entering, starts.tilt_rad, jnp.pi) * both[4]
@@ -152,7 +155,7 @@ class FlipTask(Task):
     reward: FlipReward = field(default_factory=FlipReward)
     starts: FlipStarts = field(default_factory=FlipStarts)
     setpoints: Setpoints = field(default_factory=Setpoints)
-    episode_s: float = 1.5
+    episode_s: float = 0.9
 
     @property
     def largest_reward(self) -> float:

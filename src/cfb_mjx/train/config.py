@@ -58,6 +58,9 @@ class AnalyticSettings:
 class FlipAnalyticSettings(AnalyticSettings):
     """The same for flips."""
 
+    drones: int = 512
+    horizon_s: float = 0.6
+    updates: int = 1200
     cost: FlipCost = field(default_factory=FlipCost)
 
 
@@ -97,6 +100,16 @@ class PpoSettings:
     def updates(self) -> int:
         """Collections of ``unroll`` commands."""
         return -(-self.steps // (self.drones * self.unroll))
+
+
+@dataclass(frozen=True)
+class FlipPpoSettings(PpoSettings):
+    """The same for flips: what a command does to a turn is over sooner."""
+
+    steps: int = 40_000_000
+    discount: float = 0.97
+    gae_lambda: float = 0.95
+    reward_scaling: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -155,6 +168,7 @@ class FlipTrainingConfig(TrainingConfig):
     starts: FlipStarts = field(default_factory=FlipStarts)
     setpoints: Setpoints = field(default_factory=Setpoints)
     analytic: FlipAnalyticSettings = field(default_factory=FlipAnalyticSettings)
+    ppo: FlipPpoSettings = field(default_factory=FlipPpoSettings)
 
     def build_task(self, longest_delay_s: float = 0.016) -> FlipTask:
         """The task that is trained on."""

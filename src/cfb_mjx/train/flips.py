@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cfb_mjx.control.manoeuvre import Manoeuvre, roll_angle, unwrapped
+from cfb_mjx.control.manoeuvre import CATCH, Manoeuvre, roll_angle, unwrapped
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.envs.episode import observe, reset, step
 from cfb_mjx.envs.flip import FlipTask, deviations
@@ -74,16 +74,14 @@ def flips(
 @eqx.filter_jit
 def _flips(manoeuvre, task, nominal, keys, seconds):
     start = nominal.hover_state((0.0, 0.0, 0.0))
-    flown = jax.vmap(lambda key: fly(manoeuvre, task, nominal, key, seconds, start))(keys)
-    return measure(manoeuvre, flown), flown
+    flown = jax.vmap(lambda key: fly(manoeuvre, task, nominal, key, seconds, start, lambda m: m.phase))(keys)
+    return measure(flown, manoeuvre.control_dt_s), flown
 
 
-def measure(manoeuvre: Manoeuvre, flown: Flight) -> Flips:
-    """Of flights of ``manoeuvre``, axes (drones, steps)."""
-    dt, knobs = manoeuvre.control_dt_s, manoeuvre.knobs
-    times = dt * (1 + jnp.arange(flown.position.shape[-2]))
-    switch = dt * jnp.ceil((knobs.climb_s + knobs.turn_s) / dt - 1e-6)
-    since = times - switch
+def measure(flown: Flight, dt: float) -> Flips:
+    """Of flights of manoeuvres with their phases watched, axes (drones, steps), a command every ``dt`` [s]."""
+    # A command that belongs to the catch has been flown for dt when its row is written.
+    since = dt * jnp.cumsum(flown.watched == CATCH, axis=-1)
 
     def first(condition: Array) -> Array:
         return jnp.min(jnp.where(condition & (since > 0), since, jnp.inf), axis=-1)

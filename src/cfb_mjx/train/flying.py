@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,6 +35,8 @@ class Flight(NamedTuple):
     command: Float[Array, "*drones steps 4"]
     failed: Bool[Array, "*drones steps"]
     """Whether limits of speed or rate have been passed up to here."""
+    watched: Any = None
+    """What was asked to be seen of the pilot's memory."""
 
 
 def fly(
@@ -43,10 +46,12 @@ def fly(
     key: PRNGKeyArray,
     seconds: float,
     state: State | None = None,
+    watch: Callable[[Any], Any] = lambda memory: None,
 ) -> Flight:
     """One flight to the origin on a drone drawn as the task says; ``vmap`` over ``key`` (and ``state``) for many.
 
-    The simulation takes steps of the pilot's control step where that is shorter than the model's.
+    The simulation takes steps of the pilot's control step where that is shorter than the model's. ``watch`` says what
+    of the pilot's memory to keep.
     """
     dt = pilot.control_dt_s
     if dt < nominal.dt:
@@ -62,7 +67,7 @@ def fly(
         episode, outcome = step(task, episode, command)
         failed = failed | outcome.failed
         at = episode.state
-        row = Flight(at.position, at.velocity, at.quaternion, at.body_rate, command, failed)
+        row = Flight(at.position, at.velocity, at.quaternion, at.body_rate, command, failed, watch(memory))
         return (episode, memory, failed), row
 
     return jax.lax.scan(one, (episode, memory, jnp.asarray(False)), length=round(seconds / dt))[1]

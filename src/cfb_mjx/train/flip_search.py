@@ -1,0 +1,152 @@
+"""Find the knobs of a flip in simulation: the cross-entropy method over many flights at once.
+
+Each round draws candidates from a Gaussian, flies them all, and moves the Gaussian to the best (Rubinstein 1999).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cfb_mjx.control.manoeuvre import Knobs, Manoeuvre
+from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.train.flips import FLOOR_M, Flips, flips
+from cfb_mjx.train.flying import nominal_task
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What is looked for.
+
+    ``height``: the least vertical extent on the nominal drone. ``margin``: the most drones of the task's randomisation
+    that complete the flip, and those as far above the floor as they can, while the nominal one keeps within
+    ``extent_m``. Both: turned ``rotations`` times, stopped and back within the limits below on the nominal drone.
+    """
+
+    rotations: int = 2
+    aim: Literal["height", "margin"] = "height"
+    extent_m: float = 1.8
+    rate_stop_s: float = 0.35
+    vertical_stop_s: float = 0.6
+    return_m: float = 0.1
+    fall_mps: float = 0.0
+    """How fast the nominal drone has to fall at least: the paper's does 3.5 m/s, and falling less is easy."""
+    floor_m: float = FLOOR_M
+    """How far below the start the floor is."""
+
+
+class Bounds(NamedTuple):
+    """Where knobs are looked for: least and largest of each; equal ones stay as they are."""
+
+    low: Knobs
+    high: Knobs
+
+
+def bounds(rotations: int = 2, **fixed: float) -> Bounds:
+    """The usual ones for so many turns; keyword arguments fix knobs."""
+    low = Knobs(0.5, 0.1, 0.2 * rotations, -3.0, 12.0, 1.0, 2 * jnp.pi * (rotations - 0.6))
+    high = Knobs(6.0, 1.2, 0.55 * rotations + 0.2, 5.0, 21.0, 6.0, 2 * jnp.pi * (rotations + 0.1))
+    return Bounds(low._replace(**fixed), high._replace(**fixed))
+
+
+class Found(NamedTuple):
+    """What a search came to."""
+
+    knobs: Knobs
+    cost: Float[Array, ""]
+    history: Float[Array, "rounds"]
+    """Cost of the best candidate of each round."""
+
+
+def shortfall(goal: Goal, measured: Flips) -> Float[Array, "*drones"]:
+    """How far nominal flights are from what every goal asks for; zero where it is all met."""
+
+    def over(value: Array, limit: float, scale: float) -> Array:
+        # A little less than the limit, so that another seed's noise does not cross it.
+        return jnp.minimum(1.0, jnp.maximum(0.0, jnp.nan_to_num(value, nan=1e3) - 0.97 * limit) / scale)
+
+    return (
+        3 * measured.failed
+        + jnp.minimum(2.0, jnp.abs(jnp.nan_to_num(measured.rotations, nan=9.0) - goal.rotations))
+        + over(measured.rate_stop_s, goal.rate_stop_s, 0.5)
+        + over(measured.vertical_stop_s, goal.vertical_stop_s, 0.5)
+        + over(measured.return_error_m, goal.return_m, 0.5)
+        + jnp.clip(goal.fall_mps - jnp.nan_to_num(measured.fall_mps), 0.0, 1.0)
+    )
+
+
+def search(
+    manoeuvre: Manoeuvre,
+    task: TargetTask,
+    nominal: Quadrotor,
+    goal: Goal,
+    key: PRNGKeyArray,
+    within: Bounds | None = None,
+    rounds: int = 20,
+    candidates: int = 48,
+    plants: int = 160,
+    report: Callable[[int, float], None] = lambda round, cost: None,
+) -> Found:
+    """The knobs that serve ``goal`` best.
+
+    Args:
+        manoeuvre: what to improve: what is found serves no less than its knobs, where these lie within the bounds.
+        task: with the randomisation that ``margin`` is about.
+        nominal: the drone.
+        goal: what to look for.
+        key: decides candidates, drones and noise.
+        within: where to look; `bounds` of the goal's rotations by default.
+        rounds: of the search.
+        candidates: per round.
+        plants: randomised drones per candidate, for ``margin``.
+        report: called after every round with its number and the cost of its best candidate.
+    """
+    within = bounds(goal.rotations) if within is None else within
+    low, high = (jnp.stack([jnp.asarray(x, float) for x in side]) for side in within)
+    of_nominal, of_plants, of_draws = jax.random.split(key, 3)
+    few = jax.random.split(of_nominal, 4)
+    many = jax.random.split(of_plants, plants)
+
+    @eqx.filter_jit
+    def costs(units, nominal):
+        knobs = jax.vmap(lambda unit: Knobs(*(low + (high - low) * unit)))(units)
+        return jax.vmap(lambda k: cost(k, nominal))(knobs)
+
+    def cost(knobs, nominal):
+        flown = Manoeuvre(manoeuvre.holder, manoeuvre.turner, knobs)
+        at_home = flips(flown, nominal_task(task), nominal, few)[0]
+        missed = jnp.mean(shortfall(goal, at_home))
+        extent = jnp.max(jnp.nan_to_num(at_home.vertical_extent_m, nan=1e3))
+        if goal.aim == "height":
+            return jnp.minimum(extent, 20.0) + 10 * missed
+        away = flips(flown, task, nominal, many)[0]
+        lost = 1 - jnp.mean(away.completed(goal.rotations, goal.floor_m))
+        # Nearly all of them complete it: what tells candidates apart is how much they have left.
+        deep = jnp.nan_to_num(-away.lowest_m, nan=9.0) / goal.floor_m
+        near = jnp.mean(jnp.clip(deep - 0.5, 0.0, 0.5))
+        turned = jnp.mean(jnp.minimum(1.0, jnp.abs(jnp.nan_to_num(away.rotations, nan=9.0) - goal.rotations)))
+        wide = jnp.clip(extent - 0.97 * goal.extent_m, 0.0, 5.0)
+        return lost + 0.3 * near + 0.3 * turned + 3 * missed + wide
+
+    mean, std = jnp.full(len(low), 0.5), jnp.full(len(low), 0.35)
+    given = jnp.clip(jnp.stack([jnp.asarray(x, float) for x in manoeuvre.knobs]), low, high)
+    best = jnp.where(high > low, (given - low) / jnp.where(high > low, high - low, 1.0), 0.0)
+    least, history = jnp.inf, []
+    for i in range(rounds):
+        drawn = mean + std * jax.random.normal(jax.random.fold_in(of_draws, i), (candidates, len(low)))
+        # The best so far flies again beside the others.
+        units = jnp.clip(drawn, 0.0, 1.0).at[0].set(best)
+        found = costs(units, nominal)
+        order = jnp.argsort(found)[: max(4, candidates // 8)]
+        mean, std = units[order].mean(axis=0), units[order].std(axis=0) + 0.02 * (1 - i / rounds)
+        best, least = units[order[0]], found[order[0]]
+        history.append(least)
+        report(i + 1, float(least))
+    return Found(Knobs(*(low + (high - low) * best)), least, jnp.stack(history))

@@ -1,0 +1,98 @@
+"""Flips as the paper shows them: the path in the YZ plane, the roll angle and the rates over time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.control.manoeuvre import TURN, roll_angle, unwrapped
+from cfb_mjx.view.style import check_path, context, new_figure, save
+
+_SHOWN = 60
+_BLUE, _RED, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#e8e8e8"
+
+
+def flip_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
+    """Draw flips.
+
+    Args:
+        flown: a `cfb_mjx.train.flying.Flight` of `cfb_mjx.train.flips.flips`, axes (drones, steps).
+        dt: time between two commands, s.
+        path: figure to write.
+        title: above it.
+    """
+    path = check_path(path)
+    position, velocity, rate = (np.asarray(x)[:_SHOWN] for x in (flown.position, flown.velocity, flown.body_rate))
+    roll = np.degrees(np.asarray(unwrapped(roll_angle(flown.quaternion[:_SHOWN]))))
+    time, count = dt * (1 + np.arange(position.shape[1])), len(flown.position)
+    shown, fade = _watched(flown, dt), 1.0 if count == 1 else 0.3
+    with context():
+        figure = new_figure(8.4, 4.6)
+        grid = figure.add_gridspec(3, 2, width_ratios=(1, 1.25))
+        plane = figure.add_subplot(grid[:, 0])
+        draw_path(plane, flown, dt, fade)
+        plane.set_aspect("equal", adjustable="datalim")
+        rows = (
+            ("roll, deg", roll),
+            ("roll rate, deg/s", np.degrees(rate[..., 0])),
+            ("vertical speed, m/s", velocity[..., 2]),
+        )
+        above = None
+        for i, (label, values) in enumerate(rows):
+            axis = above = figure.add_subplot(grid[i, 1], sharex=above)
+            axis.plot(time, values.T, color=_BLUE, linewidth=0.9, alpha=fade)
+            axis.set_ylabel(label)
+            axis.set_xlim(0, shown)
+            inside = values[:, time <= shown]
+            if np.isfinite(inside).any():
+                axis.set_ylim(*_padded(np.nanmin(inside), np.nanmax(inside)))
+            if count == 1:
+                turning = time[np.asarray(flown.watched)[0] == TURN]
+                axis.axvspan(turning[0] - dt, turning[-1], color=_GREY, linewidth=0)
+            if i < 2:
+                axis.tick_params(labelbottom=False)
+        axis.set_xlabel("time, s")
+        more = "" if count <= _SHOWN else f" ({_SHOWN} of {count} flights)"
+        figure.suptitle(title + more, fontsize=10)
+        figure.subplots_adjust(left=0.08, right=0.98, bottom=0.11, top=0.92, hspace=0.15, wspace=0.25)
+        save(figure, path)
+
+
+def draw_path(axis, flown, dt: float, alpha: float = 1.0) -> None:
+    """The way of flips in the YZ plane until they are back, with the drone as a bar every 40 ms if it is one flight."""
+    position, until = np.asarray(flown.position)[:_SHOWN], round(_watched(flown, dt) / dt)
+    way = position[:, :until]
+    if len(way) == 1:
+        phase = np.asarray(flown.watched)[0, :until]
+        for which, colour in enumerate((_GREEN, _RED, _BLUE)):
+            there = np.flatnonzero(phase == which)
+            if len(there):
+                piece = way[0, max(0, there[0] - 1) : there[-1] + 1]
+                axis.plot(piece[:, 1], piece[:, 2], color=colour, label=("climb", "turn", "catch")[which])
+        roll = np.asarray(roll_angle(flown.quaternion[0, :until]))
+        for i in range(0, until, max(1, round(0.04 / dt))):
+            y, z = way[0, i, 1:]
+            across, up = (
+                0.05 * np.array([np.cos(roll[i]), np.sin(roll[i])]),
+                0.04 * np.array([-np.sin(roll[i]), np.cos(roll[i])]),
+            )
+            axis.plot([y - across[0], y + across[0]], [z - across[1], z + across[1]], color="#222222", linewidth=0.8)
+            axis.plot([y, y + up[0]], [z, z + up[1]], color="#222222", linewidth=0.5)
+        axis.legend(loc="best")
+    else:
+        for one in way:
+            axis.plot(one[:, 1], one[:, 2], color=_BLUE, linewidth=0.8, alpha=alpha)
+    axis.set_xlabel("y, m")
+    axis.set_ylabel("z, m")
+
+
+def _watched(flown, dt: float) -> float:
+    """Until when flights are shown, s: a second and a half after the last of them is to be caught."""
+    before = (np.asarray(flown.watched) <= TURN).sum(axis=-1).max() * dt
+    return min(before + 1.5, dt * flown.position.shape[-2])
+
+
+def _padded(low: float, high: float) -> tuple[float, float]:
+    margin = 0.06 * max(high - low, 1e-3)
+    return low - margin, high + margin
