@@ -1,8 +1,8 @@
 """Find, fly and show the shipped flips.
 
-    python scripts/flips.py             measure them: docs/flips.md, its figures, benchmarks/flips.json (minutes)
-    python scripts/flips.py --search    look for their knobs first: configs/manoeuvres (a quarter of an hour)
-    python scripts/flips.py --page-only write the page from the numbers that are there
+python scripts/flips.py             measure them: docs/flips.md, its figures, benchmarks/flips.json (minutes)
+python scripts/flips.py --search    look for their knobs first: configs/manoeuvres (a quarter of an hour)
+python scripts/flips.py --page-only write the page from the numbers that are there
 """
 
 import argparse
@@ -139,7 +139,7 @@ class Course:
         for plant, drone in self.plants.items():
             measured = flips(manoeuvre, self.calm, drone, self.few[:16])[0]
             others[plant] = float(np.mean(measured.completed(rotations)))
-        again = replay(manoeuvre, self.nominal)
+        again = {key: float(x) for key, x in replay(manoeuvre, self.nominal)._asdict().items()}
         extent = np.asarray(away.vertical_extent_m)[well]
         return {
             "knobs": {key: float(x) for key, x in manoeuvre.knobs._asdict().items()},
@@ -150,7 +150,7 @@ class Course:
             "random_extent_m": {f"{q:g}": float(np.quantile(extent, q)) for q in (0.5, 0.95)},
             "off_nominal": others,
             "command": [float(np.min(flown.command)), float(np.max(flown.command))],
-            "replay": again._asdict(),
+            "replay": again,
         }
 
     def draw(self) -> None:
@@ -183,9 +183,9 @@ def page(found: dict) -> str:
         "",
         "The shipped policy `flip` holds a rate about the x axis while the shipped `target` climbs before and catches "
         "after it (`cfb fly double-flip`). The knobs of each flip in `configs/manoeuvres` were found by "
-        "`python scripts/flips.py --search`, the cross-entropy method in simulation. All flights are seen 8 ms late and "
-        f"with noise; nominal: mean of {NOMINAL} flights; completed: turned as often as it should, back within 0.75 m, "
-        f"never 2 m below the start, no limit of speed or rate passed, of {RANDOM} drones of the paper's full "
+        "`python scripts/flips.py --search`, the cross-entropy method in simulation. All flights are seen 8 ms late "
+        f"and with noise; nominal: mean of {NOMINAL} flights; completed: turned as often as it should, back within "
+        f"0.75 m, never 2 m below the start, no limit of speed or rate passed, of {RANDOM} drones of the paper's full "
         "randomisation. Stopping times count from the switch to `target`: until the body rate is below 100 deg/s, and "
         "until the drone does not fall any more. The paper's double flip on the real drone: 1.8 m, about 1000 deg/s "
         "stopped in 0.35 s, about 3.5 m/s in 0.6 s.",
@@ -196,7 +196,12 @@ def page(found: dict) -> str:
     ]
     for name, r in found["flips"].items():
         n, tall = r["nominal"], r["random_extent_m"]
-        cells = [name, f"{n['rotations']:.2f}", f"{n['vertical_extent_m']:.2f}", f"{n['peak_rate_radps'] * degrees:.0f}"]
+        cells = [
+            name,
+            f"{n['rotations']:.2f}",
+            f"{n['vertical_extent_m']:.2f}",
+            f"{n['peak_rate_radps'] * degrees:.0f}",
+        ]
         cells += [_time(n["rate_stop_s"]), f"{n['fall_mps']:.2f}", _time(n["vertical_stop_s"])]
         cells += [f"{1e3 * n['return_error_m']:.0f}", f"{r['completed_random']:.2%}"]
         cells += [f"{tall['0.5']:.2f}, {tall['0.95']:.2f}"]

@@ -67,7 +67,8 @@ class Manoeuvre(eqx.Module):
 
     holder: NeuralController
     turner: NeuralController
-    knobs: Knobs
+    # Arrays, so that one compiled program flies all knobs.
+    knobs: Knobs = eqx.field(converter=lambda knobs: Knobs(*map(jnp.asarray, knobs)))
 
     def __check_init__(self):
         if len(self.turner.layout.setpoint_scales) != 2 or self.holder.layout.setpoint_scales:

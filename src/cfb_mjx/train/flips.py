@@ -12,10 +12,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.control.manoeuvre import CATCH, Manoeuvre, roll_angle, unwrapped
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.envs.episode import observe, reset, step
+from cfb_mjx.envs.episode import QUIET, observe, reset, step
 from cfb_mjx.envs.flip import FlipTask, deviations
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.rollout import rollout
+from cfb_mjx.model.rotors import thrust
 from cfb_mjx.train.flying import CAUGHT_M, Flight, fly
 
 FLIPS = {"flip": 1, "double-flip": 2, "triple-flip": 3}
@@ -145,3 +147,31 @@ def _turning(controller, task, nominal, keys):
         return Turning(rate[counted:].mean(), axis[counted:].mean(), change, failed)
 
     return jax.vmap(one)(keys)
+
+
+class Replay(NamedTuple):
+    """A flip without noise on the nominal drone, and its commands flown again without a controller."""
+
+    apart_m: Float[Array, ""]
+    """Largest distance between the two flights."""
+    largest_thrust_n: Float[Array, ""]
+    """Largest force that the flight shows beside gravity: mass times change of velocity over a control step."""
+    model_thrust_n: Float[Array, ""]
+    """What the motor model gives at full command."""
+
+
+def replay(manoeuvre: Manoeuvre, nominal: Quadrotor) -> Replay:
+    """Fly, and fly the commands again open loop: nothing but the commands moves the drone."""
+    return _replay(manoeuvre, nominal)
+
+
+@eqx.filter_jit
+def _replay(manoeuvre, nominal):
+    start, dt = nominal.hover_state((0.0, 0.0, 0.0)), manoeuvre.control_dt_s
+    flown = fly(manoeuvre, TargetTask(noise=QUIET), nominal, jax.random.PRNGKey(0), FLIP_S, start)
+    again = rollout(nominal, start, flown.command, hold=round(dt / nominal.dt))
+    apart = jnp.max(jnp.linalg.norm(again.position - flown.position, axis=-1))
+    parameters = nominal.changed_parameters()
+    force = jnp.diff(flown.velocity, axis=0) / dt + parameters.gravity * jnp.array([0.0, 0.0, 1.0])
+    full = thrust(parameters, parameters.motor_gain * jnp.ones(4) + parameters.motor_speed_offset)
+    return Replay(apart, parameters.mass * jnp.max(jnp.linalg.norm(force, axis=-1)), jnp.sum(full))
