@@ -94,7 +94,7 @@ def test_changes_may_be_given_together_or_one_by_one(monkeypatch, tmp_path):
     from cfb_mjx.cli.commands import run
 
     seen = []
-    monkeypatch.setattr(training, "run_train", lambda config, output, changes, *rest: seen.append(changes))
+    monkeypatch.setattr(training, "run_train", lambda task, config, output, changes, *rest: seen.append(changes))
     run("train", ["target", "-o", str(tmp_path), "--set", "seed=1", "ppo.steps=9", "--set", "ppo.unroll=3"])
     run("train", ["target", "-o", str(tmp_path)])
     assert seen == [("seed=1", "ppo.steps=9", "ppo.unroll=3"), ()]

@@ -92,6 +92,25 @@ def test_the_firmwares_pid_holds_hover_and_steps_slowly(cfb, tmp_path):
     assert step["arrival_s"] is None
 
 
+def test_a_double_flip_by_its_name(cfb, tmp_path):
+    outputs = ("--json", tmp_path / "f.json", "--figure", tmp_path / "f.png", "--recording", tmp_path / "f.rrd")
+    done = cfb("fly", "double-flip", "--keep", tmp_path / "k.yaml", *outputs)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "f.json").read_text())
+    assert {"rotations", "vertical_extent_m", "rate_stop_s", "vertical_stop_s", "return_error_m", "failed"} <= set(
+        result
+    )
+    assert result["completed"] is True
+    assert abs(result["rotations"] - 2) < 0.05
+    assert result["vertical_extent_m"] <= 1.8
+    assert (tmp_path / "f.png").stat().st_size > 10_000
+    assert (tmp_path / "f.rrd").stat().st_size > 10_000
+    assert "vertical extent [m]" in done.stdout
+    again = cfb("fly", "flip", "--task", "double-flip", "--knobs", tmp_path / "k.yaml", "--json", tmp_path / "g.json")
+    assert again.returncode == 0, again.stderr
+    assert json.loads((tmp_path / "g.json").read_text())["knobs"] == pytest.approx(result["knobs"])
+
+
 def test_every_drone_of_a_set_is_flown(cfb, tmp_path):
     """Told apart by what they do to a controller without integral action on thrust: a weaker drone hangs lower."""
     (tmp_path / "set.yaml").write_text(
@@ -117,6 +136,16 @@ def test_every_drone_of_a_set_is_flown(cfb, tmp_path):
         (["fly", "nobody.npz"], "nobody.npz: there is no such file"),
         (["fly", "pid", "--plants", "0"], "at least one drone"),
         (["fly", "pid", "--model", "nothing"], "nothing: no such model"),
+        (["fly", "pid", "--task", "flip"], "pid: is no flip policy"),
+        (["fly", "flip", "--task", "hover"], "cannot fly --task hover"),
+        (["fly", "target", "--set", "climb_s=1"], "are for flips"),
+        (["fly", "flip", "--knobs", "double-flip"], "turn 2 times"),
+        (["fly", "flip", "--holder", "pid"], "--holder pid: must be a target policy"),
+        (["fly", "double-flip", "--set", "climb=1"], "climb_s"),
+        (["fly", "flip", "--keep", "nowhere/k.yaml"], "nowhere"),
+        (["train", "flip", "-o", "x", "--set", "setpoints.rate_radps=[9]"], "setpoints.rate_radps"),
+        (["train", "flip", "-o", "x", "--set", "reward.position=1"], "reward.position"),
+        (["train", "flip", "-o", "x", "--config", "target"], "trains target, not flip"),
         (["train", "target", "-o", "x", "--config", "nothing"], "no such training"),
         (["train", "target", "-o", "x", "--set", "ppo.dronez=3"], "ppo.dronez"),
         (["train", "target", "-o", "x", "--set", "observation.control_dt_s=0.01"], "control_dt_s = 0.01"),

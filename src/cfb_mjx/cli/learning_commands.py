@@ -42,7 +42,7 @@ def train(
     from cfb_mjx.cli.training import run_train
 
     choices = {"model": model, "algorithm": algorithm, "seed": seed}
-    run_train(config or task, output, tuple(flat(set)), choices, start, resume, force, devices)
+    run_train(task, config, output, tuple(flat(set)), choices, start, resume, force, devices)
 
 
 def fly(

@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from cfb_mjx.cli.runtime import Progress, configure_jax, differentiate_mjx, environment, say
+from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_no_file, write_json
 
 NEWEST = "training.json"
@@ -18,7 +19,8 @@ _JUDGED = (
 
 
 def run_train(
-    config: str,
+    task: str,
+    config: str | None,
     output: Path,
     changes: tuple[str, ...],
     choices: dict,
@@ -41,7 +43,9 @@ def run_train(
     from cfb_mjx.train.run import POLICY, Training, train
     from cfb_mjx.view.learning import learning_figure
 
-    settings = with_changes(load_config(config, changes), **choices)
+    settings = with_changes(load_config(config or task, changes), **choices)
+    if settings.task != task:
+        raise CfbError(f"--config {config}: trains {settings.task}, not {task}.")
     if settings.body == "mjx" and settings.algorithm == "analytic":
         differentiate_mjx()
     facts = environment()
