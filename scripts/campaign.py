@@ -72,9 +72,12 @@ def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> None:
 
 
 def _what_counts(config: dict) -> dict:
-    """Without the settings of the algorithm that is not used."""
+    """Without the settings of the algorithm that is not used; what did not exist yet then is as it is by default."""
+    from cfb_mjx.train.config import config_from
+
+    whole = config_from(config, "a stored result").to_mapping()
     other = {"ppo": "analytic", "analytic": "ppo"}[config["algorithm"]]
-    return json.loads(json.dumps({k: v for k, v in config.items() if k not in (other, "description")}))
+    return json.loads(json.dumps({k: v for k, v in whole.items() if k not in (other, "description")}))
 
 
 def _report(row: dict) -> None:

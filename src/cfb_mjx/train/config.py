@@ -186,16 +186,25 @@ def load_config(name_or_path: str | Path = "target", changes: tuple[str, ...] = 
         CfbError: no such file, an unknown key, a value of the wrong type or out of range, named.
     """
     path, document = load_named(name_or_path, "training", FORMAT)
-    task = document.get("task", "target")
-    if task not in _KINDS:
-        raise CfbError(f"{path}: task must be one of {', '.join(_KINDS)}, found {task!r}.")
     # Checked before the changes go in, so that a fault of the file is not blamed on the command line.
-    build(_KINDS[task], document, str(path))
+    config_from(document, str(path))
     for change in changes:
         _change(document, change)
-    config = build(_KINDS[task], document, str(path) if not changes else f"{path} with {', '.join(changes)}")
+    config = config_from(document, str(path) if not changes else f"{path} with {', '.join(changes)}")
     _require_sense(config, str(path))
     return config
+
+
+def config_from(mapping: dict[str, Any], where: str) -> TrainingConfig:
+    """A configuration from what a YAML file holds; what is left out is as by default.
+
+    Raises:
+        CfbError: an unknown key or a value of the wrong type, named with ``where``.
+    """
+    task = mapping.get("task", "target")
+    if task not in _KINDS:
+        raise CfbError(f"{where}: task must be one of {', '.join(_KINDS)}, found {task!r}.")
+    return build(_KINDS[task], mapping, where)
 
 
 def with_changes(config: TrainingConfig, **values: Any) -> TrainingConfig:
