@@ -46,11 +46,21 @@ FLIPS = {
     "triple-flip": Wanted(3, "margin", "Three turns, for the most drones.", {}, {"extent_m": 3.0}, 0.8),
     "triple-flip-low": Wanted(3, "height", "Three turns within the least height."),
     "flip-low": Wanted(1, "height", "One turn within the least height."),
-    "flip-slow": Wanted(1, "height", "One turn, slow.", {"rate_radps": 10.0, "speed_mps": 4.0}),
-    "flip-fast": Wanted(1, "height", "One turn, fast, from a short climb.", {"rate_radps": 21.0, "climb_mps": 2.5}),
-    "flip-high": Wanted(1, "height", "One turn high up.", {"rate_radps": 12.0, "climb_mps": 4.5, "speed_mps": -2.0}),
+    "flip-fast": Wanted(1, "height", "One fast turn.", {"rate_radps": 21.0, "climb_mps": 2.5, "climb_s": 1.2}),
+    "flip-wide": Wanted(
+        1,
+        "height",
+        "One slow turn, thrusting all the while.",
+        {"rate_radps": 8.5, "speed_mps": 5.0, "climb_mps": 3.5, "climb_s": 1.2},
+    ),
+    "flip-high": Wanted(
+        1,
+        "height",
+        "One turn from a fast climb.",
+        {"rate_radps": 14.0, "climb_mps": 4.5, "climb_s": 1.2, "climb_m": 6.0},
+    ),
 }
-SHAPES = ("flip-slow", "flip-low", "flip-high", "flip-fast")
+SHAPES = ("flip-low", "flip-fast", "flip-wide", "flip-high")
 """The single flips of the figure."""
 
 
@@ -154,23 +164,32 @@ class Course:
         }
 
     def draw(self) -> None:
-        """The paper's two figures."""
+        """The paper's two figures, and a recording of each flip in out/flips."""
+        from cfb_mjx.files import output_folder
         from cfb_mjx.train.flips import flips
+        from cfb_mjx.view.flight_recording import write_flight_recording
         from cfb_mjx.view.flip import draw_path, flip_figure
         from cfb_mjx.view.style import context, new_figure, save
 
         with context():
             figure = new_figure(10.0, 3.8)
-            for axis, name in zip(figure.subplots(1, len(SHAPES)), SHAPES, strict=True):
+            plots = figure.subplots(1, len(SHAPES))
+            for axis, name in zip(plots, SHAPES, strict=True):
                 flown = flips(self.manoeuvre(name), self.calm, self.nominal, self.few[:1])[1]
                 draw_path(axis, flown, self.holder.control_dt_s)
                 axis.set_title(name)
                 axis.set_aspect("equal", adjustable="datalim")
-            figure.subplots_adjust(left=0.06, right=0.99, bottom=0.13, top=0.91, wspace=0.3)
+            plots[0].set_ylabel("z, m")
+            plots[0].legend(loc="upper left")
+            figure.subplots_adjust(left=0.06, right=0.99, bottom=0.13, top=0.91, wspace=0.22)
             save(figure, PAGE / "flips.png")
         for name in ("double-flip-paper", "double-flip-low", "triple-flip-low"):
             flown = flips(self.manoeuvre(name), self.calm, self.nominal, self.few[:1])[1]
             flip_figure(flown, self.holder.control_dt_s, PAGE / f"{name}.png", name)
+        folder = output_folder(ROOT / "out" / "flips")
+        for name in FLIPS:
+            flown = flips(self.manoeuvre(name), self.calm, self.nominal, self.few[:1])[1]
+            write_flight_recording(folder / f"{name}.rrd", flown, self.holder.control_dt_s)
 
 
 def page(found: dict) -> str:
@@ -210,12 +229,12 @@ def page(found: dict) -> str:
         "",
         "![double flip as the paper's](double-flip-paper.png)",
         "",
-        "Left the way in the YZ plane, a drone every 40 ms; right the roll angle, its rate, and the vertical speed; "
+        "Left the way in the YZ plane and the drone on it; right the roll angle, its rate, and the vertical speed; "
         "grey: the flip policy flies.",
         "",
         "## Single flips",
         "",
-        "Four shapes from four settings of the knobs, with one policy:",
+        "Four shapes from four settings of the knobs, with one policy (`out/flips` has rerun recordings of all flips):",
         "",
         "![single flips](flips.png)",
         "",

@@ -114,27 +114,6 @@ def search(
     few = jax.random.split(of_nominal, 4)
     many = jax.random.split(of_plants, plants)
 
-    @eqx.filter_jit
-    def costs(units, nominal):
-        knobs = jax.vmap(lambda unit: Knobs(*(low + (high - low) * unit)))(units)
-        return jax.vmap(lambda k: cost(k, nominal))(knobs)
-
-    def cost(knobs, nominal):
-        flown = Manoeuvre(manoeuvre.holder, manoeuvre.turner, knobs)
-        at_home = flips(flown, nominal_task(task), nominal, few)[0]
-        missed = jnp.mean(shortfall(goal, at_home))
-        extent = jnp.max(jnp.nan_to_num(at_home.vertical_extent_m, nan=1e3))
-        if goal.aim == "height":
-            return jnp.minimum(extent, 20.0) + 10 * missed
-        away = flips(flown, task, nominal, many)[0]
-        lost = 1 - jnp.mean(away.completed(goal.rotations, goal.floor_m))
-        # Nearly all of them complete it: what tells candidates apart is how much they have left.
-        deep = jnp.nan_to_num(-away.lowest_m, nan=9.0) / goal.floor_m
-        near = jnp.mean(jnp.clip(deep - 0.5, 0.0, 0.5))
-        turned = jnp.mean(jnp.minimum(1.0, jnp.abs(jnp.nan_to_num(away.rotations, nan=9.0) - goal.rotations)))
-        wide = jnp.clip(extent - 0.97 * goal.extent_m, 0.0, 5.0)
-        return lost + 0.3 * near + 0.3 * turned + 3 * missed + wide
-
     mean, std = jnp.full(len(low), 0.5), jnp.full(len(low), 0.35)
     given = jnp.clip(jnp.stack([jnp.asarray(x, float) for x in manoeuvre.knobs]), low, high)
     best = jnp.where(high > low, (given - low) / jnp.where(high > low, high - low, 1.0), 0.0)
@@ -143,10 +122,35 @@ def search(
         drawn = mean + std * jax.random.normal(jax.random.fold_in(of_draws, i), (candidates, len(low)))
         # The best so far flies again beside the others.
         units = jnp.clip(drawn, 0.0, 1.0).at[0].set(best)
-        found = costs(units, nominal)
+        found = _costs(units, low, high, manoeuvre, task, nominal, goal, few, many)
         order = jnp.argsort(found)[: max(4, candidates // 8)]
         mean, std = units[order].mean(axis=0), units[order].std(axis=0) + 0.02 * (1 - i / rounds)
         best, least = units[order[0]], found[order[0]]
         history.append(least)
         report(i + 1, float(least))
     return Found(Knobs(*(low + (high - low) * best)), least, jnp.stack(history))
+
+
+@eqx.filter_jit
+def _costs(units, low, high, manoeuvre, task, nominal, goal, few, many):
+    def one(unit):
+        knobs = Knobs(*(low + (high - low) * unit))
+        return _cost(Manoeuvre(manoeuvre.holder, manoeuvre.turner, knobs), task, nominal, goal, few, many)
+
+    return jax.vmap(one)(units)
+
+
+def _cost(manoeuvre, task, nominal, goal, few, many) -> Float[Array, ""]:
+    at_home = flips(manoeuvre, nominal_task(task), nominal, few)[0]
+    missed = jnp.mean(shortfall(goal, at_home))
+    extent = jnp.max(jnp.nan_to_num(at_home.vertical_extent_m, nan=1e3))
+    if goal.aim == "height":
+        return jnp.minimum(extent, 20.0) + 10 * missed
+    away = flips(manoeuvre, task, nominal, many)[0]
+    lost = 1 - jnp.mean(away.completed(goal.rotations, goal.floor_m))
+    # Where nearly all of them complete it, what tells candidates apart is how much they have left.
+    deep = jnp.nan_to_num(-away.lowest_m, nan=9.0) / goal.floor_m
+    near = jnp.mean(jnp.clip(deep - 0.5, 0.0, 0.5))
+    turned = jnp.mean(jnp.minimum(1.0, jnp.abs(jnp.nan_to_num(away.rotations, nan=9.0) - goal.rotations)))
+    wide = jnp.clip(extent - 0.97 * goal.extent_m, 0.0, 5.0)
+    return lost + 0.3 * near + 0.3 * turned + 3 * missed + wide

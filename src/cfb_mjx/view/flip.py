@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.control.manoeuvre import TURN, roll_angle, unwrapped
-from cfb_mjx.view.style import check_path, context, new_figure, save
+from cfb_mjx.view.style import MEASURED, check_path, context, new_figure, save
 
 _SHOWN = 60
 _BLUE, _RED, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#e8e8e8"
@@ -33,6 +33,9 @@ def flip_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
         plane = figure.add_subplot(grid[:, 0])
         draw_path(plane, flown, dt, fade)
         plane.set_aspect("equal", adjustable="datalim")
+        plane.set_ylabel("z, m")
+        if count == 1:
+            plane.legend(loc="best")
         rows = (
             ("roll, deg", roll),
             ("roll rate, deg/s", np.degrees(rate[..., 0])),
@@ -60,7 +63,7 @@ def flip_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
 
 
 def draw_path(axis, flown, dt: float, alpha: float = 1.0) -> None:
-    """The way of flips in the YZ plane until they are back, with the drone as a bar every 40 ms if it is one flight."""
+    """The way of flips in the YZ plane until they are back, and the drone on it, a bar, if it is one flight."""
     position, until = np.asarray(flown.position)[:_SHOWN], round(_watched(flown, dt) / dt)
     way = position[:, :until]
     if len(way) == 1:
@@ -70,21 +73,27 @@ def draw_path(axis, flown, dt: float, alpha: float = 1.0) -> None:
             if len(there):
                 piece = way[0, max(0, there[0] - 1) : there[-1] + 1]
                 axis.plot(piece[:, 1], piece[:, 2], color=colour, label=("climb", "turn", "catch")[which])
-        roll = np.asarray(roll_angle(flown.quaternion[0, :until]))
-        for i in range(0, until, max(1, round(0.04 / dt))):
+        angle = np.asarray(unwrapped(roll_angle(flown.quaternion[:1, :until])))[0]
+        for i in _apart(way[0, :, 1:], angle):
             y, z = way[0, i, 1:]
-            across, up = (
-                0.05 * np.array([np.cos(roll[i]), np.sin(roll[i])]),
-                0.04 * np.array([-np.sin(roll[i]), np.cos(roll[i])]),
-            )
-            axis.plot([y - across[0], y + across[0]], [z - across[1], z + across[1]], color="#222222", linewidth=0.8)
-            axis.plot([y, y + up[0]], [z, z + up[1]], color="#222222", linewidth=0.5)
-        axis.legend(loc="best")
+            across = 0.05 * np.array([np.cos(angle[i]), np.sin(angle[i])])
+            up = 0.04 * np.array([-np.sin(angle[i]), np.cos(angle[i])])
+            axis.plot([y - across[0], y + across[0]], [z - across[1], z + across[1]], color=MEASURED, linewidth=0.8)
+            axis.plot([y, y + up[0]], [z, z + up[1]], color=MEASURED, linewidth=0.5)
     else:
         for one in way:
             axis.plot(one[:, 1], one[:, 2], color=_BLUE, linewidth=0.8, alpha=alpha)
     axis.set_xlabel("y, m")
-    axis.set_ylabel("z, m")
+
+
+def _apart(way: np.ndarray, angle: np.ndarray) -> list[int]:
+    """Where to draw the drone: a few centimetres or an eighth of a turn from where it was drawn last."""
+    kept = [0]
+    for i in range(1, len(way)):
+        moved, turned = np.linalg.norm(way[i] - way[kept[-1]]), abs(angle[i] - angle[kept[-1]])
+        if moved > 0.08 or turned > np.pi / 4:
+            kept.append(i)
+    return kept
 
 
 def _watched(flown, dt: float) -> float:
