@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from cfb_mjx.envs import TargetTask
+from cfb_mjx.envs import FlipTask, TargetTask
 from cfb_mjx.envs.gym import TargetEnv, TargetVectorEnv
 from cfb_mjx.errors import CfbError
 
@@ -15,8 +15,9 @@ SHORT = replace(TargetTask(), episode_s=0.04)
 
 # Positions and rates have no bounds, which it finds worth a warning.
 @pytest.mark.filterwarnings("ignore:.*A Box observation space (min|max)imum value is")
-def test_gymnasiums_checker_finds_nothing():
-    check_env(TargetEnv(), skip_render_check=True)
+@pytest.mark.parametrize("task", [TargetTask(), FlipTask()])
+def test_gymnasiums_checker_finds_nothing(task):
+    check_env(TargetEnv(task), skip_render_check=True)
 
 
 def test_many_fly_end_and_begin_anew():

@@ -71,7 +71,8 @@ def fly(
     short for `cfb fly flip --task double-flip`.
 
     Args:
-        controller: pid or mellinger (the firmware's), a shipped policy, or a policy file of `cfb train`.
+        controller: pid or mellinger (the firmware's), a shipped policy, a policy file of `cfb train`, or the name of a
+            flip.
         task: what to fly; hover by default, and flip with a flip policy.
         model: preset or model YAML of the drone, with its effects.
         plants: number of flights, each on a drone drawn anew.
@@ -83,8 +84,8 @@ def fly(
         json: write the results here.
         figure: draw the flights here.
         recording: write the flights here, for rerun (.rrd).
-        knobs: of a flip: when it switches and what it asks for, a shipped manoeuvre or a YAML file; the task's own by
-            default.
+        knobs: of a flip: when it switches and what it asks for, a shipped manoeuvre (flip-wide, double-flip-low ...) or
+            a YAML file; the task's own by default.
         set: changes to the knobs of a flip, for instance rate_radps=18 climb_s=0.4; a search leaves these alone.
         holder: the target policy that climbs and catches in a flip.
         search: look for the knobs of a flip first: least height on the model, or largest margin on drones of the

@@ -1,4 +1,4 @@
-"""The target task for other libraries of reinforcement learning: Gymnasium environments, one drone or many.
+"""Tasks for other libraries of reinforcement learning: Gymnasium environments, one drone or many.
 
 Needs the extra ``gymnasium``. Actions are 2 u - 1 in [-1, 1]; observations are those of `Layout`; the info of a step
 holds what the controller does not see. Episodes that end begin anew in the same step, on a drone drawn anew.
@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.envs.episode import choose, observe, reset, step
+from cfb_mjx.envs.episode import Task, choose, observe, reset, step
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
@@ -26,7 +26,7 @@ except ImportError:
     raise CfbError("Gymnasium is not installed; pip install 'cfb_mjx[gymnasium]'.") from None
 
 
-def _spaces(task: TargetTask) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def _spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     seen = gymnasium.spaces.Box(-np.inf, np.inf, (task.layout.size,), np.float32)
     return seen, gymnasium.spaces.Box(-1.0, 1.0, (4,), np.float32)
 
@@ -36,13 +36,13 @@ class TargetVectorEnv(VectorEnv):
 
     Args:
         num_envs: number of drones.
-        task: what to fly; the paper's task on the nominal drone by default.
+        task: what to fly, a `FlipTask` too; by default to the target, on the nominal drone.
         model: preset or model YAML, or the drone itself.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012 (Gymnasium's interface)
 
-    def __init__(self, num_envs: int = 1, task: TargetTask | None = None, model: str | Quadrotor = "cfb-guards"):
+    def __init__(self, num_envs: int = 1, task: Task | None = None, model: str | Quadrotor = "cfb-guards"):
         self.task = TargetTask() if task is None else task
         self.nominal = model if isinstance(model, Quadrotor) else Quadrotor.from_file(model)
         self.task.hold(self.nominal)
@@ -103,7 +103,7 @@ class TargetEnv(gymnasium.Env):
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's interface)
 
-    def __init__(self, task: TargetTask | None = None, model: str | Quadrotor = "cfb-guards"):
+    def __init__(self, task: Task | None = None, model: str | Quadrotor = "cfb-guards"):
         self.many = TargetVectorEnv(1, task, model)
         self.observation_space, self.action_space = _spaces(self.many.task)
         self.render_mode = None
