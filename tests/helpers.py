@@ -201,3 +201,19 @@ def state_of(y: np.ndarray):
     from cfb_mjx.model import State
 
     return State(*(jnp.asarray(part(y, name)) for name in NAMES))
+
+
+SMALL_TRAINING = (
+    "checkpoints=2",
+    "network.hidden=[8, 8]",
+    "analytic.drones=4",
+    "analytic.updates=4",
+    "analytic.horizon_s=0.04",
+    "ppo.drones=8",
+    "ppo.unroll=4",
+    "ppo.steps=128",
+    "ppo.minibatches=2",
+    "ppo.epochs=2",
+    "ppo.value_hidden=[8]",
+)
+"""Changes that make any training one of seconds."""

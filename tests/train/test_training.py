@@ -20,27 +20,17 @@ from cfb_mjx.train.config import AnalyticSettings, load_config
 from cfb_mjx.train.plants import load_plants
 from cfb_mjx.train.ppo import Ppo
 from cfb_mjx.train.run import CHECKPOINT, CURVE, POLICY, Training, segments, train
+from tests.helpers import SMALL_TRAINING
 
 pytestmark = pytest.mark.xdist_group("training")
 
-SMALL = (
-    "checkpoints=2",
-    "network.hidden=[8, 8]",
-    "analytic.drones=4",
-    "analytic.updates=4",
-    "analytic.horizon_s=0.04",
-    "ppo.drones=8",
-    "ppo.unroll=4",
-    "ppo.steps=128",
-    "ppo.minibatches=2",
-    "ppo.epochs=2",
-    "ppo.value_hidden=[8]",
-)
 ALGORITHMS = ("analytic", "ppo")
 
 
 def small(algorithm: str, *changes: str) -> Training:
-    return Training.prepare(load_config("target", (*SMALL, f"algorithm={algorithm}", *changes)), {"cfb_mjx": "test"})
+    return Training.prepare(
+        load_config("target", (*SMALL_TRAINING, f"algorithm={algorithm}", *changes)), {"cfb_mjx": "test"}
+    )
 
 
 def weights(folder) -> list[np.ndarray]:
@@ -99,7 +89,7 @@ def test_a_failed_drone_pays_for_the_rest_of_the_horizon_and_harms_no_gradient()
 
 def test_updates_lower_what_the_same_flights_cost():
     config = load_config(
-        "target", (*SMALL, "analytic.learning_rate=0.01", "analytic.horizon_s=0.2", "analytic.updates=400")
+        "target", (*SMALL_TRAINING, "analytic.learning_rate=0.01", "analytic.horizon_s=0.2", "analytic.updates=400")
     )
     task = config.build_task()
     analytic = Analytic(config.analytic, task, Quadrotor.from_file("cfb-guards"))
@@ -118,7 +108,7 @@ def test_ppo_finds_the_command_that_is_rewarded():
     only = [f"reward.{name}=0" for name in ("position", "velocity", "attitude", "body_rate", "failure")]
     now = ("reward.torque=1", "ppo.discount=0", "ppo.reward_scaling=1", "ppo.first_std=0.1", "ppo.learning_rate=0.01")
     sizes = ("ppo.drones=64", "ppo.unroll=4", "ppo.steps=7680", "randomisation.magnitude=0")
-    config = load_config("target", (*SMALL, *only, *now, *sizes))
+    config = load_config("target", (*SMALL_TRAINING, *only, *now, *sizes))
     task = config.build_task()
     ppo = Ppo(config.ppo, task, Quadrotor.from_file("cfb-guards"))
     first = NeuralController.random(jax.random.PRNGKey(1), task.layout, (8, 8))
@@ -132,7 +122,7 @@ def test_ppo_finds_the_command_that_is_rewarded():
 
 
 def test_the_learner_is_shown_no_reward_below_the_least_and_failed_drones_begin_anew():
-    config = load_config("target", (*SMALL, "ppo.least_reward=-7"))
+    config = load_config("target", (*SMALL_TRAINING, "ppo.least_reward=-7"))
     task = config.build_task()
     ppo = Ppo(config.ppo, task, Quadrotor.from_file("cfb-guards"))
     state = ppo.begin(jax.random.PRNGKey(0), NeuralController.random(jax.random.PRNGKey(1), task.layout, (8, 8)))
@@ -184,12 +174,12 @@ def test_earlier_trainings_are_not_overwritten_nor_mixed(tmp_path):
 
 def test_one_algorithm_goes_on_from_the_others_policy(tmp_path):
     train(small("analytic"), tmp_path / "first", evaluate=False)
-    config = load_config("target", (*SMALL, "algorithm=ppo", "ppo.learning_rate=1e-12"))
+    config = load_config("target", (*SMALL_TRAINING, "algorithm=ppo", "ppo.learning_rate=1e-12"))
     training = Training.prepare(config, {}, tmp_path / "first" / POLICY)
     train(training, tmp_path / "second", evaluate=False)
     for a, b in zip(weights(tmp_path / "first"), weights(tmp_path / "second"), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
-    other = load_config("target", (*SMALL, "network.hidden=[9]"))
+    other = load_config("target", (*SMALL_TRAINING, "network.hidden=[9]"))
     with pytest.raises(CfbError, match="another observation or network"):
         Training.prepare(other, {}, tmp_path / "first" / POLICY)
 
@@ -201,7 +191,7 @@ def test_a_model_with_effects_is_trained_on_and_a_predictor_is_refused(tmp_path)
     )
     base = load_model_file("cfb-guards")
     save_model_file(replace(base, effects=effects), tmp_path / "m.yaml")
-    config = replace(load_config("target", SMALL), model=str(tmp_path / "m.yaml"))
+    config = replace(load_config("target", SMALL_TRAINING), model=str(tmp_path / "m.yaml"))
     train(Training.prepare(config, {}), tmp_path / "run", evaluate=False)
     save_model_file(replace(base, kind="predictor"), tmp_path / "p.yaml")
     config = replace(config, model=str(tmp_path / "p.yaml"))
