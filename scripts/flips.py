@@ -181,7 +181,7 @@ class Course:
                 axis.set_aspect("equal", adjustable="datalim")
             plots[0].set_ylabel("z, m")
             plots[0].legend(loc="upper left")
-            figure.subplots_adjust(left=0.06, right=0.99, bottom=0.13, top=0.91, wspace=0.22)
+            figure.subplots_adjust(left=0.07, right=0.99, bottom=0.13, top=0.91, wspace=0.22)
             save(figure, PAGE / "flips.png")
         for name in ("double-flip-paper", "double-flip-low", "triple-flip-low"):
             flown = flips(self.manoeuvre(name), self.calm, self.nominal, self.few[:1])[1]

@@ -14,6 +14,7 @@ from cfb_mjx.control.pilot import find_pilot
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.envs.episode import QUIET
+from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_randomisation
 from cfb_mjx.train.config import FlipTrainingConfig, load_config
@@ -123,6 +124,8 @@ def test_a_search_never_does_worse_than_what_it_is_given():
     assert float(found.cost) < 0.5
     fixed = search(given, WILD, DRONE, margin, key, bounds(2, rate_radps=19.0), 1, **sizes)
     np.testing.assert_allclose(fixed.knobs.rate_radps, 19.0, rtol=1e-6)
+    with pytest.raises(CfbError, match="randomised drones"):
+        search(given, TargetTask(), DRONE, margin, key)
 
 
 def test_the_shipped_flip_policy_says_where_it_comes_from():

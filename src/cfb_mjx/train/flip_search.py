@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cfb_mjx.control.manoeuvre import Knobs, Manoeuvre
 from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.train.flips import FLOOR_M, Flips, flips
 from cfb_mjx.train.flying import nominal_task
@@ -107,13 +108,17 @@ def search(
         candidates: per round.
         plants: randomised drones per candidate, for ``margin``.
         report: called after every round with its number and the cost of its best candidate.
+
+    Raises:
+        CfbError: a margin is looked for where nothing is randomised.
     """
+    if goal.aim == "margin" and task.randomisation is None:
+        raise CfbError("A flip's margin is looked for on randomised drones; give the task a randomisation.")
     within = bounds(goal.rotations) if within is None else within
     low, high = (jnp.stack([jnp.asarray(x, float) for x in side]) for side in within)
     of_nominal, of_plants, of_draws = jax.random.split(key, 3)
     few = jax.random.split(of_nominal, 4)
     many = jax.random.split(of_plants, plants)
-
     mean, std = jnp.full(len(low), 0.5), jnp.full(len(low), 0.35)
     given = jnp.clip(jnp.stack([jnp.asarray(x, float) for x in manoeuvre.knobs]), low, high)
     best = jnp.where(high > low, (given - low) / jnp.where(high > low, high - low, 1.0), 0.0)
