@@ -7,6 +7,7 @@ docs/magnitudes.md and its figure.
 """
 
 import json
+import math
 
 from campaign import PAPER, PAPER_FIRMWARE, ROOT, Judge, Run, carry_out, facts_line, study_arguments
 
@@ -82,8 +83,8 @@ def _span(values: list, digits: str) -> str:
 def _best(runs: dict) -> list[str]:
     """Which magnitude holds the off-nominal drones best: on the mean of the seeds, and seed by seed."""
     away = {m: _of(_scores(runs, m))["away"] for m in MAGNITUDES if _scores(runs, m)}
-    if any(None in values for values in away.values()):
-        return []
+    # Who loses a drone is worse than who keeps it badly.
+    away = {m: [math.inf if v is None else v for v in values] for m, values in away.items()}
     best = min(away, key=lambda m: sum(away[m]) / len(away[m]))
     each = zip(*(away[m] for m in away), strict=False)
     seeds = ", ".join(f"{list(away)[values.index(min(values))]:g}" for values in each)
@@ -134,6 +135,15 @@ def page(found: dict, firmware: dict) -> str:
             cells += [_span(s["random_failed"], ".2%"), *(f"{x:g}" for x in PAPER[magnitude])]
             lines.append("| " + " | ".join(cells) + " |")
         lines += ["", *_best(of)]
+        if "reward" in last:
+            curves = [[row["reward"] for row in run["curve"]] for run in of.values()]
+            gain = [curve[-1] - curve[len(curve) // 2] for curve in curves]
+            lines += [
+                "",
+                f"From the middle of the trainings to their ends rewards changed by {min(gain):+.3f} to "
+                f"{max(gain):+.3f} per command: where they still rise, errors tell how far learning has come as much as what the "
+                "randomisation is worth.",
+            ]
     lines += [
         "",
         "## The firmware's controllers, same tests",
@@ -193,14 +203,12 @@ def figure(found: dict, path) -> None:
                 if row == 0:
                     axis.set_yscale("log")
                     axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-                else:
-                    axis.set_ylim(bottom=0)
                 axis.set_ylabel(label)
                 if row == 0:
                     axis.set_title(TITLES[algorithm])
                 else:
                     axis.set_xlabel("magnitude of the randomisation")
-        axes[0][0].set_ylim(top=2000)
+        axes[1][0].set_ylim(bottom=0)
         axes[0][0].legend(frameon=False, fontsize=8, loc="upper right")
         plot.subplots_adjust(left=0.17 / len(found), right=0.98, bottom=0.1, top=0.93, wspace=0.3, hspace=0.12)
         save(plot, path)
