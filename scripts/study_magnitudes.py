@@ -141,8 +141,8 @@ def page(found: dict, firmware: dict) -> str:
             lines += [
                 "",
                 f"From the middle of the trainings to their ends rewards changed by {min(gain):+.3f} to "
-                f"{max(gain):+.3f} per command: where they still rise, errors tell how far learning has come as much as "
-                "what the randomisation is worth.",
+                f"{max(gain):+.3f} per command: where they still rise, errors tell how far learning has come as much "
+                "as what the randomisation is worth.",
             ]
     lines += [
         "",
