@@ -2,28 +2,25 @@
 
     python scripts/tracing_sweep.py [--null 100] [--results benchmarks/tracing.jsonl] [--page-only] [--from-end]
 
-The plants (tests/plants) are an independent simulator with effects of other functional forms than the catalogue's.
-Results are kept campaign by campaign: an interrupted sweep goes on where it was.
+The plants (cfb_mjx.labelled_plants) are an independent simulator with effects of other functional forms than the
+catalogue's. Results are kept campaign by campaign: an interrupted sweep goes on where it was.
 """
 
 import argparse
 import json
-import sys
 import time
 from collections import Counter, defaultdict
 from pathlib import Path
 
 import numpy as np
 
+from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.files import write_text
+from cfb_mjx.labelled_plants import EFFECTS, Case, fly_campaigns, label
+from cfb_mjx.parameters import load_model_file
+from cfb_mjx.sysid.tracing.fits import ERRORS
+
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tests"))
-
-from plants import EFFECTS, Case, fly_campaigns, label  # noqa: E402
-
-from cfb_mjx.cli.runtime import configure_jax, environment  # noqa: E402
-from cfb_mjx.files import write_text  # noqa: E402
-from cfb_mjx.parameters import load_model_file  # noqa: E402
-from cfb_mjx.sysid.tracing.fits import ERRORS  # noqa: E402
 
 BATCH = 8
 WEAK = 0.35
@@ -144,7 +141,7 @@ def page(results: Path, planned: int) -> str:
         else f"{len(lines)} of {planned} campaigns of the sweep have been traced so far, in an order of no meaning; "
         "the command goes on with the rest.",
         "",
-        "Campaigns of 10 to 11 flights by an independent simulator (`tests/plants`, plain NumPy, flown closed loop)",
+        "Campaigns of 10 to 11 flights by an independent simulator (`cfb_mjx.labelled_plants`, plain NumPy, closed loop)",
         "whose effects have other functional forms than the catalogue's. The search was developed on other seeds.",
         "*Buys* is the largest share by which a perfect model would lower one of eight held-out errors (position,",
         "velocity, attitude, rate; 0.2 and 0.5 s), measured on the same flights flown without the effect; *recovered*",

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from plants.firmware_pid import Drone, flight
+from firmware_pid import Drone, flight
 
 from cfb_mjx.control import FirmwarePid, Setpoint, init, resume, step
 from cfb_mjx.control.pid import COUNTS, DT, mix

@@ -5,14 +5,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from plants import EFFECTS, OUTSIDE, Case, effects, fly_campaigns, physics
-from plants import constants as c
-from plants.airframe import PLAIN_ROWS, SPEED, P, Q, V, W, advance, derivative
-from plants.manoeuvres import MANOEUVRES
-from plants.sensors import QUIET, row_ticks
-from plants.simulation import Lane, simulate
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
+
+from cfb_mjx.labelled_plants import EFFECTS, OUTSIDE, Case, effects, fly_campaigns, physics
+from cfb_mjx.labelled_plants import constants as c
+from cfb_mjx.labelled_plants.airframe import PLAIN_ROWS, SPEED, P, Q, V, W, advance, derivative
+from cfb_mjx.labelled_plants.manoeuvres import MANOEUVRES
+from cfb_mjx.labelled_plants.sensors import QUIET, row_ticks
+from cfb_mjx.labelled_plants.simulation import Lane, simulate
 
 # They share fixtures and compiled programs.
 pytestmark = pytest.mark.xdist_group("plants")

@@ -8,9 +8,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from plants import Case, fly_campaigns
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.logs import read_log
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import Inertia, RotorDrag

@@ -1,4 +1,4 @@
-"""Tracing on labelled plants (tests/plants), and the pieces it is made of."""
+"""Tracing on labelled plants (cfb_mjx.labelled_plants), and the pieces it is made of."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from plants import Case, fly_campaigns
 from scipy.stats import norm
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import CATALOGUE, RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file

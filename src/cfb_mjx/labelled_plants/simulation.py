@@ -7,11 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from plants import constants as c
-from plants import physics
-from plants.airframe import BOB, BOB_V, ESC, LAGGED, PLAIN_ROWS, ROWS, SPEED, P, Q, V, W, advance
-from plants.controller import DITHER, POSITION, YAW_ANGLE, Controller
-from plants.sensors import Instruments, LowPass, Recorder
+from cfb_mjx.labelled_plants import constants as c
+from cfb_mjx.labelled_plants import physics
+from cfb_mjx.labelled_plants.airframe import BOB, BOB_V, ESC, LAGGED, PLAIN_ROWS, ROWS, SPEED, P, Q, V, W, advance
+from cfb_mjx.labelled_plants.controller import DITHER, POSITION, YAW_ANGLE, Controller
+from cfb_mjx.labelled_plants.pilot import Pilot, relative
+from cfb_mjx.labelled_plants.sensors import Instruments, LowPass, Recorder
 
 CHUNK = 250  # ticks of noise drawn at a time
 # Columns of the noise: position, velocity, quaternion, gyro, then what drives push, twist and gust.
@@ -59,9 +60,14 @@ class Flight:
     motors: np.ndarray
 
 
-def simulate(lanes: list[Lane]) -> list[Flight]:
-    """Fly all lanes side by side; nothing drawn or computed in one depends on the others."""
-    loop = _Loop(lanes)
+def simulate(lanes: list[Lane], pilot: Pilot | None = None) -> list[Flight]:
+    """Fly all lanes side by side; nothing drawn or computed in one depends on the others.
+
+    Args:
+        lanes: the flights.
+        pilot: flies them all in place of the built-in controller; it sees what is late, as a policy on board would.
+    """
+    loop = _Loop(lanes, pilot)
     for tick in range(loop.ticks):
         loop.step(tick)
     return [
@@ -73,9 +79,9 @@ def simulate(lanes: list[Lane]) -> list[Flight]:
 class _Loop:
     """State of all lanes."""
 
-    def __init__(self, lanes: list[Lane]):
+    def __init__(self, lanes: list[Lane], pilot: Pilot | None):
         count = len(lanes)
-        self.lanes = lanes
+        self.lanes, self.pilot, self.memory = lanes, pilot, None
         self.p = p = physics.stack([lane.drone for lane in lanes])
         self.goals = _padded([lane.setpoints for lane in lanes])
         self.ends = np.array([c.WARM_UP_TICKS + len(lane.setpoints) * c.SETPOINT_TICKS for lane in lanes])
@@ -91,6 +97,7 @@ class _Loop:
         self.gyro_bias = np.stack([lane.gyro_bias for lane in lanes], axis=1)
         self.controller, self.low_pass = Controller(count), LowPass(p.gyro_corner)
         self.past = [self.x[: W.start]] * c.POSE_TICKS
+        self.past_gyro = [self.x[W]] * c.POSE_TICKS
         self.commands = np.full((DELAY_RING, 4, count), c.HOVER_SPEED / c.MOTOR_GAIN)
         self.wander = np.zeros((8, count))
         self.phase = np.array([lane.rng.uniform(0, 2 * np.pi) for lane in lanes])
@@ -109,8 +116,7 @@ class _Loop:
         late[Q] /= np.sqrt((late[Q] ** 2).sum(0))
         gyro = self.x[W] + noise[10:13] + self.gyro_bias
         goal = self.goals[min(max(tick - c.WARM_UP_TICKS, 0) // c.SETPOINT_TICKS, len(self.goals) - 1)]
-        seen = SimpleNamespace(position=late[P], velocity=late[V], quaternion=late[Q])
-        command = self.controller(goal, seen, gyro)
+        command = self._decide(tick, goal, late, gyro)
         voltage = self._battery()
         held = self._held(noise, voltage)
         self.commands[tick % DELAY_RING] = command
@@ -121,6 +127,17 @@ class _Loop:
         self.x = moved
         if tick % 5 == 0:
             self._check(tick)
+
+    def _decide(self, tick, goal, late, gyro):
+        """Commands (4, F): the built-in controller's, or the pilot's, who is asked now and then and held in between."""
+        if self.pilot is None:
+            return self.controller(goal, SimpleNamespace(position=late[P], velocity=late[V], quaternion=late[Q]), gyro)
+        self.past_gyro.append(gyro)
+        late_gyro = self.past_gyro.pop(0)
+        if tick % self.pilot.every:
+            return self.commands[(tick - 1) % DELAY_RING]
+        self.memory, command = self.pilot.fly(self.memory, relative(goal, late, late_gyro))
+        return np.rint(np.clip(command + goal[DITHER], 0.0, 1.0) * 65535) / 65535
 
     def _move(self, tick, command, held):
         x, first, step = self.x, None, c.TICK / c.SUBSTEPS

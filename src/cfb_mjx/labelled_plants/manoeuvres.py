@@ -1,7 +1,7 @@
 """Set-point generators with random parameters.
 
 Each takes a Generator, a duration (s) and ``vigour`` (1; less after a crash) and returns set-points at 100 Hz, (n, 17):
-columns as in `plants.controller`.
+columns as in `cfb_mjx.labelled_plants.controller`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,17 @@ from collections.abc import Callable
 
 import numpy as np
 
-from plants.constants import SETPOINT_TICKS, TICK
-from plants.controller import ACCELERATION, DITHER, POSITION, RATES, SETPOINT_COLUMNS, VELOCITY, YAW_ANGLE, YAW_RATE
+from cfb_mjx.labelled_plants.constants import SETPOINT_TICKS, TICK
+from cfb_mjx.labelled_plants.controller import (
+    ACCELERATION,
+    DITHER,
+    POSITION,
+    RATES,
+    SETPOINT_COLUMNS,
+    VELOCITY,
+    YAW_ANGLE,
+    YAW_RATE,
+)
 
 STEP = SETPOINT_TICKS * TICK
 ROOM = np.array([2.4, 2.4])  # m either side

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from plants import constants as c
+from cfb_mjx.labelled_plants import constants as c
 
 HUB_EFFECTS = frozenset({"inflow", "rotor_drag", "flapping", "ground"})
 DISC = np.pi * c.BLADE_RADIUS**2
