@@ -141,7 +141,7 @@ def page(results: Path, planned: int) -> str:
         else f"{len(lines)} of {planned} campaigns of the sweep have been traced so far, in an order of no meaning; "
         "the command goes on with the rest.",
         "",
-        "Campaigns of 10 to 11 flights by an independent simulator (`cfb_mjx.labelled_plants`, plain NumPy, closed loop)",
+        "Campaigns of 10 to 11 flights by an independent simulator (`cfb_mjx.labelled_plants`, NumPy, closed loop)",
         "whose effects have other functional forms than the catalogue's. The search was developed on other seeds.",
         "*Buys* is the largest share by which a perfect model would lower one of eight held-out errors (position,",
         "velocity, attitude, rate; 0.2 and 0.5 s), measured on the same flights flown without the effect; *recovered*",

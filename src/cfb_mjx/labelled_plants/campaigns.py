@@ -90,21 +90,32 @@ def fly_campaigns(cases: list[Case], duration_scale: float = 1.0) -> list[Campai
     return campaigns
 
 
-def _draw(case: Case, duration_scale: float) -> tuple[list[_Plan], dict]:
-    """The flights of a case and its truth."""
+def draw_drone(case: Case) -> tuple[dict[str, np.ndarray], Instruments, dict]:
+    """The drone of a case, its sensors, and its truth: labels, what was drawn of each effect, the sensors' numbers."""
     drone = physics.nominal()
     truth: dict = {"labels": case.labels, "effects": {}}
     for order, (name, strength) in enumerate(case.effects):
         rng = np.random.default_rng([case.seed, 1000 + order])
         truth["effects"][name] = effects.apply(name, rng, drone, strength)
-    rng = np.random.default_rng([case.seed, 2000])
-    instruments = draw_instruments(rng)
+    instruments = draw_instruments(_of_case(case))
+    return drone, instruments, truth | {"instruments": vars(instruments)}
+
+
+def _of_case(case: Case) -> np.random.Generator:
+    """Draws the sensors first, then which flights are made."""
+    return np.random.default_rng([case.seed, 2000])
+
+
+def _draw(case: Case, duration_scale: float) -> tuple[list[_Plan], dict]:
+    """The flights of a case and its truth."""
+    drone, instruments, truth = draw_drone(case)
+    rng = _of_case(case)
+    draw_instruments(rng)
     fit = [*FIT, "hover"] if rng.random() < 0.6 else list(FIT)
     held_out = [rng.choice(["figure8", "circle"]), "waypoints", rng.choice(["mixed_excitation", "yaw_recovery"])]
     names = [*fit, *map(str, held_out), "climb_dive"]
     plans = [_Plan(case, drone, instruments, i, name, i >= len(fit), duration_scale) for i, name in enumerate(names)]
-    truth |= {"instruments": vars(instruments), "manoeuvres": names, "tries": [0] * len(names)}
-    return plans, truth
+    return plans, truth | {"manoeuvres": names, "tries": [0] * len(names)}
 
 
 def _lane(plan: _Plan, attempt: int) -> Lane:
@@ -127,9 +138,13 @@ def _lane(plan: _Plan, attempt: int) -> Lane:
 
 
 def _log(plan: _Plan, lane: Lane, flight: Flight, attempt: int) -> FlightLog:
-    """A log of a flight, with the noise of whatever the controller did not use."""
     rng = np.random.default_rng([plan.case.seed, plan.index, attempt, 1])
-    instruments, count = plan.instruments, len(lane.rows)
+    return recorded(lane, flight, rng, f"log_{plan.index + 1:02d}")
+
+
+def recorded(lane: Lane, flight: Flight, rng: np.random.Generator, name: str) -> FlightLog:
+    """A log of a flight, with the noise, drawn from ``rng``, of whatever the controller did not use."""
+    instruments, count = lane.instruments, len(lane.rows)
     bias = 0.03 * rng.standard_normal(3)
     speed = None
     if instruments.measures_rotors and rng.random() < 0.7:
@@ -137,7 +152,7 @@ def _log(plan: _Plan, lane: Lane, flight: Flight, attempt: int) -> FlightLog:
     return FlightLog(
         time=(lane.rows - lane.rows[0]) * c.TICK,
         position=flight.pose[:, :3],
-        velocity=flight.pose[:, 3:6] * plan.drone["velocity_scale"],
+        velocity=flight.pose[:, 3:6] * lane.drone["velocity_scale"],
         quaternion=flight.pose[:, 6:],
         body_rate=flight.inertial[:, :3],
         specific_force=flight.inertial[:, 3:6] + bias + instruments.accelerometer * rng.standard_normal((count, 3)),
@@ -145,7 +160,7 @@ def _log(plan: _Plan, lane: Lane, flight: Flight, attempt: int) -> FlightLog:
         rotor_speed=speed,
         battery_voltage=flight.inertial[:, 6] + instruments.battery * rng.standard_normal(count),
         metadata={
-            "name": f"log_{plan.index + 1:02d}",
+            "name": name,
             "source": "plant",
             "format": "made",
             "observation_delay": c.POSE_TICKS * c.TICK,
