@@ -14,8 +14,17 @@ LEAST_SECONDS = 10.0
 """Of flight to fit: below this nothing could be told from chance."""
 
 
-def run_close_loop(fit: list[Path], held_out: list[Path], output: Path, model: str, changes: list[str]) -> None:
+def run_close_loop(
+    fit: list[Path],
+    held_out: list[Path],
+    output: Path,
+    model: str,
+    changes: list[str],
+    arguments: list[str] | None = None,
+) -> None:
     """Trace, judge, write the report and the corrected model.
+
+    ``arguments`` are written into the model's provenance; by default those of this process.
 
     Raises:
         CfbError: bad logs, a log on both sides, a bad model, or a folder that cannot be written.
@@ -33,7 +42,8 @@ def run_close_loop(fit: list[Path], held_out: list[Path], output: Path, model: s
     output_folder(output)
     checkpoint = Checkpoint.open(output / "search.json", fit, base)
     outcome = close_loop(logs, judged, base, say, checkpoint)
-    story = provenance("close-loop", base.name, "fit_logs_sha256", fit, held_out=[path.name for path in held_out])
+    judged_on = [path.name for path in held_out]
+    story = provenance("close-loop", base.name, "fit_logs_sha256", fit, arguments, held_out=judged_on)
     corrected = outcome.model_file(f"{base.name}-closed", story)
     facts = environment()
     report = {"case": output.resolve().name} | outcome.to_json() | {"model": base.name, "environment": facts}

@@ -353,6 +353,30 @@ def demo(output: Output = Path("out/demo"), real: Path | None = None) -> None:
     run_demo(output, real)
 
 
+def demo_loop(
+    output: Output = Path("out/demo-loop"),
+    effects: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = (),
+    seeds: int = 1,
+    seed: int = 61_000,
+) -> None:
+    """Close the loop all the way, on an independent simulator: fly, diagnose, retrain, fly again.
+
+    A policy trained on the declared model flies and logs a drone with an effect that the model lacks; close-loop names
+    it and corrects the model; the policy is trained further on that and flies the same drone again, beside a policy
+    trained with more randomisation. Writes loop.json, loop.png and index.html, and for every drone its logs, the report
+    of close-loop, the corrected model and the policy. What is done is kept: started again, it goes on where it was.
+
+    Args:
+        output: folder to write to.
+        effects: of the labelled plants, one drone each: payload, cog_offset, wind ...; by default payload.
+        seeds: drones of each effect; every seed has policies of its own.
+        seed: the first.
+    """
+    from cfb_mjx.cli.looping import run_demo_loop
+
+    run_demo_loop(output, effects, seeds, seed)
+
+
 def version() -> None:
     """Print the versions of the library and of what it computes with."""
     from cfb_mjx.cli.runtime import environment
@@ -373,6 +397,7 @@ COMMANDS = {
     "train": train,
     "fly": fly,
     "bench": bench,
+    "demo-loop": demo_loop,
     "demo": demo,
     "version": version,
 }

@@ -34,10 +34,16 @@ def require_apart(fit: list[Path], held_out: list[Path]) -> None:
         raise CfbError(f"{names}: given to fit and as --held-out; nothing may be judged on what it was fitted to.")
 
 
-def provenance(command: str, base: str, hashes_name: str, paths: list[Path], **more) -> dict:
-    """Command line without folders, model started from, hashes of the fitted files, versions; and ``more``."""
+def provenance(
+    command: str, base: str, hashes_name: str, paths: list[Path], arguments: list[str] | None = None, **more
+) -> dict:
+    """Command line without folders, model started from, hashes of the fitted files, versions; and ``more``.
+
+    ``arguments`` are those that would do the same, where another command does it.
+    """
+    given = sys.argv[2:] if arguments is None else arguments
     return {
-        "command": shlex.join(["cfb", command, *(Path(a).name if "/" in a else a for a in sys.argv[2:])]),
+        "command": shlex.join(["cfb", command, *(Path(a).name if "/" in a else a for a in given)]),
         "base_model": base,
         hashes_name: {path.name: sha256(path.read_bytes()).hexdigest() for path in paths},
         **more,

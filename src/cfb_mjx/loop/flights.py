@@ -1,0 +1,118 @@
+"""The flights a policy makes for the sake of tracing: it follows set-points that excite, and its logs are kept.
+
+A policy holds a target. Shown its position and velocity relative to a target that moves, it follows: the set-points are
+those of the labelled plants' own manoeuvres, `RAISE` higher, for a policy that does not know its drone sinks. Rates
+cannot be asked of it; in place of that manoeuvre its target jumps. Two of the flights have a dither on the commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfb_mjx.control.neural import NeuralController
+from cfb_mjx.errors import CfbError
+from cfb_mjx.labelled_plants import Case
+from cfb_mjx.labelled_plants import constants as c
+from cfb_mjx.labelled_plants.campaigns import draw_drone, recorded
+from cfb_mjx.labelled_plants.controller import DITHER, POSITION, SETPOINT_COLUMNS
+from cfb_mjx.labelled_plants.manoeuvres import MANOEUVRES, STEP
+from cfb_mjx.labelled_plants.sensors import Instruments, row_ticks
+from cfb_mjx.labelled_plants.simulation import Lane, simulate
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.loop.pilots import pilot_of
+
+FIT = ("lateral", "jumps", "vertical", "low_altitude", "motor_excitation", "long_hover")
+HELD_OUT = ("figure8", "waypoints", "climb_dive")
+SECONDS = {"long_hover": (20.0, 25.0)}
+USUAL_SECONDS = (13.0, 17.0)
+RAISE = 0.4
+"""m"""
+DITHER_OF_JUMPS = 0.02
+TRIES, GENTLER = 6, 0.85
+"""A flight that crashes is drawn anew so often, each time gentler by this factor."""
+_OWN = 7
+"""Sets the draws of these flights apart from those of the plants' own campaigns."""
+
+
+@dataclass(frozen=True)
+class Flown:
+    """A campaign: logs to fit and to judge on, what was flown and at which try, and the drone's truth."""
+
+    fit: list[FlightLog]
+    held_out: list[FlightLog]
+    manoeuvres: tuple[str, ...]
+    tries: tuple[int, ...]
+    truth: dict
+
+
+def fly_campaign(
+    case: Case,
+    controller: NeuralController,
+    duration_scale: float = 1.0,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Flown:
+    """Fly a drone with a policy and log it.
+
+    Args:
+        case: the drone.
+        controller: the policy.
+        duration_scale: factor on the logs' lengths.
+        progress: told what happens.
+
+    Raises:
+        CfbError: the policy cannot keep the drone in the air, however gently it is flown.
+    """
+    names = FIT + HELD_OUT
+    drone, instruments, truth = draw_drone(case)
+    logs: dict[int, FlightLog] = {}
+    tries = [0] * len(names)
+    for attempt in range(TRIES):
+        waiting = [i for i in range(len(names)) if i not in logs]
+        if not waiting:
+            break
+        progress(f"flying {', '.join(names[i] for i in waiting)}")
+        lanes = [_lane(case, i, names[i], attempt, drone, instruments, duration_scale) for i in waiting]
+        for i, lane, flight in zip(waiting, lanes, simulate(lanes, pilot_of([controller] * len(lanes))), strict=True):
+            tries[i] = attempt + 1
+            if not flight.crashed:
+                rng = np.random.default_rng([case.seed, i, attempt, _OWN, 1])
+                logs[i] = recorded(lane, flight, rng, f"log_{i + 1:02d}")
+    if len(logs) < len(names):
+        lost = ", ".join(name for i, name in enumerate(names) if i not in logs)
+        raise CfbError(f"{case.name}: the policy cannot keep this drone in the air ({lost}).")
+    ordered = [logs[i] for i in range(len(names))]
+    return Flown(ordered[: len(FIT)], ordered[len(FIT) :], names, tuple(tries), truth)
+
+
+def _lane(
+    case: Case, index: int, manoeuvre: str, attempt: int, drone: dict, instruments: Instruments, duration_scale: float
+) -> Lane:
+    rng, noise = np.random.default_rng([case.seed, index, attempt, _OWN]).spawn(2)
+    seconds = duration_scale * rng.uniform(*SECONDS.get(manoeuvre, USUAL_SECONDS))
+    generate = jumps if manoeuvre == "jumps" else MANOEUVRES[manoeuvre]
+    setpoints = generate(rng, seconds, GENTLER**attempt)
+    setpoints[:, POSITION.stop - 1] += RAISE * (1 + attempt)
+    return Lane(
+        drone,
+        instruments,
+        setpoints,
+        # From the warm-up's end, when a command falls due: rows see commands change as they do.
+        row_ticks(rng, len(setpoints) * c.SETPOINT_TICKS, instruments.irregular, rng.random() < 0.4),
+        voltage=rng.uniform(3.4, 3.95),
+        gyro_bias=0.003 * rng.standard_normal(3),
+        rng=noise,
+    )
+
+
+def jumps(rng: np.random.Generator, seconds: float, vigour: float) -> np.ndarray:
+    """Set-points (n, 17) at 100 Hz: the target jumps within a metre or so, and every command is dithered a little."""
+    goal = np.zeros((round(seconds / STEP), SETPOINT_COLUMNS))
+    start = 0
+    while start < len(goal):
+        goal[start:, POSITION] = [*(0.7 * vigour * rng.uniform(-1, 1, 2)), rng.uniform(0.8, 1.5)]
+        start += round(rng.uniform(0.7, 1.5) / STEP)
+    goal[:, DITHER] = DITHER_OF_JUMPS * rng.uniform(-1, 1, (len(goal), 4))
+    return goal

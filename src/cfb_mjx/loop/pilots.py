@@ -1,0 +1,52 @@
+"""Trained policies as pilots of labelled plants: jax on one side, NumPy on the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cfb_mjx.control.neural import NeuralController
+from cfb_mjx.envs.observation import Estimate
+from cfb_mjx.errors import CfbError
+from cfb_mjx.labelled_plants.constants import TICK
+from cfb_mjx.labelled_plants.pilot import Pilot, Seen
+
+
+def pilot_of(controllers: Sequence[NeuralController]) -> Pilot:
+    """One pilot for as many lanes as there are controllers, each flown by its own.
+
+    Raises:
+        CfbError: the controllers differ in more than their weights, or their control step is no multiple of a tick.
+    """
+    first = controllers[0]
+    if any(jax.tree.structure(one) != jax.tree.structure(first) for one in controllers):
+        raise CfbError("policies that fly side by side must have the same observation and layers.")
+    every = first.control_dt_s / TICK
+    if abs(every - round(every)) > 1e-6 or every < 1:
+        raise CfbError(f"a policy's control step of {first.control_dt_s} s is no multiple of the plants' {TICK} s.")
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *controllers)
+
+    def fly(memory, seen: Seen):
+        shown = [np.ascontiguousarray(x.T) for x in (seen.position, seen.velocity, seen.quaternion, seen.body_rate)]
+        if memory is None:
+            memory = _start(stacked, *shown)
+        memory, command = _command(stacked, memory, *shown)
+        return memory, np.asarray(command, float).T
+
+    return Pilot(round(every), fly)
+
+
+@eqx.filter_jit
+def _start(controllers, *shown):
+    return jax.vmap(lambda controller, *of: controller.start(Estimate(*of)))(controllers, *shown)
+
+
+@eqx.filter_jit
+def _command(controllers, memories, *shown):
+    return jax.vmap(lambda controller, memory, *of: controller.command(memory, Estimate(*of)))(
+        controllers, memories, *shown
+    )

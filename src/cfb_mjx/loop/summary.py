@@ -1,0 +1,125 @@
+"""What a study comes to, effect by effect: medians over the seeds, whether the flight got better, and if not, why."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+POLICIES = ("without_effect", "nominal", "longer", "randomised", "corrected")
+MEASURES = ("hover_mm", "track_m")
+HARDLY = 0.1
+"""What raises an error by less than this share costs hardly anything."""
+NOTES = {
+    "battery_sag": "A policy cannot see the voltage: it is trained at 3.7 V, and the flights begin with packs of 3.4 "
+    "to 3.95 V. The right model is of no use to a controller that is not told what changes."
+}
+"""What is known of an effect and a policy that only sees the estimated state."""
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Of the seeds' values: median, least and greatest; infinite where a flight crashed. ``crashed`` counts flights."""
+
+    median: float
+    least: float
+    greatest: float
+    crashed: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """One effect.
+
+    Attributes:
+        effect: its name.
+        named: what close-loop reported, seed by seed.
+        spreads: by measure and policy.
+        change: by measure, the median over seeds of the corrected policy's error over the nominal policy's, less one.
+        held_out: before and after, by error: the median over seeds.
+    """
+
+    effect: str
+    named: tuple[tuple[str, ...], ...]
+    spreads: dict[str, dict[str, Spread]]
+    change: dict[str, float]
+    held_out: dict[str, tuple[float, float]]
+
+    @property
+    def right(self) -> int:
+        """Seeds whose effect was named, whatever else was."""
+        return sum(self.effect in names for names in self.named)
+
+    def improved(self, measure: str) -> bool:
+        """Whether the median over seeds got better."""
+        return self.change[measure] < 0
+
+    @property
+    def why_not(self) -> list[str]:
+        """Sentences, where a measure did not improve."""
+        worse = [measure for measure in MEASURES if not self.improved(measure)]
+        if not worse:
+            return []
+        words = []
+        for measure in worse:
+            clean, before = (self.spreads[measure][p].median for p in ("without_effect", "nominal"))
+            if before < (1 + HARDLY) * clean:
+                words.append(
+                    f"There was little to gain in {_WORDS[measure]}: {_text(measure, before)} with the effect, "
+                    f"{_text(measure, clean)} without it, by the same policy."
+                )
+        if self.right < len(self.named):
+            words.append(f"close-loop named it for {self.right} of {len(self.named)} drones.")
+        return words + ([NOTES[self.effect]] if self.effect in NOTES else [])
+
+
+_WORDS = {"hover_mm": "hover", "track_m": "tracking"}
+
+
+def _text(measure: str, value: float) -> str:
+    return f"{value:.0f} mm" if measure == "hover_mm" else f"{value:.3f} m"
+
+
+def value_of(trial: dict[str, Any], measure: str) -> float:
+    """Mean over the flights; infinite if one of them crashed."""
+    values = trial[measure]
+    return math.inf if any(v is None for v in values) else sum(values) / len(values)
+
+
+def summarise(cells: Iterable[dict[str, Any]]) -> list[Row]:
+    """One row per effect, in the order in which they first appear.
+
+    Args:
+        cells: results as `cfb_mjx.loop.study.run` gives them.
+    """
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for cell in cells:
+        groups.setdefault(cell["effect"], []).append(cell)
+    return [_row(effect, sorted(group, key=lambda cell: cell["seed"])) for effect, group in groups.items()]
+
+
+def _row(effect: str, group: list[dict[str, Any]]) -> Row:
+    named = tuple(tuple(item["name"] for item in cell["report"]["effects"]) for cell in group)
+    spreads = {m: {p: _spread([cell["trials"][p] for cell in group], m) for p in POLICIES} for m in MEASURES}
+    change = {m: median(_change(cell["trials"], m) for cell in group) for m in MEASURES}
+    errors = group[0]["report"]["held_out"]["before"]
+    held_out = {
+        key: tuple(median(cell["report"]["held_out"][when][key] for cell in group) for when in ("before", "after"))
+        for key in errors
+    }
+    return Row(effect, named, spreads, change, held_out)
+
+
+def _spread(trials: list[dict[str, Any]], measure: str) -> Spread:
+    values = [value_of(trial, measure) for trial in trials]
+    lost = sum(v is None for trial in trials for v in trial[measure])
+    return Spread(median(values), min(values), max(values), lost)
+
+
+def _change(trials: dict[str, Any], measure: str) -> float:
+    before, after = (value_of(trials[policy], measure) for policy in ("nominal", "corrected"))
+    if math.isinf(after):
+        return 0.0 if math.isinf(before) else math.inf
+    return -1.0 if math.isinf(before) else after / before - 1
