@@ -22,8 +22,8 @@ EFFECTS = (
     "battery_sag",
     "rotor_drag",
 )
-"""Chosen before any was flown: what should push a drone away from its target, a battery whose voltage no policy sees,
-and a drag that hovering should hardly notice."""
+"""Chosen before any corrected policy had flown: what should push a drone away from its target, a battery whose voltage
+no policy sees, and a drag that hovering should hardly notice."""
 RESULTS = ROOT / "benchmarks" / "closed-loop.json"
 FIGURE = ROOT / "docs" / "closed-loop.png"
 

@@ -41,8 +41,8 @@ def lead(results: dict[str, Any]) -> str:
     effects = "effect" if len(rows) == 1 else "effects"
     return (
         f"{count} {drones} with {len(rows)} {effects} the model does not know. From flights of a policy trained on "
-        f"that model, close-loop named the effect of {right} of {count}. Trained further on the corrected model, the policy "
-        f"hovers the same drone better for {better['hover_mm']} of {len(rows)} {effects} and tracks better for "
+        f"that model, close-loop named the effect of {right} of {count}. Trained further on the corrected model, the "
+        f"policy hovers the same drone better for {better['hover_mm']} of {len(rows)} {effects} and tracks better for "
         f"{better['track_m']} of {len(rows)} (median over the seeds)."
     )
 
@@ -102,7 +102,8 @@ def _story(settings: dict[str, Any]) -> list[str]:
     return [
         "The drones are labelled plants (cfb_mjx.labelled_plants): a simulator in plain NumPy that shares no line with "
         "the model, with effects of other functional forms than the catalogue's, sensor noise, gusts of force and "
-        "torque, and a battery that drains. Effects and seeds were chosen before any of them was flown.",
+        "torque, and a battery that drains. The effects were chosen for what they should do to a flight, before any "
+        "corrected policy had flown; flights and training were developed on other seeds.",
         f"1. A policy is trained on the declared model by back-propagation (configuration `loop`, "
         f"{analytic['updates']} updates of {analytic['drones']} drones, randomisation x "
         f"{config['randomisation']['magnitude']:g}).",
