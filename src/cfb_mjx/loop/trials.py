@@ -25,7 +25,7 @@ HEIGHT = 1.2
 HOVERS, HOVER_S, SETTLING_S = 6, 6.0, 1.0
 """Flights, how long each, and how much of it is not counted, as in the paper's hover test."""
 TRACKS, TRACK_S, ENTRY_S = 4, 15.0, 3.0
-PERIOD_S, WIDTH_M, DEPTH_M, RAMP_S = 6.0, 1.0, 0.5, 2.0
+PERIOD_S, WIDTH_M, DEPTH_M, RAMP_S = 12.0, 1.0, 0.5, 2.0
 """A figure eight: one round, half its width and depth, and how long its pace takes to build up."""
 _OWN = 9
 
