@@ -96,6 +96,8 @@ def test_empty_and_truncated_files(cfb, files, tmp_path, kind, keep):
         (["evaluate", "absent.mcap"], ["absent.mcap"]),
         (["evaluate"], ["log"]),
         (["fly-away"], ["fly-away", "evaluate"]),
+        (["demo-loop", "--effects", "gremlins"], ["gremlins", "payload"]),
+        (["demo-loop", "--seeds", "0"], ["--seeds 0"]),
         (["evaluate", "FLIGHT", "--model", "cfb-unknown"], ["cfb-unknown", "cfb-guards"]),
         (["evaluate", "FLIGHT", "--set", "mass=heavy"], ["mass=heavy"]),
         (["evaluate", "FLIGHT", "--set", "mass=-1"], ["mass"]),
