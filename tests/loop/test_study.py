@@ -60,6 +60,7 @@ class Counted:
                 "longer": trial(38.0, 0.06),
                 "randomised": trial(20.0, 0.04),
                 "corrected": trial(5.0, 0.05) if good else trial(25.0, 0.06),
+                "both": trial(6.0, 0.03),
                 "without_effect": trial(4.0, 0.05) if good else trial(19.0, 0.05),
                 "environment": {"date": "2000-01-01", "processor": "none"},
             }
@@ -76,6 +77,7 @@ class Counted:
 SETTINGS = {
     "config": {"analytic": {"updates": 5, "drones": 2}, "randomisation": {"magnitude": 0.25}},
     "further": ("analytic.updates=2",),
+    "both": ("analytic.updates=2", "randomisation.magnitude=1.0"),
     "randomised": ("randomisation.magnitude=1.0", "analytic.updates=7"),
     "flights": {
         "FIT": ["lateral"],
@@ -83,6 +85,7 @@ SETTINGS = {
         "USUAL_SECONDS": [1.0, 2.0],
         "SECONDS": {"long_hover": [3.0, 4.0]},
         "DITHER_OF_JUMPS": 0.02,
+        "RAISE": 0.4,
     },
     "trials": {"HOVERS": 2, "HOVER_S": 6.0, "SETTLING_S": 1.0, "TRACKS": 1, "TRACK_S": 9.0, "ENTRY_S": 3.0}
     | {"WIDTH_M": 1.0, "DEPTH_M": 0.5, "PERIOD_S": 6.0},
@@ -146,6 +149,7 @@ def test_a_summary_is_of_medians_and_says_what_did_not_help(results):
     payload, wind = summarise(results["cells"].values())
     assert (payload.right, wind.right) == (3, 0)
     assert payload.change["hover_mm"] == pytest.approx(-0.875)
+    assert payload.alone["hover_mm"] == pytest.approx(-0.05)
     assert payload.improved("hover_mm")
     assert payload.improved("track_m")
     assert not payload.why_not

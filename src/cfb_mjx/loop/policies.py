@@ -19,6 +19,8 @@ FURTHER = ("analytic.updates=200", "analytic.learning_rate=1.0e-3")
 """Of a policy gone on with, on the corrected model or, to be fair, on the declared one."""
 RANDOMISED = ("randomisation.magnitude=1.0", "analytic.updates=700")
 """The paper's whole spread, and as many updates as `CONFIG` and `FURTHER` have together."""
+BOTH = (*FURTHER, RANDOMISED[0])
+"""Of the randomised policy gone on with on the corrected model."""
 DONE = "training.json"
 
 Progress = Callable[[int, int, float, float], None]
@@ -31,7 +33,7 @@ def train_policy(
     changes: tuple[str, ...] = (),
     model: Path | None = None,
     start: Path | None = None,
-    progress: Progress = lambda done, total, rate, left: None,
+    begin: Callable[[], Progress] = lambda: lambda done, total, rate, left: None,
 ) -> dict[str, Any]:
     """Train into ``folder``, or go on where an interruption left it; what is done is left alone.
 
@@ -42,7 +44,7 @@ def train_policy(
         changes: to the configuration `CONFIG`.
         model: YAML in place of the declared model.
         start: policy file to begin from.
-        progress: as of `cfb_mjx.train.run.train`.
+        begin: called where there is something to train; gives `cfb_mjx.train.run.train` its progress.
 
     Returns:
         The last row of the learning curve.
@@ -52,7 +54,7 @@ def train_policy(
     choices = {"seed": seed, "model": None if model is None else str(model)}
     training = Training.prepare(with_changes(load_config(CONFIG, changes), **choices), versions, start)
     with jax.enable_x64(False):
-        rows = train(training, folder, resume=True, progress=progress)
+        rows = train(training, folder, resume=True, progress=begin())
     write_json(folder / DONE, rows[-1])
     return rows[-1]
 

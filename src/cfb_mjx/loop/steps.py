@@ -15,12 +15,12 @@ from cfb_mjx.files import write_json
 from cfb_mjx.logs import write_mcap
 from cfb_mjx.loop import flights, policies, trials
 from cfb_mjx.loop.flights import fly_campaign
-from cfb_mjx.loop.policies import FURTHER, RANDOMISED, policy_file, train_policy
+from cfb_mjx.loop.policies import BOTH, FURTHER, RANDOMISED, policy_file, train_policy
 from cfb_mjx.loop.study import Cell, Steps
 from cfb_mjx.loop.trials import fly_trials
 from cfb_mjx.train.config import load_config
 
-FLOWN, CLOSED, LEARNT = "flown.json", "closed", "corrected"
+FLOWN, CLOSED, LEARNT, LEARNT_BOTH = "flown.json", "closed", "corrected", "both"
 KEPT = ("effects", "unexplained", "unexplained_because", "unconfirmed")
 HELD_OUT = ("position_rmse_m@0.5s", "velocity_rmse_mps@0.5s", "attitude_rmse_deg@0.5s", "rate_rmse_radps@0.5s")
 
@@ -37,6 +37,7 @@ def settings() -> dict[str, Any]:
         "config": load_config(policies.CONFIG).to_mapping(),
         "randomised": RANDOMISED,
         "further": FURTHER,
+        "both": BOTH,
         "flights": {name: getattr(flights, name) for name in names},
         "trials": {name: getattr(trials, name) for name in (*tests, *eight)},
     }
@@ -54,8 +55,11 @@ def real_steps(facts: dict[str, str], close: Close, say: Callable[[str], None], 
     versions = {name: facts[name] for name in ("cfb_mjx", "jax", "jaxlib", "python")}
 
     def trained(what: str, folder: Path, seed: int, **options) -> dict[str, Any]:
-        say(f"training: {what}")
-        return train_policy(folder, seed, versions, progress=watch(what), **options)
+        def begin():
+            say(f"training {what}")
+            return watch(what)
+
+        return train_policy(folder, seed, versions, begin=begin, **options)
 
     def common(seed: int, folder: Path) -> dict[str, Any]:
         nominal = trained("on the declared model", folder / "nominal", seed)
@@ -79,12 +83,17 @@ def real_steps(facts: dict[str, str], close: Close, say: Callable[[str], None], 
         return {key: found[key] for key in KEPT} | {"held_out": errors, "seconds": time.perf_counter() - began}
 
     def learn(cell: Cell, shared: Path, own: Path) -> dict[str, Any]:
-        model, start = own / CLOSED / "model.yaml", policy_file(shared / "nominal")
-        return trained("on the corrected model", own / LEARNT, cell.seed, changes=FURTHER, model=model, start=start)
+        model, seed = own / CLOSED / "model.yaml", cell.seed
+        start, wide = (policy_file(shared / name) for name in ("nominal", "randomised"))
+        what = "on the corrected model"
+        row = trained(what, own / LEARNT, seed, changes=FURTHER, model=model, start=start)
+        both = trained(f"{what}, randomised", own / LEARNT_BOTH, seed, changes=BOTH, model=model, start=wide)
+        return {"corrected": row, "both": both}
 
     def judge(cell: Cell, shared: Path, own: Path) -> dict[str, Any]:
         say("flying the same drone again")
-        files = {name: shared / name for name in ("nominal", "longer", "randomised")} | {"corrected": own / LEARNT}
+        files = {name: shared / name for name in ("nominal", "longer", "randomised")}
+        files |= {"corrected": own / LEARNT, "both": own / LEARNT_BOTH}
         with jax.enable_x64(False):
             controllers = {name: load_policy(policy_file(folder)).controller for name, folder in files.items()}
             judged = fly_trials(cell.case, controllers, "nominal")

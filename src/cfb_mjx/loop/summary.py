@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-POLICIES = ("without_effect", "nominal", "longer", "randomised", "corrected")
+POLICIES = ("without_effect", "nominal", "longer", "randomised", "corrected", "both")
 MEASURES = ("hover_mm", "track_m")
 HARDLY = 0.1
 """What raises an error by less than this share costs hardly anything."""
@@ -38,6 +38,7 @@ class Row:
         named: what close-loop reported, seed by seed.
         spreads: by measure and policy.
         change: by measure, the median over seeds of the corrected policy's error over the nominal policy's, less one.
+        alone: the same of the policy trained as long on the declared model.
         held_out: before and after, by error: the median over seeds.
     """
 
@@ -45,6 +46,7 @@ class Row:
     named: tuple[tuple[str, ...], ...]
     spreads: dict[str, dict[str, Spread]]
     change: dict[str, float]
+    alone: dict[str, float]
     held_out: dict[str, tuple[float, float]]
 
     @property
@@ -103,13 +105,16 @@ def summarise(cells: Iterable[dict[str, Any]]) -> list[Row]:
 def _row(effect: str, group: list[dict[str, Any]]) -> Row:
     named = tuple(tuple(item["name"] for item in cell["report"]["effects"]) for cell in group)
     spreads = {m: {p: _spread([cell["trials"][p] for cell in group], m) for p in POLICIES} for m in MEASURES}
-    change = {m: median(_change(cell["trials"], m) for cell in group) for m in MEASURES}
+    change, alone = (
+        {m: median(_change(cell["trials"], m, policy) for cell in group) for m in MEASURES}
+        for policy in ("corrected", "longer")
+    )
     errors = group[0]["report"]["held_out"]["before"]
     held_out = {
         key: tuple(median(cell["report"]["held_out"][when][key] for cell in group) for when in ("before", "after"))
         for key in errors
     }
-    return Row(effect, named, spreads, change, held_out)
+    return Row(effect, named, spreads, change, alone, held_out)
 
 
 def _spread(trials: list[dict[str, Any]], measure: str) -> Spread:
@@ -118,8 +123,8 @@ def _spread(trials: list[dict[str, Any]], measure: str) -> Spread:
     return Spread(median(values), min(values), max(values), lost)
 
 
-def _change(trials: dict[str, Any], measure: str) -> float:
-    before, after = (value_of(trials[policy], measure) for policy in ("nominal", "corrected"))
+def _change(trials: dict[str, Any], measure: str, policy: str) -> float:
+    before, after = (value_of(trials[name], measure) for name in ("nominal", policy))
     if math.isinf(after):
         return 0.0 if math.isinf(before) else math.inf
     return -1.0 if math.isinf(before) else after / before - 1

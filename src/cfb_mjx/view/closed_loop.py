@@ -18,6 +18,7 @@ LABELS = {
     "longer": "nominal policy, trained longer",
     "randomised": "more randomisation",
     "corrected": "corrected model",
+    "both": "corrected model and more randomisation",
 }
 _HEADS = {"hover_mm": "hover error, mm", "track_m": "tracking error, m"}
 _DIGITS = {"hover_mm": ".0f", "track_m": ".3f"}
@@ -27,6 +28,7 @@ _LOOKS = {
     "longer": ("#E69F00", "x", 5),
     "randomised": ("#009E73", "^", 5),
     "corrected": ("#0072B2", "s", 5),
+    "both": ("#56B4E9", "D", 4.5),
 }
 ERROR = "position_rmse_m@0.5s"
 
@@ -55,7 +57,10 @@ def sections(results: dict[str, Any], figure: Path) -> list[Section]:
         figure: drawn by `loop_figure`.
     """
     rows = summarise(results["cells"].values())
-    short = "Each effect's median over its seeds; changes are those of the corrected policy against the nominal one."
+    short = (
+        "Each effect's median over its seeds; changes are those of the policy trained on the corrected model against "
+        "the nominal one it began from. Beside them, what as much training on the declared model changed."
+    )
     return [
         Section("In short", [short], [_in_short(rows)], [(figure, "hover and tracking error, effect by effect")]),
         Section("What was done", _story(results["settings"])),
@@ -75,10 +80,16 @@ def sections(results: dict[str, Any], figure: Path) -> list[Section]:
 
 def _in_short(rows: Sequence[Row]) -> tuple:
     body = [
-        [row.effect, f"{row.right} of {len(row.named)}", *(_percent(row.change[m]) for m in MEASURES), _verdict(row)]
+        [
+            row.effect,
+            f"{row.right} of {len(row.named)}",
+            *(_percent(change) for m in MEASURES for change in (row.change[m], row.alone[m])),
+            _verdict(row),
+        ]
         for row in rows
     ]
-    return "", ["effect", "named right", "hover error", "tracking error", "the flight is"], body
+    alone = "training alone"
+    return "", ["effect", "named right", "hover error", alone, "tracking error", alone, "the flight is"], body
 
 
 def _verdict(row: Row) -> str:
@@ -111,8 +122,9 @@ def _story(settings: dict[str, Any]) -> list[str]:
         f"{', '.join(flights['HELD_OUT'])} to judge on, {flights['USUAL_SECONDS'][0]:g} to "
         f"{flights['USUAL_SECONDS'][1]:g} s each (long_hover {flights['SECONDS']['long_hover'][0]:g} to "
         f"{flights['SECONDS']['long_hover'][1]:g} s). It is shown position, velocity and heading relative to a target "
-        f"that moves. In motor_excitation, jumps (by up to {flights['DITHER_OF_JUMPS']:g}) and nowhere else a dither "
-        "is added to its commands, which its own memory of commands does not see.",
+        f"that moves, {flights['RAISE']:g} m higher than the plants' own controller would be sent. In motor_excitation "
+        f"(a few hundredths) and in jumps (up to {flights['DITHER_OF_JUMPS']:g}) a dither is added to its commands, "
+        "which its own memory of commands does not see; nowhere else.",
         "3. `cfb close-loop` gets these logs and the declared model, nothing else, and writes the corrected model.",
         f"4. The policy is trained further on the corrected model: {further['analytic.updates']} updates.",
         f"5. The same drone is flown again, under other noise. Hover: {trials['HOVERS']} flights of "
@@ -123,8 +135,8 @@ def _story(settings: dict[str, Any]) -> list[str]:
         "the drone's own tracking reports.",
         f"Beside it: the nominal policy trained further by the same number of updates on the declared model (whatever "
         f"more training is worth); a policy trained on randomisation x {float(more['randomisation.magnitude']):g} with "
-        f"as many updates as the corrected one had in all; and the nominal policy on the same drone without the "
-        "effect, which is what it would fly if the model were right.",
+        f"as many updates as the corrected one had in all; that one trained further on the corrected model, still "
+        "randomised; and the nominal policy on the same drone without the effect, which is what it would fly if the model were right.",
     ]
 
 
@@ -196,17 +208,17 @@ def loop_figure(results: dict[str, Any], path: Path) -> None:
     rows = summarise(results["cells"].values())
     cells = list(results["cells"].values())
     with context():
-        from matplotlib.ticker import FormatStrFormatter, NullFormatter
+        from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-        plot = new_figure(9.6, 1.5 + 0.55 * len(rows))
+        plot = new_figure(9.6, 1.5 + 0.6 * len(rows))
         for axis, measure in zip(plot.subplots(1, 2, sharey=True), MEASURES, strict=True):
             for height, row in enumerate(rows):
                 own = [cell["trials"] for cell in cells if cell["effect"] == row.effect]
                 _draw_row(axis, height, row.spreads[measure], own, measure, height == 0)
             axis.set_xscale("log")
+            axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
             axis.xaxis.set_major_formatter(FormatStrFormatter("%g"))
-            axis.xaxis.set_minor_formatter(FormatStrFormatter("%g") if measure == "track_m" else NullFormatter())
-            axis.tick_params(axis="x", which="minor", labelsize=7)
+            axis.xaxis.set_minor_formatter(NullFormatter())
             axis.set_xlabel(_HEADS[measure])
             axis.set_yticks(range(len(rows)), [row.effect.replace("_", " ") for row in rows])
             axis.set_ylim(len(rows) - 0.5, -0.5)
@@ -219,9 +231,9 @@ def loop_figure(results: dict[str, Any], path: Path) -> None:
 def _draw_row(axis, height: int, spreads: dict[str, Spread], trials: list[dict], measure: str, label: bool) -> None:
     for number, policy in enumerate(POLICIES):
         colour, marker, size = _LOOKS[policy]
-        at = height + 0.13 * (number - 2)
+        at = height + 0.13 * (number - 2.5)
         values = [value for value in (value_of(trial[policy], measure) for trial in trials) if math.isfinite(value)]
-        axis.plot(values, [at] * len(values), marker, color=colour, markersize=0.6 * size, alpha=0.5)
+        axis.plot(values, [at] * len(values), marker, color=colour, markersize=0.6 * size, alpha=0.4)
         if math.isfinite(spreads[policy].median):
             axis.plot(
                 spreads[policy].median,
@@ -234,5 +246,5 @@ def _draw_row(axis, height: int, spreads: dict[str, Spread], trials: list[dict],
             )
     before, after = spreads["nominal"].median, spreads["corrected"].median
     if math.isfinite(before) and math.isfinite(after):
-        ends = {"xy": (after, height + 0.26), "xytext": (before, height - 0.13)}
+        ends = {"xy": (after, height + 0.195), "xytext": (before, height - 0.195)}
         axis.annotate("", **ends, arrowprops={"arrowstyle": "->", "color": "#555555", "linewidth": 0.8})
