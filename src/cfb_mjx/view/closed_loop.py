@@ -136,7 +136,8 @@ def _story(settings: dict[str, Any]) -> list[str]:
         f"Beside it: the nominal policy trained further by the same number of updates on the declared model (whatever "
         f"more training is worth); a policy trained on randomisation x {float(more['randomisation.magnitude']):g} with "
         f"as many updates as the corrected one had in all; that one trained further on the corrected model, still "
-        "randomised; and the nominal policy on the same drone without the effect, which is what it would fly if the model were right.",
+        "randomised; and the nominal policy on the same drone without the effect, which "
+        "is what it would fly if the model were right.",
     ]
 
 
