@@ -98,7 +98,7 @@ class _Problem:
         (RigidBody(), "euler", "mean"),
         (RigidBody(), "rk4", "instant"),
         (MjxBody(floor=False), "euler", "mean"),
-        (MjxBody(floor=False), "rk4", "instant"),
+        pytest.param(MjxBody(floor=False), "rk4", "instant", marks=pytest.mark.long),
     ],
     ids=lambda value: repr(value) if not isinstance(value, str) else value,
 )

@@ -58,6 +58,7 @@ def test_the_gradient_of_a_flight_is_that_of_differences():
         np.testing.assert_allclose(along, (loss(ahead) - loss(behind)) / 2e-5, rtol=1e-5)
 
 
+@pytest.mark.long
 def test_both_bodies_give_the_same_gradient():
     config = load_config("target", ("analytic.drones=2", "analytic.horizon_s=0.016", "network.hidden=[8]", "body=mjx"))
     found = []

@@ -23,6 +23,7 @@ SUMMARY = {
     "train": "train a controller, by PPO or by back-propagation through the model",
     "fly": "fly a controller in simulation and measure it",
     "bench": "measure throughput, compile time and memory",
+    "reproduce": "make the paper's figures and tables, its numbers beside ours",
     "demo": "evaluate a flight, fly 4096 randomised drones, write a page",
     "version": "print versions",
 }
