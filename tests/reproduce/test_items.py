@@ -99,7 +99,7 @@ def test_pages_hold_every_row(tmp_path):
     rows = [Row("a | b", "1", "2", "because"), Row("<c>", "", "3")]
     results = {"some": Result("Title", ["Text."], rows)}
     text = markdown(results, {"date": "today"}, "a command")
-    assert "The 1 numbers of the paper" in text
+    assert "1 comparisons with numbers of the paper" in text
     table = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(table) == 3
     assert {line.count("|") for line in table} == {5}

@@ -45,8 +45,8 @@ def markdown(results: Mapping[str, Result], facts: Mapping[str, object], command
         "",
         f"Written by `{command}`; do not edit. " + ", ".join(f"{key} {value}" for key, value in facts.items()) + ".",
         "",
-        f"The {stated} numbers of the paper that are compared, in its order, with ours and the command that makes "
-        "each; rows without a paper's number are ours alone. Where the paper is silent or cannot be right: "
+        f"{stated} comparisons with numbers of the paper, in its order, and the command that makes each; rows without "
+        "a paper's number are ours alone. Where the paper is silent or cannot be right: "
         "[deviations.md](deviations.md).",
     ]
     for name, result in results.items():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,5 +72,6 @@ def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]
 
 
 def with_std(value: float, std: float) -> str:
-    """A fitted number and its standard deviation."""
-    return f"{value:.4g} +- {std:.1g}"
+    """A fitted number and its standard deviation, that with two digits and the number to the same place."""
+    place = max(0, 1 - math.floor(math.log10(std))) if std > 0 else 6
+    return f"{value:.{place}f} +- {std:.{place}f}"
