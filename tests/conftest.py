@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import gc
-import os
 from pathlib import Path
 
-# XLA logs two harmless pages ("prefer-no-gather is not supported on the host machine") for every program it loads from
-# the compilation cache. Has to be set before jax is imported.
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+from cfb_mjx.cli.runtime import set_up_xla
+
+# As the commands do: large programs compile in half the time. `make test-long` has it off, for derivatives of MJX.
+set_up_xla()
 
 import jax
 import pytest
