@@ -10,9 +10,9 @@ from cfb_mjx.cli.runtime import set_up_xla
 # As the commands do: large programs compile in half the time. `make test-long` has it off, for derivatives of MJX.
 set_up_xla()
 
-import jax
-import pytest
-from jaxtyping import install_import_hook
+import jax  # noqa: E402
+import pytest  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
 
 # Float64 so that tests can tell a wrong term from rounding; model/test_rollout.py covers float32.
 jax.config.update("jax_enable_x64", True)
