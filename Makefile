@@ -8,11 +8,12 @@ PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13; do \
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 
-.PHONY: demo test lint bench accuracy logs clean help
+.PHONY: demo test test-long lint bench accuracy logs clean help
 
 help:
 	@echo "make demo      set up and run the main job; the page is out/demo/index.html"
 	@echo "make test      set up and run the tests"
+	@echo "make test-long the few tests that take minutes each"
 	@echo "make bench     measure speed beside crazyflow, write docs/performance.md"
 	@echo "make accuracy  measure the integrators, write docs/accuracy.md"
 	@echo "make logs      generate the shipped flight logs anew"
@@ -24,6 +25,9 @@ test: $(INSTALLED)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
+
+test-long: $(INSTALLED)
+	XLA_FLAGS=--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=false $(BIN)/python -m pytest -m long
 
 bench: $(INSTALLED) .venv-peers/.installed
 	$(BIN)/cfb bench --peer-python .venv-peers/bin/python --json benchmarks/results.json --markdown docs/performance.md

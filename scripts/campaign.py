@@ -9,10 +9,6 @@ from pathlib import Path
 from cfb_mjx.cli.runtime import configure_jax, environment, say
 
 ROOT = Path(__file__).resolve().parents[1]
-FLIGHTS, RANDOM_DRONES = 64, 512
-PAPER = {0.0: (284.76, 0.0203), 0.5: (100.07, 0.0245), 1.0: (43.16, 0.0197), 1.5: (71.39, 0.0548)}
-PAPER_FIRMWARE = {"pid": (27.81, 0.0226), "mellinger": (54.68, 0.0394)}
-"""The paper's hover tests on its real drone, networks by magnitude: mean distance in mm, command std."""
 
 
 @dataclass(frozen=True)
@@ -82,48 +78,6 @@ def _what_counts(config: dict) -> dict:
 
 def _report(row: dict) -> None:
     say(f"  {row['commands'] / 1e6:.3g} M commands, {row['seconds']:.0f} s, hover {row['hover_mm']:.4g} mm")
-
-
-class Judge:
-    """Flies a controller on the nominal drone, on randomised ones and on a set of others."""
-
-    def __init__(self, plants: str | None = "off-nominal", random_drones: int = RANDOM_DRONES):
-        import jax
-
-        from cfb_mjx.envs import TargetTask
-        from cfb_mjx.model import Quadrotor
-        from cfb_mjx.parameters import load_model_file, load_randomisation
-        from cfb_mjx.train.plants import load_plants
-
-        self.described = load_model_file("cfb-guards")
-        self.nominal = Quadrotor.from_file(self.described)
-        self.plants = {} if plants is None else load_plants(self.described, plants)
-        self.calm, self.wild = TargetTask(), TargetTask(randomisation=load_randomisation("paper"))
-        self.few = jax.random.split(jax.random.PRNGKey(0), FLIGHTS)
-        self.many = jax.random.split(jax.random.PRNGKey(1), random_drones)
-
-    def __call__(self, pilot) -> dict:
-        """Hover error and command std of any pilot."""
-        import numpy as np
-
-        from cfb_mjx.train.flying import hover
-
-        def measure(task, drone, keys, kind):
-            measured = hover(pilot, task, drone, keys)[0]
-            well = ~np.asarray(measured.failed)
-            distance, std = np.asarray(measured.mean_distance_m)[well], np.asarray(measured.command_std)[well]
-            return {
-                "hover_mm": float(1e3 * kind(distance)) if well.any() else None,
-                "command_std": float(kind(std)) if well.any() else None,
-                "failed": float(1 - well.mean()),
-            }
-
-        score = {"nominal": measure(self.calm, self.nominal, self.few, np.mean)}
-        if len(self.many):
-            score["random"] = measure(self.wild, self.nominal, self.many, np.median)
-        return score | {
-            "plants": {name: measure(self.calm, drone, self.few, np.mean) for name, drone in self.plants.items()}
-        }
 
 
 def facts_line(command: str, results: list[dict]) -> str:

@@ -10,7 +10,7 @@ and its figure.
 import json
 import statistics
 
-from campaign import ROOT, Judge, Run, carry_out, facts_line, study_arguments
+from campaign import ROOT, Run, carry_out, facts_line, study_arguments
 
 NOMINAL = ("randomisation.magnitude=0", "randomisation.graded=0.0")
 PPO = (*NOMINAL, "ppo.steps=16000000", "checkpoints=16")
@@ -45,6 +45,8 @@ def main() -> None:
             for seed in range(arguments.seeds)
             for name in arguments.chosen
         ]
+        from cfb_mjx.train.judge import Judge
+
         carry_out(runs, results, ROOT / "out" / "learning-curves", Judge(plants=None, random_drones=0))
     found = {}
     for key, run in json.loads(results.read_text()).items():

@@ -60,7 +60,8 @@ class Noise:
 
 @dataclass(frozen=True)
 class Flight:
-    """What is flown: ``drag`` [N s/m] is linear air drag on the body, which the library's declared model lacks."""
+    """What is flown: ``drag`` [N s/m] is linear air drag on the body, which the library's declared model lacks;
+    ``kicks`` are (time [s], size) of pulses about yaw on the commands that the controller did not ask for."""
 
     name: str
     description: str
@@ -68,12 +69,24 @@ class Flight:
     drag: float = 0.0
     direction: float = 1.0
     seconds: float = 12.0
+    size: float = 1.0
+    kicks: tuple[tuple[float, float], ...] = ()
 
 
 FLIGHTS = (
     Flight("figure8", "figure eight; the plant has exactly the parameters of cfb-guards", seed=8),
     Flight("drag", "figure eight; the plant has linear air drag of 0.05 N s/m", seed=9, drag=0.05, direction=-1.0),
+    Flight(
+        "yaw",
+        "hover, disturbed about yaw three times; the plant has exactly the parameters of cfb-guards",
+        seed=10,
+        seconds=5.0,
+        size=0.0,
+        kicks=((1.0, 0.3), (2.4, -0.3), (3.8, 0.3)),
+    ),
 )
+KICK_S = 0.16
+"""How long a pulse lasts."""
 
 
 # ---------------------------------------------------------------------------------------------------- the plant
@@ -135,7 +148,7 @@ def fly_tick(y: np.ndarray, command: np.ndarray, drag: float) -> np.ndarray:
 # ----------------------------------------------------------------------------------------------- the controller
 
 
-def reference(t: float, direction: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+def reference(t: float, flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Position, velocity, acceleration and heading to fly at time t [s]: a figure eight that begins from hover."""
     # The phase accelerates smoothly over two seconds, so that the reference has continuous acceleration.
     fraction = np.clip(t / 2.0, 0.0, 1.0)
@@ -143,18 +156,23 @@ def reference(t: float, direction: float) -> tuple[np.ndarray, np.ndarray, np.nd
     rate = full * (3 * fraction**2 - 2 * fraction**3)
     rate_change = full * (6 * fraction - 6 * fraction**2) / 2.0
     phase = full * (2.0 * (fraction**3 - fraction**4 / 2) + max(t - 2.0, 0.0))
-    size = np.array([1.1, 0.65 * direction, 0.25])
+    size = flight.size * np.array([1.1, 0.65 * flight.direction, 0.25])
     often = np.array([1.0, 2.0, 1.0])
     angle = often * phase
     curve, slope, bend = np.sin(angle), often * np.cos(angle), -(often**2) * np.sin(angle)
     position = np.array([0.0, 0.0, 1.2]) + size * curve
-    return position, size * slope * rate, size * (bend * rate**2 + slope * rate_change), 0.5 * np.sin(0.6 * phase)
+    return (
+        position,
+        size * slope * rate,
+        size * (bend * rate**2 + slope * rate_change),
+        flight.size * 0.5 * np.sin(0.6 * phase),
+    )
 
 
 def control(t: float, seen: np.ndarray, speed: np.ndarray, flight: Flight) -> np.ndarray:
     """Geometric position controller: four commands from the state as reported and the rotor speeds it expects."""
     position, velocity, q, rate = seen[:3], seen[3:6], seen[6:10], seen[10:13]
-    p, v, a, heading = reference(t, flight.direction)
+    p, v, a, heading = reference(t, flight)
     wanted = a + 6.0 * (p - position) + 4.0 * (v - velocity) + np.array([0.0, 0.0, GRAVITY])
     matrix = rotation_matrix(q)
     up = wanted / np.linalg.norm(wanted)
@@ -170,6 +188,11 @@ def control(t: float, seen: np.ndarray, speed: np.ndarray, flight: Flight) -> np
     # Invert the thrust curve (convex where rotors work), then lead so that the motors answer in 20 and not 50 ms.
     s = np.interp(thrust, *_CURVE)
     return np.clip(speed / MOTOR_GAIN + 2.5 * (s - speed / MOTOR_GAIN), 0.05, 1.0)
+
+
+def kick(t: float, flight: Flight) -> np.ndarray:
+    """What disturbs the commands at time t."""
+    return sum((size for at, size in flight.kicks if at <= t < at + KICK_S), 0.0) * YAW
 
 
 _GRID = np.linspace(0.15, 1.0, 400)
@@ -192,7 +215,7 @@ def fly(flight: Flight, noise: Noise) -> FlightLog:
     """Fly it and return what was logged."""
     random = np.random.default_rng(flight.seed)
     hover = np.interp(MASS * GRAVITY / 4, *_CURVE) * MOTOR_GAIN
-    y = np.concatenate([reference(0.0, flight.direction)[0], np.zeros(3), [1, 0, 0, 0], np.zeros(3), np.full(4, hover)])
+    y = np.concatenate([reference(0.0, flight)[0], np.zeros(3), [1, 0, 0, 0], np.zeros(3), np.full(4, hover)])
     past = [y] * (DELAY + 1)
     deviation = np.repeat(
         [noise.position, noise.velocity, noise.attitude, noise.gyro, noise.rotor_speed, noise.accelerometer],
@@ -208,7 +231,7 @@ def fly(flight: Flight, noise: Noise) -> FlightLog:
         late = past[0]
         seen = np.concatenate([late[:6] + e[:6], turned(late[6:10], e[6:9]), y[10:13] + e[9:12], y[13:17] + e[12:16]])
         t = tick * TICK
-        command = control(max(t, 0.0), seen, expected, flight)
+        command = control(max(t, 0.0), seen, expected, flight) + kick(t, flight)
         expected = MOTOR_GAIN * command + (expected - MOTOR_GAIN * command) * np.exp(-TICK / MOTOR_LAG)
         # Battery: drops while it empties and with the current, here taken as proportional to rotor power. The firmware
         # compensates it, so the motors do not see it.

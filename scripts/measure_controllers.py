@@ -8,12 +8,13 @@ Minutes. The paper's own numbers are of the real drone and stand beside.
 import argparse
 import sys
 
-from campaign import PAPER, PAPER_FIRMWARE, ROOT, Judge
+from campaign import ROOT
 
 from cfb_mjx.cli.runtime import configure_jax, environment, say
+from cfb_mjx.reproduce.paper import PAPER_FIRMWARE, PAPER_HOVER
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-PAPER_OF = {"target": PAPER[1.0], **PAPER_FIRMWARE}
+PAPER_OF = {"target": PAPER_HOVER[1.0], **PAPER_FIRMWARE}
 
 
 def main() -> None:
@@ -30,6 +31,7 @@ def main() -> None:
     from cfb_mjx.envs import reset
     from cfb_mjx.files import write_json, write_text
     from cfb_mjx.train.flying import hover, recovery, six_metres
+    from cfb_mjx.train.judge import Judge
 
     judge = Judge(random_drones=arguments.plants)
     described, nominal, plants = judge.described, judge.nominal, judge.plants

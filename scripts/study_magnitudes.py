@@ -9,7 +9,9 @@ docs/magnitudes.md and its figure.
 import json
 import math
 
-from campaign import PAPER, PAPER_FIRMWARE, ROOT, Judge, Run, carry_out, facts_line, study_arguments
+from campaign import ROOT, Run, carry_out, facts_line, study_arguments
+
+from cfb_mjx.reproduce.paper import PAPER_FIRMWARE, PAPER_HOVER
 
 MAGNITUDES = (0.0, 0.5, 1.0, 1.5)
 CONFIGS = {"analytic": "study-analytic", "ppo": "study-ppo"}
@@ -23,6 +25,8 @@ def main() -> None:
 
     firmware = ROOT / "benchmarks" / "magnitudes-firmware.json"
     if not arguments.page_only:
+        from cfb_mjx.train.judge import Judge
+
         judge = Judge()
         if not firmware.exists():
             from cfb_mjx.control.pilot import find_pilot
@@ -37,7 +41,10 @@ def main() -> None:
             ]
             carry_out(runs, _results(algorithm), ROOT / "out" / "magnitudes" / algorithm, judge)
     found = {a: json.loads(_results(a).read_text()) for a in CONFIGS if _results(a).exists()}
-    figure(found, ROOT / "docs" / "magnitudes.png")
+    from cfb_mjx.view.magnitudes import magnitudes_figure
+
+    runs = {TITLES[a]: {m: _of(_scores(of, m)) for m in MAGNITUDES} for a, of in found.items()}
+    magnitudes_figure(runs, PAPER_HOVER, ROOT / "docs" / "magnitudes.png")
     write_text(ROOT / "docs" / "magnitudes.md", page(found, json.loads(firmware.read_text())))
     print("docs/magnitudes.md, docs/magnitudes.png")
 
@@ -50,19 +57,14 @@ def _scores(runs: dict, magnitude: float) -> list[dict]:
     return [run["score"] for name, run in runs.items() if name.rpartition("-")[0] == f"{magnitude:g}"]
 
 
-def _away(score: dict, key: str) -> float | None:
-    """Mean over the off-nominal drones; None where one of them was lost."""
-    values = [plant[key] for plant in score["plants"].values()]
-    lost = any(plant["failed"] > 0 or plant[key] is None for plant in score["plants"].values())
-    return None if lost else sum(values) / len(values)
-
-
 def _of(scores: list[dict]) -> dict[str, list]:
+    from cfb_mjx.train.judge import away
+
     return {
         "nominal": [s["nominal"]["hover_mm"] for s in scores],
         "nominal_std": [s["nominal"]["command_std"] for s in scores],
-        "away": [_away(s, "hover_mm") for s in scores],
-        "away_std": [_away(s, "command_std") for s in scores],
+        "away": [away(s, "hover_mm") for s in scores],
+        "away_std": [away(s, "command_std") for s in scores],
         "random": [s["random"]["hover_mm"] for s in scores],
         "random_failed": [s["random"]["failed"] for s in scores],
     }
@@ -132,7 +134,7 @@ def page(found: dict, firmware: dict) -> str:
             s = _of(scores)
             cells = [f"{magnitude:g}", str(len(scores)), _span(s["nominal"], ".1f"), _span(s["nominal_std"], ".4f")]
             cells += [_span(s["away"], ".1f"), _span(s["away_std"], ".4f"), _span(s["random"], ".0f")]
-            cells += [_span(s["random_failed"], ".2%"), *(f"{x:g}" for x in PAPER[magnitude])]
+            cells += [_span(s["random_failed"], ".2%"), *(f"{x:g}" for x in PAPER_HOVER[magnitude])]
             lines.append("| " + " | ".join(cells) + " |")
         lines += ["", *_best(of)]
         if "reward" in last:
@@ -175,43 +177,6 @@ def page(found: dict, firmware: dict) -> str:
             ]
             lines.append(f"| {plant} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
-
-
-def figure(found: dict, path) -> None:
-    """Hover error and command std over magnitude: seeds as points, their mean as a line, the paper as crosses."""
-    from matplotlib.ticker import FormatStrFormatter
-
-    from cfb_mjx.view.style import COLOURS, context, new_figure, save
-
-    colours = dict(zip(("nominal", "away"), (COLOURS["hold"], COLOURS["commands_in"]), strict=True))
-    labels = {"nominal": "nominal drone", "away": "off-nominal drones"}
-    with context():
-        plot = new_figure(4.2 * len(found), 4.8)
-        axes = plot.subplots(2, len(found), squeeze=False, sharex=True, sharey="row")
-        for column, (algorithm, of) in enumerate(found.items()):
-            for row, (suffix, label) in enumerate((("", "mean distance, mm"), ("_std", "command std"))):
-                axis = axes[row][column]
-                for where, colour in colours.items():
-                    means = []
-                    for magnitude in MAGNITUDES:
-                        values = [v for v in _of(_scores(of, magnitude))[where + suffix] if v is not None]
-                        axis.plot([magnitude] * len(values), values, ".", color=colour)
-                        means.append(sum(values) / len(values) if values else float("nan"))
-                    axis.plot(MAGNITUDES, means, color=colour, label=labels[where])
-                paper = [PAPER[m][row] for m in MAGNITUDES]
-                axis.plot(MAGNITUDES, paper, "x:", color="black", label="paper, real drone")
-                if row == 0:
-                    axis.set_yscale("log")
-                    axis.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-                axis.set_ylabel(label)
-                if row == 0:
-                    axis.set_title(TITLES[algorithm])
-                else:
-                    axis.set_xlabel("magnitude of the randomisation")
-        axes[1][0].set_ylim(bottom=0)
-        axes[0][0].legend(frameon=False, fontsize=8, loc="upper right")
-        plot.subplots_adjust(left=0.17 / len(found), right=0.98, bottom=0.1, top=0.93, wspace=0.3, hspace=0.12)
-        save(plot, path)
 
 
 if __name__ == "__main__":

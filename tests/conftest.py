@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import os
+import gc
+from pathlib import Path
 
-# XLA logs two harmless pages ("prefer-no-gather is not supported on the host machine") for every program it loads from
-# the compilation cache. Has to be set before jax is imported.
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+from cfb_mjx.cli.runtime import set_up_xla
 
-import jax
-from jaxtyping import install_import_hook
+# As the commands do: large programs compile in half the time. `make test-long` has it off, for derivatives of MJX.
+set_up_xla()
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+from jaxtyping import install_import_hook  # noqa: E402
 
 # Float64 so that tests can tell a wrong term from rounding; model/test_rollout.py covers float32.
 jax.config.update("jax_enable_x64", True)
@@ -25,3 +28,18 @@ def pytest_configure(config) -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(cache.mkdir("jax")))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
+
+
+MAPS = Path("/proc/self/maps")
+MANY_MAPS = 20_000
+"""Linux gives a process 65530 memory maps, and every compiled program keeps some: a worker that keeps the programs of
+the whole suite dies of a segmentation fault while it compiles."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_programs():
+    """Forget compiled programs between modules once they are many."""
+    yield
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MANY_MAPS:
+        jax.clear_caches()
+        gc.collect()

@@ -13,14 +13,15 @@ from cfb_mjx.model import MjxBody, Quadrotor
 from cfb_mjx.parameters import load_randomisation, preset_names
 assert "site-packages" in cfb_mjx.__file__ or "target" in cfb_mjx.__file__, cfb_mjx.__file__
 assert str(shipped("assets", "cfb.xml")).startswith(str(pathlib.Path(cfb_mjx.__file__).parent))
-assert preset_names() == ["cf21b-500", "cfb", "cfb-guards"]
+assert preset_names() == ["cf21b-500", "cf2x", "cfb", "cfb-guards"]
 load_randomisation()
 Quadrotor.from_file("cf21b-500", body=MjxBody(floor=True))
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.train import load_config
 from cfb_mjx.train.plants import load_plants
-assert list(shipped_policies()) == ["target", "target-adaptive"]
+assert list(shipped_policies()) == ["flip", "target", "target-adaptive"]
+assert shipped("data", "study", "ppo", "1-0.npz").exists()
 for policy in shipped_policies().values():
     load_policy(policy)
 load_config("target-adaptive")

@@ -77,6 +77,7 @@ def test_a_path_is_worth_its_least_telling_pair():
     assert Told("x", {("a", "b"): 40.0}, None, False).flights is None
 
 
+@pytest.mark.long
 def test_heights_tell_ground_effect_from_thrust():
     described = load_model_file("cfb-guards")
     model = Quadrotor(described.parameters(), (GroundEffect(strength=0.15, height=0.1),))

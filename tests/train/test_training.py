@@ -58,6 +58,7 @@ def test_the_gradient_of_a_flight_is_that_of_differences():
         np.testing.assert_allclose(along, (loss(ahead) - loss(behind)) / 2e-5, rtol=1e-5)
 
 
+@pytest.mark.long
 def test_both_bodies_give_the_same_gradient():
     config = load_config("target", ("analytic.drones=2", "analytic.horizon_s=0.016", "network.hidden=[8]", "body=mjx"))
     found = []
@@ -131,8 +132,9 @@ def test_the_learner_is_shown_no_reward_below_the_least_and_failed_drones_begin_
     after, data, outcome = eqx.filter_jit(ppo._collect)(state.actor, episodes, jax.random.PRNGKey(2))
     np.testing.assert_array_equal(outcome.failed[0, :3], True)
     assert float(outcome.reward[0, :3].max()) < -298
-    np.testing.assert_array_equal(data.reward[:3, 0], -7)
-    np.testing.assert_array_equal(data.reward[:, 1:], outcome.reward[1:].T)
+    scaling = config.ppo.reward_scaling
+    np.testing.assert_array_equal(data["reward"][0, :3], -7 * scaling)
+    np.testing.assert_array_equal(data["reward"][1:], outcome.reward[1:] * scaling)
     # Another drone each, and the rest of the commands flown with it.
     assert not np.any(np.asarray(after.model.parameters.mass)[:3] == np.asarray(episodes.model.parameters.mass)[:3])
     np.testing.assert_array_equal(after.count[:3], config.ppo.unroll - 1)

@@ -13,7 +13,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cfb_mjx.cli.demo import simulated_log
 from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS, RotorDrag
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid import evaluate
@@ -27,6 +26,7 @@ from cfb_mjx.sysid.tracing.structure import BLOCK, OFFSET, binned, edges_of, exp
 from cfb_mjx.sysid.tracing.trace import Found, Trace
 from cfb_mjx.view import closing_words as words
 from cfb_mjx.view.closing import write_report
+from tests.simulated_log import simulated_log
 
 # They share fixtures and compiled programs.
 pytestmark = pytest.mark.xdist_group("view_closing")

@@ -9,6 +9,7 @@ import pytest
 from cfb_mjx.cli import demo
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import write_tabular
+from tests.simulated_log import simulated_log
 
 # They share fixtures and compiled programs.
 pytestmark = pytest.mark.xdist_group("demo")
@@ -19,7 +20,7 @@ def flown(tmp_path_factory):
     """Page and numbers of a small demo whose "real" flight is a short simulated one of another mass."""
     folder = tmp_path_factory.mktemp("demo")
     (folder / "real" / "validation").mkdir(parents=True)
-    write_tabular(demo.simulated_log(2.0), folder / "real" / "validation" / "random1_a.parquet")
+    write_tabular(simulated_log(2.0), folder / "real" / "validation" / "random1_a.parquet")
     demo.run_demo(folder / "new" / "out", folder / "real", rollouts=64)
     out = folder / "new" / "out"
     return out, json.loads((out / "demo.json").read_text()), (out / "index.html").read_text()
@@ -79,13 +80,6 @@ def test_verdict_follows_the_numbers(model, expected):
     keys = [f"{quantity}_rmse_{unit}@0.5s" for quantity, unit, _ in demo._ROWS]
     result = {"commands_in": dict(zip(keys, model, strict=True)), "hold": dict.fromkeys(keys, 1.5)}
     assert expected in demo._verdict(result)
-
-
-def test_without_shipped_logs_one_is_simulated(tmp_path):
-    log, origin = demo._demo_log(tmp_path)
-    assert log.name == "simulated"
-    assert "itself" in origin
-    assert abs(log.position - (0, 0, 1)).max() < 3.0
 
 
 def test_output_that_cannot_be_made(tmp_path):

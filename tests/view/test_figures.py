@@ -10,13 +10,13 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from cfb_mjx.cli.demo import simulated_log
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.view import Section, html_page, prediction_figure, spread_figure
 from cfb_mjx.view.prediction import euler_deg
 from cfb_mjx.view.spread import tilt_deg
+from tests.simulated_log import simulated_log
 
 
 @pytest.fixture(scope="module")

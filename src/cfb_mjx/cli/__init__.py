@@ -24,6 +24,7 @@ SUMMARY = {
     "fly": "fly a controller in simulation and measure it",
     "bench": "measure throughput, compile time and memory",
     "demo-loop": "fly a drone the model does not know, diagnose it, retrain, and fly it again",
+    "reproduce": "make the paper's figures and tables, its numbers beside ours",
     "demo": "evaluate a flight, fly 4096 randomised drones, write a page",
     "version": "print versions",
 }

@@ -10,6 +10,7 @@ import tyro
 
 from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat
 from cfb_mjx.cli.learning_commands import fly, train
+from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce
 from cfb_mjx.errors import CfbError
 
 
@@ -58,7 +59,7 @@ def evaluate(
 
     Args:
         logs: flight logs (MCAP, parquet, csv).
-        model: preset (cfb-guards, cfb, cf21b-500) or model YAML.
+        model: preset (cfb-guards, cfb, cf21b-500, cf2x) or model YAML.
         set: parameters to change, for instance mass=0.045.
         json: write the results here.
         figure: draw prediction against measurement here (.png, .svg, .pdf).
@@ -339,44 +340,6 @@ def bench(
     run_bench(list(drones), json, markdown, peer_python, quick)
 
 
-def demo(output: Output = Path("out/demo"), real: Path | None = None) -> None:
-    """Show the library at work: evaluate a flight, draw it, fly 4096 randomised drones, write a page.
-
-    Args:
-        output: folder to write to.
-        real: folder with real flights in the IDSIA layout (validation/*.parquet).
-    """
-    from cfb_mjx.cli.demo import run_demo
-    from cfb_mjx.cli.runtime import configure_jax
-
-    configure_jax(x64=True)
-    run_demo(output, real)
-
-
-def demo_loop(
-    output: Output = Path("out/demo-loop"),
-    effects: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME...")] = (),
-    seeds: int = 1,
-    seed: int = 61_000,
-) -> None:
-    """Close the loop all the way, on an independent simulator: fly, diagnose, retrain, fly again.
-
-    A policy trained on the declared model flies and logs a drone with an effect that the model lacks; close-loop names
-    it and corrects the model; the policy is trained further on that and flies the same drone again, beside a policy
-    trained with more randomisation. Writes loop.json, loop.png and index.html, and for every drone its logs, the report
-    of close-loop, the corrected model and the policy. What is done is kept: started again, it goes on where it was.
-
-    Args:
-        output: folder to write to.
-        effects: of the labelled plants, one drone each: payload, cog_offset, wind ...; by default payload.
-        seeds: drones of each effect; every seed has policies of its own.
-        seed: the first.
-    """
-    from cfb_mjx.cli.looping import run_demo_loop
-
-    run_demo_loop(output, effects, seeds, seed)
-
-
 def version() -> None:
     """Print the versions of the library and of what it computes with."""
     from cfb_mjx.cli.runtime import environment
@@ -397,6 +360,7 @@ COMMANDS = {
     "train": train,
     "fly": fly,
     "bench": bench,
+    "reproduce": reproduce,
     "demo-loop": demo_loop,
     "demo": demo,
     "version": version,

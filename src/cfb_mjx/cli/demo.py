@@ -9,7 +9,7 @@ import numpy as np
 
 from cfb_mjx.cli.runtime import environment
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import write_json, write_text
+from cfb_mjx.files import shipped, write_json, write_text
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.parameters import ModelFile, load_model_file, load_randomisation, sample_parameters
 from cfb_mjx.view import Section, html_page, prediction_figure, spread_figure
@@ -84,17 +84,10 @@ def _has_real(result: dict) -> bool:
 # ------------------------------------------------------------------------------------------------- evaluations
 
 
-def _demo_log(folder: Path = _CHECKOUT / "data" / "flight_logs") -> tuple[FlightLog, str]:
-    path = folder / f"{LOG}.mcap"
-    if path.is_file():
-        return read_log(path), (
-            "A simulated flight that comes with the project: another program integrated the same equations of motion "
-            "and added sensor noise (data/flight_logs). What the model misses here is mostly that noise."
-        )
-    return simulated_log(), (
-        "The project's flight logs are not part of an installed wheel, so this flight was made just now by the model "
-        "itself and has no noise: the small error that remains is that of its 4 ms steps. It shows how to read the "
-        "figure, not how good the model is."
+def _demo_log() -> tuple[FlightLog, str]:
+    return read_log(shipped("data", "flight_logs", f"{LOG}.mcap")), (
+        "A simulated flight that comes with the project: another program integrated the same equations of motion "
+        "and added sensor noise (data/flight_logs). What the model misses here is mostly that noise."
     )
 
 
@@ -340,46 +333,3 @@ def _page(result: dict, folder: Path) -> str:
 
 def _spread_text(quantiles: dict[str, float], unit: str) -> str:
     return ", ".join(f"{value:.3g}" for value in quantiles.values()) + f" {unit}"
-
-
-# ------------------------------------------------------------------------------------ a log where none is shipped
-
-
-def simulated_log(seconds: float = 4.0) -> FlightLog:
-    """A flight of the declared model itself, without noise: a hover with gentle swings about all axes."""
-    import jax
-    import jax.numpy as jnp
-
-    from cfb_mjx.model import Quadrotor, step, thrust
-
-    drone = Quadrotor.from_file(MODEL)
-    delay = round(float(drone.parameters.observation_delay) / drone.dt)
-    signs = jnp.array([[-1.0, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
-
-    def command(t, state):
-        """Attitude follows slow sines and resists drift; height is held. Gains: command per rad, rad/s, m and m/s."""
-        q, v = state.quaternion, state.velocity
-        target = 0.15 * jnp.sin(jnp.array([2.5, 1.9, 0.8]) * t) + 0.1 * jnp.array([v[1], -v[0], 0.0])
-        turn = jnp.array([0.08, 0.08, 0.2]) * (target - 2 * q[1:]) - jnp.array([0.02, 0.02, 0.1]) * state.body_rate
-        return drone.hover_command() + 0.3 * (1.0 - state.position[2]) - 0.25 * v[2] + turn @ signs
-
-    def fly(state, t):
-        sent = jnp.clip(command(t, state), 0.0, 1.0)
-        return step(drone, state, sent), (state, sent)
-
-    instants = drone.dt * jnp.arange(round(seconds / drone.dt) + delay)
-    _, (flown, sent) = jax.jit(lambda state: jax.lax.scan(fly, state, instants))(drone.hover_state())
-    force = jax.vmap(lambda speed: thrust(drone.parameters, speed).sum())(flown.rotor_speed)
-    specific = (force / drone.parameters.mass)[:, None] * jnp.array([0.0, 0.0, 1.0])
-    late, now = slice(0, len(instants) - delay), slice(delay, None)
-    return FlightLog(
-        time=drone.dt * np.arange(len(instants) - delay),
-        position=flown.position[late],
-        velocity=flown.velocity[late],
-        quaternion=flown.quaternion[late],
-        body_rate=flown.body_rate[now],
-        specific_force=specific[now],
-        command=sent[now],
-        rotor_speed=flown.rotor_speed[now],
-        metadata={"name": "simulated", "source": "cfb demo", "observation_delay": delay * drone.dt},
-    )

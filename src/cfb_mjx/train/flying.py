@@ -47,11 +47,13 @@ def fly(
     seconds: float,
     state: State | None = None,
     watch: Callable[[Any], Any] = lambda memory: None,
+    targets: Float[Array, "steps 3"] | None = None,
 ) -> Flight:
     """One flight to the origin on a drone drawn as the task says; ``vmap`` over ``key`` (and ``state``) for many.
 
     The simulation takes steps of the pilot's control step where that is shorter than the model's. ``watch`` says what
-    of the pilot's memory to keep.
+    of the pilot's memory to keep. With ``targets``, the target of every command, positions are the world's and the
+    targets are what is watched.
     """
     dt = pilot.control_dt_s
     if dt < nominal.dt:
@@ -61,16 +63,22 @@ def fly(
     episode = reset(task, nominal, key, state)
     memory = pilot.start(episode.estimate, settled_command(episode.model, episode.state))
 
-    def one(carry, _):
+    def one(carry, target):
         episode, memory, failed = carry
+        if target is not None:
+            # What was estimated for the last target is told for this one.
+            seen = replace(episode.estimate, position=episode.estimate.position + episode.target - target)
+            episode = replace(episode, target=target, estimate=seen)
         memory, command = pilot.command(memory, episode.estimate)
         episode, outcome = step(task, episode, command)
         failed = failed | outcome.failed
         at = episode.state
-        row = Flight(at.position, at.velocity, at.quaternion, at.body_rate, command, failed, watch(memory))
+        watched = watch(memory) if target is None else target
+        row = Flight(at.position, at.velocity, at.quaternion, at.body_rate, command, failed, watched)
         return (episode, memory, failed), row
 
-    return jax.lax.scan(one, (episode, memory, jnp.asarray(False)), length=round(seconds / dt))[1]
+    steps = round(seconds / dt) if targets is None else len(targets)
+    return jax.lax.scan(one, (episode, memory, jnp.asarray(False)), targets, length=steps)[1]
 
 
 class Hover(NamedTuple):
@@ -129,6 +137,34 @@ def _six_metres(pilot, task, nominal, keys):
     arrival = jnp.min(jnp.where(distance < ARRIVED_M, times, jnp.inf), axis=1)
     speed = jnp.linalg.norm(flown.velocity, axis=-1).max(axis=1)
     return Step(arrival, speed, jnp.maximum(0.0, flown.position[..., 0].max(axis=1)), flown.failed[:, -1]), flown
+
+
+def back_and_forth(
+    pilot: Pilot, task: TargetTask, nominal: Quadrotor, key: PRNGKeyArray, legs: int = 4, leg_s: float = 3.0
+) -> Flight:
+    """From hover at the origin, to a target that jumps between `STEP_DISTANCE_M` along x and the origin.
+
+    Args:
+        pilot: the controller.
+        task: says which drone and how much noise.
+        nominal: the drone.
+        key: of drone and noise.
+        legs: how often the target jumps, at once and then every ``leg_s`` [s].
+        leg_s: see there.
+
+    Returns:
+        One flight, its ``position`` in the world; ``watched`` is the target (steps, 3).
+    """
+    return _back_and_forth(pilot, task, nominal, key, legs, leg_s)
+
+
+@eqx.filter_jit
+def _back_and_forth(pilot, task, nominal, key, legs, leg_s):
+    far = jnp.array([STEP_DISTANCE_M, 0.0, 0.0])
+    targets = jnp.repeat(
+        jnp.stack([far * ((leg + 1) % 2) for leg in range(legs)]), round(leg_s / pilot.control_dt_s), 0
+    )
+    return fly(pilot, task, nominal, key, legs * leg_s, nominal.hover_state((0.0, 0.0, 0.0)), targets=targets)
 
 
 class Recovery(NamedTuple):

@@ -1,0 +1,59 @@
+"""How a position controller is judged: on the nominal drone, on randomised ones, on a set of others."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+
+from cfb_mjx.control.pilot import Pilot
+from cfb_mjx.envs import TargetTask
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.parameters import load_model_file, load_randomisation
+from cfb_mjx.train.flying import hover
+from cfb_mjx.train.plants import load_plants
+
+FLIGHTS, RANDOM_DRONES = 64, 512
+
+
+class Judge:
+    """Flies controllers in the paper's hover test.
+
+    Args:
+        plants: set of drones with effects, of `load_plants`; None: without them.
+        random_drones: of the paper's full randomisation.
+    """
+
+    def __init__(self, plants: str | None = "off-nominal", random_drones: int = RANDOM_DRONES):
+        self.described = load_model_file("cfb-guards")
+        self.nominal = Quadrotor.from_file(self.described)
+        self.plants = {} if plants is None else load_plants(self.described, plants)
+        self.calm, self.wild = TargetTask(), TargetTask(randomisation=load_randomisation("paper"))
+        self.few = jax.random.split(jax.random.PRNGKey(0), FLIGHTS)
+        self.many = jax.random.split(jax.random.PRNGKey(1), random_drones)
+
+    def __call__(self, pilot: Pilot) -> dict:
+        """Hover error and command std, JSON-like; over randomised drones medians of those that did not fail."""
+
+        def measure(task, drone, keys, kind):
+            measured = hover(pilot, task, drone, keys)[0]
+            well = ~np.asarray(measured.failed)
+            distance, std = np.asarray(measured.mean_distance_m)[well], np.asarray(measured.command_std)[well]
+            return {
+                "hover_mm": float(1e3 * kind(distance)) if well.any() else None,
+                "command_std": float(kind(std)) if well.any() else None,
+                "failed": float(1 - well.mean()),
+            }
+
+        score = {"nominal": measure(self.calm, self.nominal, self.few, np.mean)}
+        if len(self.many):
+            score["random"] = measure(self.wild, self.nominal, self.many, np.median)
+        return score | {
+            "plants": {name: measure(self.calm, drone, self.few, np.mean) for name, drone in self.plants.items()}
+        }
+
+
+def away(score: dict, key: str) -> float | None:
+    """Mean over the set of drones with effects; None where one of them was lost."""
+    values = [plant[key] for plant in score["plants"].values()]
+    lost = any(plant["failed"] > 0 or plant[key] is None for plant in score["plants"].values())
+    return None if lost else sum(values) / len(values)
