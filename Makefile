@@ -27,7 +27,7 @@ test: $(INSTALLED)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 test-long: $(INSTALLED)
-	XLA_FLAGS=--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=false $(BIN)/python -m pytest -m long
+	PLAIN_XLA=1 $(BIN)/python -m pytest -m long
 
 bench: $(INSTALLED) .venv-peers/.installed
 	$(BIN)/cfb bench --peer-python .venv-peers/bin/python --json benchmarks/results.json --markdown docs/performance.md

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import gc
+import os
 from pathlib import Path
 
 from cfb_mjx.cli.runtime import set_up_xla
 
-# As the commands do: large programs compile in half the time. `make test-long` has it off, for derivatives of MJX.
-set_up_xla()
+# As the commands do: large programs compile in half the time. Not for derivatives of MJX (`make test-long`): there
+# jaxlib aborts as soon as the option is named, whatever its value.
+if not os.environ.get("PLAIN_XLA"):
+    set_up_xla()
 
-import jax  # noqa: E402
-import pytest  # noqa: E402
-from jaxtyping import install_import_hook  # noqa: E402
+import jax
+import pytest
+from jaxtyping import install_import_hook
 
 # Float64 so that tests can tell a wrong term from rounding; model/test_rollout.py covers float32.
 jax.config.update("jax_enable_x64", True)
