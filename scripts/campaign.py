@@ -80,13 +80,13 @@ def _report(row: dict) -> None:
     say(f"  {row['commands'] / 1e6:.3g} M commands, {row['seconds']:.0f} s, hover {row['hover_mm']:.4g} mm")
 
 
-def facts_line(command: str, results: list[dict]) -> str:
-    """Which command wrote a page, when and on what."""
+def facts_line(command: str, results: list[dict], did: str = "trained") -> str:
+    """Which command wrote a page, what it ``did``, when and on what."""
     facts = [result["environment"] for result in results]
     first, last = min(f["date"] for f in facts), max(f["date"] for f in facts)
     when = first if first == last else f"{first} to {last}"
     of = facts[-1]
     return (
-        f"Written by `{command}`; trained {when}, {of['processor']}, Python {of['python']}, "
+        f"Written by `{command}`; {did} {when}, {of['processor']}, Python {of['python']}, "
         f"jax {of['jax']}, cfb_mjx {of['cfb_mjx']}."
     )

@@ -115,6 +115,13 @@ def write_text(path: str | os.PathLike, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def write_texts(folder: str | os.PathLike, texts: Mapping[str, str]) -> None:
+    """Write text files that belong together: all of them, or, when one cannot be written, none."""
+    with contextlib.ExitStack() as stack:
+        for name, text in texts.items():
+            stack.enter_context(replacing(Path(folder) / name)).write_text(text, encoding="utf-8")
+
+
 def write_json(path: str | os.PathLike, value: object) -> None:
     """Write ``value`` as JSON atomically; NaN and infinities, which JSON lacks, become null."""
     write_text(path, json.dumps(plain(value), indent=1) + "\n")

@@ -26,6 +26,10 @@ for policy in shipped_policies().values():
     load_policy(policy)
 load_config("target-adaptive")
 load_plants(load_model_file("cfb-guards"))
+from cfb_mjx.deploy.deployment import find_deployment
+from cfb_mjx.deploy.export import export_policy
+assert len(export_policy(find_deployment("double-flip"), "exported").sources) == 4
+assert (pathlib.Path(cfb_mjx.__file__).parent / "deploy/emulated/stm32f405.ld").exists()
 assert (pathlib.Path(cfb_mjx.__file__).parent / "py.typed").exists()
 print("fine")
 """

@@ -22,6 +22,7 @@ SUMMARY = {
     "refine": "fit the numbers of named effects, to innovations or to predictions",
     "train": "train a controller, by PPO or by back-propagation through the model",
     "fly": "fly a controller in simulation and measure it",
+    "export": "write a policy as C for the drone, and check that it does the same there",
     "bench": "measure throughput, compile time and memory",
     "demo-loop": "fly a drone the model does not know, diagnose it, retrain, and fly it again",
     "reproduce": "make the paper's figures and tables, its numbers beside ours",

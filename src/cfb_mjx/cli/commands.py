@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 
 from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat
+from cfb_mjx.cli.deploying_commands import export
 from cfb_mjx.cli.learning_commands import fly, train
 from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce
 from cfb_mjx.errors import CfbError
@@ -359,6 +360,7 @@ COMMANDS = {
     "refine": refine,
     "train": train,
     "fly": fly,
+    "export": export,
     "bench": bench,
     "reproduce": reproduce,
     "demo-loop": demo_loop,

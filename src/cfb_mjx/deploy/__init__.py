@@ -1,0 +1,17 @@
+"""Trained policies as C for the drone, and the check that they do the same there."""
+
+from cfb_mjx.deploy.compiled import CompiledPolicy, compile_policy
+from cfb_mjx.deploy.contract import contract
+from cfb_mjx.deploy.export import Exported, export_policy
+from cfb_mjx.deploy.flights import fly_beside
+from cfb_mjx.deploy.parity import compare
+
+__all__ = [
+    "CompiledPolicy",
+    "Exported",
+    "compare",
+    "compile_policy",
+    "contract",
+    "export_policy",
+    "fly_beside",
+]

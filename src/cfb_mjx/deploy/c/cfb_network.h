@@ -1,0 +1,57 @@
+/* A small fully connected network, and what it is shown: the observation with its history.
+ *
+ * Part of a policy exported by cfb_mjx. C11, single precision, no heap; nothing here changes but the memory it is
+ * given. The meaning of every number is in contract.json.
+ */
+#ifndef CFB_NETWORK_H
+#define CFB_NETWORK_H
+
+#include "cfb_sizes.h"
+
+typedef enum { CFB_TANH, CFB_RELU, CFB_SWISH } cfb_activation_t;
+
+typedef struct {
+  int inputs, outputs;
+  const float *weights; /* outputs rows of inputs */
+  const float *biases;
+} cfb_layer_t;
+
+typedef struct {
+  /* What is shown. */
+  int position, body_velocity, integral; /* yes or no */
+  int past_estimates, estimate_stride, past_commands, setpoints;
+  float position_limit, position_scale, velocity_scale, rate_scale;
+  float integral_input_limit, integral_limit, dt;
+  const float *setpoint_scales;
+  /* What is made of it. */
+  cfb_activation_t activation;
+  int layers;
+  const cfb_layer_t *layer;
+} cfb_network_t;
+
+/* What the state estimator says, position relative to the target. */
+typedef struct {
+  float position[3], velocity[3]; /* world; m, m/s */
+  float quaternion[4];            /* w, x, y, z; body to world; unit norm */
+  float body_rate[3];             /* body; rad/s */
+} cfb_estimate_t;
+
+typedef struct {
+  float frames[CFB_KEPT_FRAMES][CFB_FRAME];  /* of every step, shown or not, newest first */
+  float commands[CFB_KEPT_COMMANDS][4];      /* as they are shown, 2 u - 1, newest first */
+  float integral[3];                         /* of the relative position, m s */
+} cfb_memory_t;
+
+/* As if this had been estimated, and this been commanded, for long. */
+void cfb_network_start(const cfb_network_t *network, cfb_memory_t *memory, const cfb_estimate_t *estimate,
+                       float command);
+
+/* The command of M1..M4, each in [0, 1]. setpoint may be NULL where the network has none. */
+void cfb_network_command(const cfb_network_t *network, const cfb_memory_t *memory, const cfb_estimate_t *estimate,
+                         const float *setpoint, float command[4]);
+
+/* Once every step, with the command that was given. */
+void cfb_network_remember(const cfb_network_t *network, cfb_memory_t *memory, const cfb_estimate_t *estimate,
+                          const float command[4]);
+
+#endif

@@ -1,0 +1,61 @@
+/* See cfb_policy.h: the guards around what flies. */
+#include "cfb_policy.h"
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#include "cfb_data.h"
+#include "cfb_pilot.h"
+
+static int started, blind;
+static cfb_fault_t fault;
+static float last[4];
+
+void cfb_policy_reset(void) {
+  started = 0;
+  blind = 0;
+  fault = CFB_FINE;
+  memset(last, 0, sizeof last);
+  cfb_pilot_reset();
+}
+
+float cfb_policy_dt(void) { return CFB_DT_S; }
+
+cfb_fault_t cfb_policy_fault(void) { return fault; }
+
+/* By its bits, which no compiler option makes disappear: those of 1e6, NaN and infinity are larger. */
+static int sensible(const float *values, int length) {
+  for (int i = 0; i < length; i++) {
+    uint32_t bits;
+    memcpy(&bits, &values[i], sizeof bits);
+    if ((bits & 0x7fffffffu) > 0x49742400u) return 0;
+  }
+  return 1;
+}
+
+void cfb_policy_step(const float position[3], const float velocity[3], const float quaternion_wxyz[4],
+                     const float body_rate[3], const float target[3], float motor_command[4]) {
+  const float *const q = quaternion_wxyz;
+  int good = sensible(position, 3) && sensible(velocity, 3) && sensible(q, 4) && sensible(body_rate, 3) &&
+             sensible(target, 3);
+  const float norm = good ? sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) : 0.0f;
+  good = norm > 1e-6f;
+  if (fault != CFB_STOPPED) {
+    blind = good ? 0 : blind + 1;
+    fault = good ? CFB_FINE : (started && blind <= CFB_POLICY_BLIND_STEPS ? CFB_BLIND : CFB_STOPPED);
+  }
+  if (fault == CFB_FINE) {
+    cfb_estimate_t estimate;
+    for (int i = 0; i < 3; i++) {
+      estimate.position[i] = position[i] - target[i];
+      estimate.velocity[i] = velocity[i];
+      estimate.body_rate[i] = body_rate[i];
+    }
+    for (int i = 0; i < 4; i++) estimate.quaternion[i] = q[i] / norm;
+    if (!started) cfb_pilot_start(&estimate);
+    started = 1;
+    cfb_pilot_command(&estimate, last);
+  }
+  for (int motor = 0; motor < 4; motor++) motor_command[motor] = fault == CFB_STOPPED ? 0.0f : last[motor];
+}

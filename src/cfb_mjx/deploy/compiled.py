@@ -1,0 +1,108 @@
+"""An exported policy, compiled for this machine and called from Python."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.deploy.export import Exported
+from cfb_mjx.errors import CfbError
+
+FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra", "-Werror")
+"""What the sources must compile with."""
+
+
+class CompiledPolicy:
+    """The C policy behind its own interface. One of these at a time is in one state; `reset` begins anew."""
+
+    def __init__(self, library: ctypes.CDLL, flips: bool):
+        self._library, self.flips = library, flips
+        library.cfb_policy_dt.restype = ctypes.c_float
+        if flips:
+            library.cfb_policy_set_flip.argtypes = [ctypes.c_float, ctypes.c_float]
+        library.cfb_policy_step.argtypes = [ctypes.c_void_p] * 6
+        library.cfb_policy_step.restype = None
+
+    @property
+    def dt(self) -> float:
+        """Time between two steps, s."""
+        return float(self._library.cfb_policy_dt())
+
+    @property
+    def fault(self) -> int:
+        """0: fine, 1: blind, 2: stopped."""
+        return int(self._library.cfb_policy_fault())
+
+    @property
+    def phase(self) -> int:
+        """Of a flip: 0 hold, 1 climb, 2 turn, 3 catch."""
+        return int(self._library.cfb_policy_phase())
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self._library.cfb_policy_reset()
+
+    def set_flip(self, speed_mps: float, rate_radps: float) -> None:
+        """Begin a flip with the next step."""
+        self._library.cfb_policy_set_flip(speed_mps, rate_radps)
+
+    def step(self, position, velocity, quaternion, body_rate, target=(0.0, 0.0, 0.0)) -> np.ndarray:
+        """Commands of M1..M4, (4,), float32."""
+        inputs = [np.ascontiguousarray(x, np.float32) for x in (position, velocity, quaternion, body_rate, target)]
+        command = np.empty(4, np.float32)
+        self._library.cfb_policy_step(*(x.ctypes.data for x in inputs), command.ctypes.data)
+        return command
+
+    def steps(self, inputs: np.ndarray) -> np.ndarray:
+        """Many steps in a row.
+
+        Args:
+            inputs: (steps, 16) position, velocity, quaternion, body rate, target.
+
+        Returns:
+            Commands, (steps, 4), float32.
+        """
+        rows = np.ascontiguousarray(inputs, np.float32)
+        commands = np.empty((len(rows), 4), np.float32)
+        step, at, into = self._library.cfb_policy_step, rows.ctypes.data, commands.ctypes.data
+        for i in range(len(rows)):
+            row = at + 64 * i
+            step(row, row + 12, row + 24, row + 40, row + 52, into + 16 * i)
+        return commands
+
+
+def compile_policy(exported: Exported, extra: Sequence[str] = ()) -> CompiledPolicy:
+    """Compile with the system's compiler (``CC``, else cc), strictly.
+
+    Raises:
+        CfbError: there is no compiler, or it objects.
+    """
+    compiler = os.environ.get("CC") or "cc"
+    with tempfile.TemporaryDirectory(prefix="cfb-policy-") as folder:
+        library = Path(folder) / "policy.so"
+        sources = [str(path) for path in exported.sources]
+        run_compiler([compiler, *FLAGS, *extra, "-shared", "-fPIC", "-o", str(library), *sources, "-lm"])
+        # Loaded, it stays in memory after its file is gone.
+        return CompiledPolicy(ctypes.CDLL(str(library)), exported.deployment.flips)
+
+
+def run_compiler(command: list[str]) -> str:
+    """Run a compiler or one of its tools; what it printed.
+
+    Raises:
+        CfbError: it is not there, or fails.
+    """
+    if shutil.which(command[0]) is None:
+        raise CfbError(f"{command[0]}: there is no such compiler; install one (Debian: apt install gcc) or set CC.")
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        words = " ".join(done.stderr.split())[:400]
+        raise CfbError(f"{command[0]} does not compile the exported policy: {words}")
+    return done.stdout

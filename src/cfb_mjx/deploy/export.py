@@ -1,0 +1,220 @@
+"""A policy as a folder of C: fixed sources, and weights and settings generated for it."""
+
+from __future__ import annotations
+
+import json
+import math
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from cfb_mjx import __version__
+from cfb_mjx.control.policy_file import PolicyFile
+from cfb_mjx.deploy.contract import BLIND_STEPS, contract
+from cfb_mjx.deploy.deployment import CATCH_S, Deployment, float32
+from cfb_mjx.files import output_folder, plain, write_texts
+
+FIXED = ("cfb_network.h", "cfb_network.c", "cfb_pilot.h", "cfb_policy.h", "cfb_policy.c", "controller_out_of_tree.c")
+BUILD = ("Kbuild", "Makefile", "app-config", "README.md")
+LIBRARY = ("cfb_policy.c", "cfb_network.c", "cfb_data.c")
+"""What makes the plain library, beside the pilot."""
+_NEVER = 1e9
+"""A time, speed or angle that is not reached."""
+
+
+class Exported(NamedTuple):
+    """What was written."""
+
+    folder: Path
+    deployment: Deployment
+
+    @property
+    def sources(self) -> list[Path]:
+        """Of the plain library."""
+        return [self.folder / name for name in (*LIBRARY, f"{_pilot(self.deployment)}.c")]
+
+
+def export_policy(deployment: Deployment, folder: str | Path) -> Exported:
+    """Write the C sources, the firmware app and the contract.
+
+    Raises:
+        CfbError: the folder cannot be made or written; what it held before is as it was.
+    """
+    folder = output_folder(folder)
+    write_texts(folder, sources(deployment))
+    return Exported(folder, deployment)
+
+
+def sources(deployment: Deployment) -> dict[str, str]:
+    """Names and texts of all files of an export."""
+    pilot = f"{_pilot(deployment)}.c"
+    texts = {name: _filled(_template(name), deployment) for name in (*FIXED, *BUILD, pilot)}
+    texts["cfb_sizes.h"] = _sizes(deployment)
+    texts["cfb_data.h"] = _header(deployment)
+    texts["cfb_data.c"] = _data(deployment)
+    texts["contract.json"] = json.dumps(plain(contract(deployment)), indent=1) + "\n"
+    return texts
+
+
+def _template(name: str) -> str:
+    return files("cfb_mjx.deploy").joinpath("c", name).read_text(encoding="utf-8")
+
+
+def _pilot(deployment: Deployment) -> str:
+    return "cfb_pilot_flip" if deployment.flips else "cfb_pilot_hold"
+
+
+def _filled(text: str, deployment: Deployment) -> str:
+    """A template without the parts that are for flips only, where it does not flip, and with the names filled in."""
+    kept, dropping = [], False
+    for line in text.splitlines():
+        if line in ("//@flip", "//@end"):
+            dropping = line == "//@flip" and not deployment.flips
+        elif not dropping:
+            kept.append(line)
+    text = "\n".join(kept) + "\n"
+    for mark, value in _marks(deployment).items():
+        text = text.replace(f"@{mark}@", value)
+    return text
+
+
+def _marks(deployment: Deployment) -> dict[str, str]:
+    trained = deployment.trained_on()
+    delay = "an unknown number of" if trained is None else f"{1e3 * trained['parameters']['observation_delay']:g}"
+    step_ms = 1e3 * deployment.holder.controller.control_dt_s
+    marks = {
+        "TITLE": f"{deployment.name}, a policy of a Crazyflie Brushless",
+        "WHAT": f"A network that flies the drone to a target and holds it there, every {step_ms:g} ms.",
+        "VERSION": __version__,
+        "HASH": " and ".join(p.weights_sha256[:12] for p in deployment.policies.values()),
+        "PILOT": _pilot(deployment),
+        "PILOT_DOES": "what flies: the network",
+        "DELAY_MS": delay,
+        "BLIND_MS": f"{BLIND_STEPS * step_ms:g}",
+        "FLIP": "",
+    }
+    if not deployment.flips:
+        return marks
+    knobs, ranges = deployment.manoeuvre.knobs, deployment.setpoint_ranges
+    times = {1: "once", 2: "twice"}.get(deployment.manoeuvre.rotations, f"{deployment.manoeuvre.rotations} times")
+    flip = f"""
+## Flipping
+
+It holds the target until `cfb_policy_set_flip(v_target, rate_target)`, or on the drone until the parameter `cfbflip.go`
+is set to 1; then it climbs, turns {times} about its x axis, and is caught at the target. `v_target` may lie between
+{ranges["speed_mps"][0]:g} and {ranges["speed_mps"][1]:g} m/s, `rate_target` between {ranges["rate_radps"][0]:g} and \
+{ranges["rate_radps"][1]:g} rad/s; the manoeuvre was designed with
+{float(knobs.speed_mps):g} m/s and {float(knobs.rate_radps):g} rad/s, and other numbers want other switching times \
+(`cfb fly --search`). It was judged with
+2 m of air below; see `cfb fly` for what yours needs.
+"""
+    return marks | {
+        "WHAT": f"Holds a target, every {step_ms:g} ms, and on demand turns {times} about the body's x axis.",
+        "PILOT_DOES": "what flies: hold, climb, turn, catch",
+        "SPEED": literal(knobs.speed_mps),
+        "RATE": literal(knobs.rate_radps),
+        "FLIP": flip,
+    }
+
+
+def literal(x) -> str:
+    """A number as C of single precision, that reads back as the same."""
+    value = np.float32(x)
+    if not math.isfinite(value):
+        value = np.float32(math.copysign(_NEVER, float(value)))
+    text = np.format_float_positional(value, unique=True, trim="0") if 1e-4 < abs(value) < 1e6 or value == 0 else None
+    return f"{text or np.format_float_scientific(value, unique=True, trim='0')}f"
+
+
+def _sizes(deployment: Deployment) -> str:
+    layouts = [p.controller.layout for p in deployment.policies.values()]
+    outputs = [len(b) for p in deployment.policies.values() for b in p.controller.network.biases]
+    estimates = max(1, *(layout.past_estimates for layout in layouts))
+    commands = max(1, *(layout.past_commands for layout in layouts))
+    setpoints = max(len(layout.setpoint_scales) for layout in layouts)
+    frame = max(layout.frame for layout in layouts)
+    numbers = {
+        "CFB_FRAME": frame,
+        "CFB_KEPT_FRAMES": max(1, *(layout.past_estimates * layout.estimate_stride for layout in layouts)),
+        "CFB_KEPT_COMMANDS": commands,
+        # For all there could be at once: a compiler that looks into the loops must not find them writing too far.
+        "CFB_WIDEST": max(frame * (1 + estimates) + 4 * commands + 3 + setpoints, *outputs),
+    }
+    lines = "\n".join(f"#define {name} {value}" for name, value in numbers.items())
+    return _guarded("CFB_SIZES_H", f"/* Generated for {deployment.name}: what its networks need. */", lines)
+
+
+def _guarded(mark: str, head: str, body: str) -> str:
+    return f"{head}\n#ifndef {mark}\n#define {mark}\n\n{body}\n\n#endif\n"
+
+
+def _header(deployment: Deployment) -> str:
+    values = {
+        "CFB_DT_S": literal(deployment.holder.controller.control_dt_s),
+        "CFB_HOVER_COMMAND": literal(deployment.hover_command()),
+    }
+    if deployment.flips:
+        knobs, ranges = deployment.manoeuvre.knobs, deployment.setpoint_ranges
+        values |= {f"CFB_{name.upper()}": literal(getattr(knobs, name)) for name in knobs._fields[:3]}
+        values |= {"CFB_CLIMB_MPS": literal(knobs.climb_mps), "CFB_TURN_RAD": literal(knobs.turn_rad)}
+        values |= {"CFB_CATCH_S": literal(CATCH_S)}
+        for name, key in (("SPEED", "speed_mps"), ("RATE", "rate_radps")):
+            low, high = ranges[key]
+            values |= {f"CFB_LEAST_{name}": literal(low), f"CFB_LARGEST_{name}": literal(high)}
+    defines = "\n".join(f"#define {name} {value}" for name, value in values.items())
+    networks = "\n".join(f"extern const cfb_network_t cfb_{name};" for name in deployment.policies)
+    head = f"/* Generated for {deployment.name}: settings, and where the weights are. */"
+    return _guarded("CFB_DATA_H", head, f'#include "cfb_network.h"\n\n{defines}\n\n{networks}')
+
+
+def _data(deployment: Deployment) -> str:
+    parts = [f'/* Generated for {deployment.name}: weights. */\n#include "cfb_data.h"\n\n#include <stddef.h>\n']
+    for name, policy in deployment.policies.items():
+        parts.append(_network(name, policy))
+    return "\n".join(parts)
+
+
+def _network(name: str, policy: PolicyFile) -> str:
+    network, layout = policy.controller.network, policy.controller.layout
+    parts, layers = [f"/* weights_sha256 {policy.weights_sha256} */"], []
+    for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+        # A row for each output, so that the sums walk through memory.
+        parts += [_array(f"{name}_weight_{i}", float32(weight).T), _array(f"{name}_bias_{i}", float32(bias))]
+        inputs, outputs = weight.shape
+        layers.append(f"    {{{inputs}, {outputs}, {name}_weight_{i}, {name}_bias_{i}}},")
+    scales = "NULL"
+    if layout.setpoint_scales:
+        scales = f"{name}_setpoint_scales"
+        parts.append(_array(scales, float32(layout.setpoint_scales)))
+    fields = {
+        "position": int(layout.position),
+        "body_velocity": int(layout.body_velocity),
+        "integral": int(layout.integral),
+        "past_estimates": layout.past_estimates,
+        "estimate_stride": layout.estimate_stride,
+        "past_commands": layout.past_commands,
+        "setpoints": len(layout.setpoint_scales),
+        "position_limit": literal(layout.position_limit_m),
+        "position_scale": literal(layout.position_scale_m),
+        "velocity_scale": literal(layout.velocity_scale_mps),
+        "rate_scale": literal(layout.rate_scale_radps),
+        "integral_input_limit": literal(layout.integral_input_limit_m),
+        "integral_limit": literal(layout.integral_limit_ms),
+        "dt": literal(layout.control_dt_s),
+        "setpoint_scales": scales,
+        "activation": f"CFB_{network.activation.upper()}",
+        "layers": len(layers),
+        "layer": f"{name}_layers",
+    }
+    parts.append(f"static const cfb_layer_t {name}_layers[] = {{\n" + "\n".join(layers) + "\n};")
+    body = "\n".join(f"    .{key} = {value}," for key, value in fields.items())
+    parts.append(f"const cfb_network_t cfb_{name} = {{\n{body}\n}};\n")
+    return "\n\n".join(parts)
+
+
+def _array(name: str, values: np.ndarray) -> str:
+    numbers = [literal(x) for x in values.reshape(-1)]
+    rows = [", ".join(numbers[i : i + 8]) for i in range(0, len(numbers), 8)]
+    return f"static const float {name}[{len(numbers)}] = {{\n    " + ",\n    ".join(rows) + ",\n};"

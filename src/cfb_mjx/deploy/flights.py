@@ -1,0 +1,93 @@
+"""The compiled C in closed loop with the simulated drone, beside the JAX policy on the same drone and noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cfb_mjx.deploy.compiled import CompiledPolicy
+from cfb_mjx.deploy.deployment import Deployment
+from cfb_mjx.deploy.parity import begin
+from cfb_mjx.envs import TargetTask
+from cfb_mjx.envs.episode import longest_delay_s, reset, step
+from cfb_mjx.model.state import State
+
+
+class Beside(NamedTuple):
+    """Two flights: of the C, and of JAX."""
+
+    position: np.ndarray
+    """(2, steps, 3), relative to the target, m."""
+    command: np.ndarray
+    """(2, steps, 4)."""
+    dt: float
+    """Time between two commands, s."""
+
+    def command_difference(self, seconds: float | None = None) -> float:
+        """Largest, over all motors and the first ``seconds``."""
+        until = None if seconds is None else round(seconds / self.dt)
+        return float(np.abs(self.command[0, :until] - self.command[1, :until]).max())
+
+    @property
+    def distance_m(self) -> float:
+        """Largest between the two drones at one time."""
+        return float(np.linalg.norm(self.position[0] - self.position[1], axis=-1).max())
+
+
+def fly_beside(
+    deployment: Deployment,
+    compiled: CompiledPolicy,
+    seconds: float,
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    seed: int = 0,
+) -> Beside:
+    """Fly both from hover, with the noise that policies are trained with.
+
+    Args:
+        deployment: what was exported; flips begin with the first step.
+        compiled: the C.
+        seconds: how long.
+        offset: of the start from the target, m.
+        seed: of the noise, the same for both.
+    """
+    plant = deployment.plant()
+    pilot, dt = deployment.pilot, deployment.pilot.control_dt_s
+    if dt < plant.dt:
+        plant = replace(plant, dt=dt)
+    task = TargetTask(layout=deployment.holder.controller.layout, longest_delay_s=longest_delay_s(plant))
+    start = plant.hover_state(offset)
+    hover = jnp.full(4, deployment.hover_command(), jnp.float32)
+    steps = round(seconds / dt)
+    position, command = np.empty((2, steps, 3)), np.empty((2, steps, 4), np.float32)
+
+    @eqx.filter_jit
+    def first(start: State):
+        episode = reset(task, plant, jax.random.PRNGKey(seed), start)
+        return episode, pilot.start(episode.estimate, hover)
+
+    @eqx.filter_jit
+    def commanded(memory, estimate):
+        return pilot.command(memory, estimate)
+
+    @eqx.filter_jit
+    def flown(episode, u):
+        return step(task, episode, u)[0]
+
+    for which in range(2):
+        episode, memory = first(start)
+        begin(deployment, compiled)
+        for i in range(steps):
+            if which == 0:
+                seen = episode.estimate
+                u = compiled.step(seen.position, seen.velocity, seen.quaternion, seen.body_rate)
+            else:
+                memory, u = commanded(memory, episode.estimate)
+            command[which, i] = u
+            episode = flown(episode, jnp.asarray(u, jnp.float32))
+            position[which, i] = episode.state.position
+    return Beside(position, command, dt)

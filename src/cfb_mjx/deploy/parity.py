@@ -1,0 +1,88 @@
+"""The same numbers in C as in JAX, on random estimates: sequences that share nothing but the policy."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from cfb_mjx.deploy.compiled import CompiledPolicy
+from cfb_mjx.deploy.deployment import Deployment
+from cfb_mjx.envs.observation import Estimate
+
+SEQUENCES, STEPS = 10_000, 12
+TOLERANCE = 1e-5
+"""Largest difference of a command, of 1."""
+
+
+class Parity(NamedTuple):
+    """Of commands in C and in JAX."""
+
+    sequences: int
+    steps: int
+    largest: float
+    """Difference of a command, over all sequences, steps and motors."""
+    mean: float
+
+
+def compare(
+    deployment: Deployment, compiled: CompiledPolicy, sequences: int = SEQUENCES, steps: int = STEPS, seed: int = 0
+) -> Parity:
+    """Run both on the same random estimates, each sequence from a reset, and compare every command.
+
+    Args:
+        deployment: what was exported; flips begin with the first step.
+        compiled: the C.
+        sequences: how many.
+        steps: of each, more than a policy's history holds of commands.
+        seed: of the estimates.
+    """
+    inputs = random_inputs(np.random.default_rng(seed), sequences, steps)
+    expected = np.asarray(_commands(deployment.pilot, jnp.float32(deployment.hover_command()), jnp.asarray(inputs)))
+    found = np.empty_like(expected)
+    for i in range(sequences):
+        begin(deployment, compiled)
+        found[i] = compiled.steps(inputs[i])
+    difference = np.abs(found.astype(float) - expected)
+    return Parity(sequences, steps, float(difference.max()), float(difference.mean()))
+
+
+def begin(deployment: Deployment, compiled: CompiledPolicy) -> None:
+    """Reset; a flip begins with the next step."""
+    compiled.reset()
+    if deployment.flips:
+        knobs = deployment.manoeuvre.knobs
+        compiled.set_flip(float(knobs.speed_mps), float(knobs.rate_radps))
+
+
+def random_inputs(generator: np.random.Generator, sequences: int, steps: int) -> np.ndarray:
+    """Estimates of all kinds, (sequences, steps, 16): near and far, slow and fast, any attitude; float32."""
+    # Half of the sequences hover about their targets, the others are anywhere.
+    wide = np.where(np.arange(sequences) % 2, 1.0, 0.05)[:, None, None]
+    shape = sequences, steps
+    target = generator.uniform(-3, 3, (sequences, 1, 3)) * np.ones((*shape, 1))
+    position = target + 6 * wide * generator.standard_normal((*shape, 3))
+    velocity = 4 * wide * generator.standard_normal((*shape, 3))
+    rotation = generator.standard_normal((*shape, 3)) * np.pi * wide
+    angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
+    quaternion = np.concatenate([np.cos(angle / 2), rotation / angle * np.sin(angle / 2)], axis=-1)
+    body_rate = 12 * wide * generator.standard_normal((*shape, 3))
+    return np.concatenate([position, velocity, quaternion, body_rate, target], axis=-1).astype(np.float32)
+
+
+@eqx.filter_jit
+def _commands(pilot, hover, inputs):
+    def one(rows):
+        def estimate(row):
+            return Estimate(row[:3] - row[13:], row[3:6], row[6:10], row[10:13])
+
+        def step(memory, row):
+            return pilot.command(memory, estimate(row))
+
+        first = pilot.start(estimate(rows[0]), jnp.full(4, hover))
+        return jax.lax.scan(step, first, rows)[1]
+
+    return jax.vmap(one)(inputs)

@@ -1,0 +1,1 @@
+#include "stabilizer_types.h"
