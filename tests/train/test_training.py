@@ -158,6 +158,20 @@ def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, 
         assert {k: v for k, v in a.items() if k != "seconds"} == {k: v for k, v in b.items() if k != "seconds"}
 
 
+def test_a_training_goes_on_after_its_folder_and_its_models_have_moved(tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    old.mkdir()
+    described = load_model_file("cfb-guards").with_values("a test", mass=0.045)
+    save_model_file(described, old / "model.yaml")
+    train(small("ppo", f"model={old / 'model.yaml'}"), old / "run", evaluate=False)
+    old.rename(new)
+    train(small("ppo", f"model={new / 'model.yaml'}"), new / "run", resume=True, evaluate=False)
+    # What the model says still counts.
+    save_model_file(described.with_values("a test", mass=0.046), new / "model.yaml")
+    with pytest.raises(CfbError, match=r"another model\.parameters\.mass"):
+        train(small("ppo", f"model={new / 'model.yaml'}"), new / "run", resume=True, evaluate=False)
+
+
 def test_earlier_trainings_are_not_overwritten_nor_mixed(tmp_path):
     train(small("ppo"), tmp_path, evaluate=False)
     before = (tmp_path / POLICY).read_bytes()

@@ -23,6 +23,7 @@ SUMMARY = {
     "train": "train a controller, by PPO or by back-propagation through the model",
     "fly": "fly a controller in simulation and measure it",
     "export": "write a policy as C for the drone, and check that it does the same there",
+    "view": "show flights: a rerun recording with predictions and residuals, or a film",
     "bench": "measure throughput, compile time and memory",
     "demo-loop": "fly a drone the model does not know, diagnose it, retrain, and fly it again",
     "reproduce": "make the paper's figures and tables, its numbers beside ours",

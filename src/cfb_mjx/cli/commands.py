@@ -11,7 +11,7 @@ import tyro
 from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat
 from cfb_mjx.cli.deploying_commands import export
 from cfb_mjx.cli.learning_commands import fly, train
-from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce
+from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce, view
 from cfb_mjx.errors import CfbError
 
 
@@ -361,6 +361,7 @@ COMMANDS = {
     "train": train,
     "fly": fly,
     "export": export,
+    "view": view,
     "bench": bench,
     "reproduce": reproduce,
     "demo-loop": demo_loop,

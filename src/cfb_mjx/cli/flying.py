@@ -16,6 +16,22 @@ DEFAULT_TASK = "hover"
 
 
 @dataclass(frozen=True)
+class Outputs:
+    """Files to write."""
+
+    json: Path | None = None
+    figure: Path | None = None
+    recording: Path | None = None
+    video: Path | None = None
+    log: Path | None = None
+
+    @property
+    def of_one_model(self) -> bool:
+        """Whether some show the flights of one model."""
+        return any((self.figure, self.recording, self.video, self.log))
+
+
+@dataclass(frozen=True)
 class Turn:
     """What only flips take: see ``cfb fly --help``."""
 
@@ -36,9 +52,7 @@ def run_fly(
     on: str | None,
     noise: bool,
     seed: int,
-    json: Path | None,
-    figure: Path | None,
-    recording: Path | None,
+    outputs: Outputs,
     turn: Turn,
 ) -> None:
     """Fly, print what was measured, write what was asked for.
@@ -47,11 +61,16 @@ def run_fly(
         CfbError: an unknown controller, model or randomisation, impossible numbers, options that do nothing, or outputs
             without a folder.
     """
-    require_folder(json, figure, recording, turn.keep)
-    if on is not None and (figure is not None or recording is not None):
+    require_folder(*vars(outputs).values(), turn.keep)
+    if on is not None and outputs.of_one_model:
         raise CfbError(
-            "--figure and --recording show the flights of one model; leave out --on, or give the drone with --model."
+            "--figure, --recording, --video and --log show the flights of one model; leave out --on, or give the drone "
+            "with --model."
         )
+    if outputs.video is not None:
+        from cfb_mjx.view.film import check_film
+
+        check_film(outputs.video)
     if plants < 1:
         raise CfbError(f"--plants {plants}: at least one drone must fly.")
     if magnitude < 0:
@@ -117,21 +136,14 @@ def run_fly(
         for name, drone in drones.items():
             result["on"][name], _ = fly(drone)
             _print_row(name, result["on"][name], max(map(len, drones)))
-    if json is not None:
-        write_json(json, result | {"environment": environment()})
-        print(f"results: {json}")
-    if figure is not None:
-        from cfb_mjx.view.flight import flight_figure
-        from cfb_mjx.view.flip import flip_figure
+    if outputs.json is not None:
+        write_json(outputs.json, result | {"environment": environment()})
+        print(f"results: {outputs.json}")
+    if outputs.of_one_model:
+        from cfb_mjx.cli.flight_outputs import write_flights
 
-        draw = flight_figure if rotations is None else flip_figure
-        draw(flown, pilot.control_dt_s, figure, f"{controller}, {task}, {model}")
-        print(f"figure: {figure}")
-    if recording is not None:
-        from cfb_mjx.view.flight_recording import write_flight_recording
-
-        write_flight_recording(recording, flown, pilot.control_dt_s)
-        print(f"recording: {recording}")
+        title = f"{controller}, {task}, {model}"
+        write_flights(outputs, flown, pilot.control_dt_s, nominal, title, turning=rotations is not None)
 
 
 def asks_for_setpoints(pilot) -> bool:

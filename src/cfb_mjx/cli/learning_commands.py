@@ -58,6 +58,8 @@ def fly(
     json: File = None,
     figure: File = None,
     recording: File = None,
+    video: File = None,
+    log: File = None,
     knobs: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
     set: Pairs = (),
     holder: Annotated[str, tyro.conf.arg(metavar="CONTROLLER")] = "target",
@@ -84,6 +86,8 @@ def fly(
         json: write the results here.
         figure: draw the flights here.
         recording: write the flights here, for rerun (.rrd).
+        video: film the first flight here (.mp4 or .gif).
+        log: write the first flight here as a flight log (.mcap), for cfb view, evaluate, fit.
         knobs: of a flip: when it switches and what it asks for, a shipped manoeuvre (flip-wide, double-flip-low ...) or
             a YAML file; the task's own by default.
         set: changes to the knobs of a flip, for instance rate_radps=18 climb_s=0.4; a search leaves these alone.
@@ -92,7 +96,7 @@ def fly(
             randomisation.
         keep: write the knobs that were flown here, for --knobs.
     """
-    from cfb_mjx.cli.flying import Turn, run_fly
+    from cfb_mjx.cli.flying import Outputs, Turn, run_fly
 
-    turn = Turn(knobs, tuple(flat(set)), holder, search, keep)
-    run_fly(controller, task, model, plants, magnitude, randomisation, on, noise, seed, json, figure, recording, turn)
+    outputs, turn = Outputs(json, figure, recording, video, log), Turn(knobs, tuple(flat(set)), holder, search, keep)
+    run_fly(controller, task, model, plants, magnitude, randomisation, on, noise, seed, outputs, turn)

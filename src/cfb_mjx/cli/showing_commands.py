@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from cfb_mjx.cli.argument_types import Output
+from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat
 
 
 def demo(output: Output = Path("out/demo"), real: Path | None = None) -> None:
@@ -22,6 +22,35 @@ def demo(output: Output = Path("out/demo"), real: Path | None = None) -> None:
 
     configure_jax(x64=True)
     run_demo(output, real)
+
+
+def view(
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")],
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None,
+    model: Model = "cfb-guards",
+    set: Pairs = (),
+    spawn: bool = False,
+    video: File = None,
+    slow: float = 1.0,
+) -> None:
+    """Show flights: a rerun recording, rerun's viewer, or a film.
+
+    The recording has the drone in 3D with the thrust of its rotors, the way it went, where the model thought it would
+    go (half a second from every window), the commands, and what the model misses (force and torque per mass and
+    inertia). Flights of `cfb fly --log` are shown like any other.
+
+    Args:
+        logs: flight logs (MCAP, parquet, csv), or one recording (.rrd) with --spawn.
+        output: recording to write (.rrd).
+        model: preset or model YAML, for thrust, predictions and residuals.
+        set: parameters to change, for instance mass=0.045.
+        spawn: open rerun's viewer.
+        video: film the first flight here (.mp4 or .gif).
+        slow: how many times slower the film is than the flight.
+    """
+    from cfb_mjx.cli.viewing import run_view
+
+    run_view(list(logs), output, model, flat(set), spawn, video, slow)
 
 
 def reproduce(

@@ -172,13 +172,13 @@ def loads_at(constants: RotorConstants, speed: Vec, rate: Vec) -> RotorLoads:
     return RotorLoads(constants.thrust(speed).map(_at_least_zero), constants.torque(speed), rate)
 
 
-def thrust(parameters: Parameters, speed: Float[Array, "4"]) -> Float[Array, "4"]:
+def thrust(parameters: Parameters, speed: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
     """Thrust of each rotor [eq. 8], N. Clamped at zero: the cubic is negative below 229 rad/s, a fit artefact."""
     curve = polynomial(parameters.thrust_polynomial, parameters.thrust_scale, parameters.reference_rotor_speed)
     return curve(Vec.unstack(speed)).map(_at_least_zero).stack()
 
 
-def torque(parameters: Parameters, speed: Float[Array, "4"]) -> Float[Array, "4"]:
+def torque(parameters: Parameters, speed: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
     """Aerodynamic torque magnitude of each rotor [eq. 9], N m."""
     curve = polynomial(parameters.torque_polynomial, parameters.torque_scale, parameters.reference_rotor_speed)
     return curve(Vec.unstack(speed)).stack()

@@ -37,6 +37,8 @@ class Flight(NamedTuple):
     """Whether limits of speed or rate have been passed up to here."""
     watched: Any = None
     """What was asked to be seen of the pilot's memory."""
+    rotor_speed: Any = None
+    """(*drones, steps, 4), rad/s."""
 
 
 def fly(
@@ -74,7 +76,7 @@ def fly(
         failed = failed | outcome.failed
         at = episode.state
         watched = watch(memory) if target is None else target
-        row = Flight(at.position, at.velocity, at.quaternion, at.body_rate, command, failed, watched)
+        row = Flight(at.position, at.velocity, at.quaternion, at.body_rate, command, failed, watched, at.rotor_speed)
         return (episode, memory, failed), row
 
     steps = round(seconds / dt) if targets is None else len(targets)

@@ -217,10 +217,17 @@ def _found(checkpoint: Path, output: Path, training: Training, resume: bool) -> 
         return None
     about = read_about(checkpoint)
     for part, now in training.identity().items():
-        if about.get(part) != _json(now):
-            what = ", ".join(_differences(about.get(part), _json(now), part)) or part
+        before, now = _comparable(about.get(part)), _comparable(_json(now))
+        if before != now:
+            what = ", ".join(_differences(before, now, part)) or part
             raise CfbError(f"{checkpoint}: the training there had another {what}; give what it had, or another folder.")
     return about
+
+
+def _comparable(part: Any) -> Any:
+    """Without the name of the model's file: what it holds is compared, and folders move."""
+    named = isinstance(part, dict) and str(part.get("model", "")).endswith((".yaml", ".yml"))
+    return {key: value for key, value in part.items() if key != "model"} if named else part
 
 
 def _json(value: Any) -> Any:

@@ -8,12 +8,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
+from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import to_body
-from cfb_mjx.sysid.flight import Flight
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.sysid.flight import Flight, delay_of, prepare_flight
+from cfb_mjx.sysid.tracing.gram import driven_by, residual_blocks
 from cfb_mjx.sysid.tracing.search import Hypothesis, Search
+from cfb_mjx.sysid.tracing.whitening import Blocks
 
 WIDTH = 0.02
 """Standard deviation of the Gaussian, s: half of what moves at 6 Hz passes."""
@@ -87,8 +93,25 @@ def residual_rows(search: Search, hypothesis: Hypothesis) -> list[Residuals]:
     ]
 
 
+def model_residuals(model: Quadrotor, log: FlightLog, delay: float | None = None) -> tuple[Residuals, np.ndarray]:
+    """What a model misses along one flight, and the rotor speeds (rows, 4) [rad/s] that drove it.
+
+    Args:
+        model: the drone.
+        log: the flight.
+        delay: age of pose and velocity in its rows, s; as the log or the model says by default.
+    """
+    flight = prepare_flight(log, delay_of(log, model.parameters) if delay is None else delay)
+    driven = driven_by(model, flight, 0.0)
+    rows = _rows(residual_blocks(model, flight, driven, jnp.zeros(())), driven, flight, log.name)
+    return rows, np.asarray(driven)[: len(log)]
+
+
 def _one(search: Search, hypothesis: Hypothesis, flight: Flight, name: str) -> Residuals:
-    blocks, driven = search.residual(hypothesis, flight)
+    return _rows(*search.residual(hypothesis, flight), flight, name)
+
+
+def _rows(blocks: Blocks, driven: Array, flight: Flight, name: str) -> Residuals:
     # Blocks and padding only serve the compiler: the flight again, in one piece.
     n = int(np.sum(np.asarray(flight.interval) > 0)) + 1
     quantity = np.asarray(blocks.signals.quantity).reshape(-1, 10)[:n]

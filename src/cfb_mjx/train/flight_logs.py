@@ -1,0 +1,50 @@
+"""Simulated flights as flight logs: for `cfb evaluate`, `cfb fit`, `cfb view`, as if they had been recorded."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.rotation import to_body
+from cfb_mjx.train.flying import Flight
+
+
+def flight_log(flown: Flight, dt: float, name: str, gravity: float = 9.81, drone: int = 0) -> FlightLog:
+    """One flight as a log: true states, without delay or sensor noise, a row for each command.
+
+    The specific force is the mean over the control step before a row, as an accelerometer that is filtered shows it.
+
+    Args:
+        flown: flights, axes (drones, steps).
+        dt: time between two commands, s.
+        name: of the log.
+        gravity: m/s^2.
+        drone: which.
+
+    Raises:
+        CfbError: the drone was lost so early that nothing is left of its flight.
+    """
+    flight = {key: np.asarray(getattr(flown, key), float)[drone] for key in _FIELDS}
+    # A row holds the command that follows it; what is not finite any more, or has failed, is no flight.
+    well = np.isfinite(np.concatenate(list(flight.values()), axis=1)).all(axis=1) & ~np.asarray(flown.failed)[drone]
+    rows = len(well) - 1 if well.all() else int(np.argmin(well)) - 1
+    if rows < 2:
+        raise CfbError(f"{name}: the drone was lost at once; there is no flight to log.")
+    velocity, quaternion = flight["velocity"], flight["quaternion"][:rows]
+    change = np.diff(velocity[:rows], axis=0, prepend=velocity[:1]) / dt
+    change[0] = change[1]
+    return FlightLog(
+        time=dt * np.arange(1, rows + 1),
+        position=flight["position"][:rows],
+        velocity=velocity[:rows],
+        quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+        body_rate=flight["body_rate"][:rows],
+        specific_force=to_body(quaternion, change + np.array([0.0, 0.0, gravity])),
+        command=np.clip(flight["command"][1 : rows + 1], 0.0, 1.0),
+        rotor_speed=flight["rotor_speed"][:rows],
+        metadata={"name": name, "source": "simulated by cfb fly", "format": "simulated", "observation_delay": 0.0},
+    )
+
+
+_FIELDS = ("position", "velocity", "quaternion", "body_rate", "command", "rotor_speed")

@@ -1,0 +1,73 @@
+"""Flight logs as a rerun recording: what was measured, with thrust, predictions and residuals of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model import Quadrotor, rotors
+from cfb_mjx.sysid.evaluation import Evaluation, LogEvaluation
+from cfb_mjx.sysid.tracing.residuals import Residuals
+from cfb_mjx.view.closing_recording import record_flight, record_predictions, record_residuals, tab
+from cfb_mjx.view.recorder import AXES, Plot, Recorder, part, recording
+from cfb_mjx.view.style import COLOURS
+
+RATE = 100.0
+"""Rows per second kept at most."""
+_MOTORS = ("M1", "M2", "M3", "M4")
+
+
+def write_log_recording(
+    path: str | Path | None,
+    model: Quadrotor,
+    evaluation: Evaluation,
+    residuals: Sequence[tuple[Residuals, np.ndarray]],
+    spawn: bool = False,
+) -> None:
+    """Record flights beside a model's view of them.
+
+    For each flight, under its name: in 3D the measured way and drone with the thrust of each rotor, and predictions of
+    half a second from every window; commands, rotor speeds, body rates and voltage under ``signal``, what the model
+    misses under ``residual``.
+
+    Args:
+        path: file to write, ``.rrd``; None: only a viewer.
+        model: whose predictions and residuals are shown.
+        evaluation: of the model on the flights.
+        residuals: of each flight, with the rotor speeds (rows, 4) [rad/s] that drove the model.
+        spawn: open a viewer and show them there.
+
+    Raises:
+        CfbError: rerun is not installed, no viewer opens, or the file cannot be written.
+    """
+    roots = [part(one.log.name) for one in evaluation.logs]
+    tabs = [
+        tab(one.log, root, (Plot("command", (f"{root}/signal/command/**",)),))
+        for one, root in zip(evaluation.logs, roots, strict=True)
+    ]
+    with recording("cfb_view", tabs, path, spawn) as recorder:
+        for one, root, (missed, driven) in zip(evaluation.logs, roots, residuals, strict=True):
+            thrust = np.asarray(rotors.thrust(model.changed_parameters(), jnp.asarray(driven)))
+            record_flight(recorder, root, one, RATE, thrust)
+            record_predictions(recorder, f"{root}/world/prediction", one, COLOURS["commands_in"])
+            record_residuals(recorder, root, {"missed": (missed, None)}, RATE)
+            _signals(recorder, root, one, driven)
+
+
+def _signals(recorder: Recorder, root: str, evaluated: LogEvaluation, driven: np.ndarray) -> None:
+    """What the log holds beside the pose."""
+    log: FlightLog = evaluated.log
+    step = max(1, round(1 / (RATE * max(log.nominal_interval, 1e-4))))
+    rows = slice(None, None, step)
+    for i, motor in enumerate(_MOTORS):
+        recorder.series(f"{root}/signal/command/{motor}", log.time[rows], log.command[rows, i], motor)
+        recorder.series(f"{root}/signal/rotor_speed/{motor}", log.time[rows], driven[rows, i], f"{motor}, rad/s")
+    for i, axis in enumerate("xyz"):
+        degrees = np.degrees(log.body_rate[rows, i])
+        recorder.series(f"{root}/signal/body_rate/{axis}", log.time[rows], degrees, f"{axis}, deg/s", AXES[axis])
+    if log.battery_voltage is not None:
+        recorder.series(f"{root}/signal/battery", log.time[rows], log.battery_voltage[rows], "battery, V")
