@@ -1,0 +1,92 @@
+"""What the documentation site adds to docs/ while it is built (`hooks` in mkdocs.yml).
+
+- `cli.md` gets the help of every command, as the parsers print it: the page cannot be out of date.
+- CHANGELOG.md becomes the page `changes.md`.
+- Files of the repository that pages link to (``../configs/...``) become part of the site, so that no link leads out of it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import posixpath
+import re
+from pathlib import Path
+
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).resolve().parents[1]
+COMMANDS = "<!-- commands -->"
+"""In `cli.md`, where the commands belong."""
+OUTSIDE = re.compile(r"\]\(((?:\.\./)+[^)#\s]+)((?:#[^)\s]*)?)\)")
+WIDTH = "100"
+
+
+def on_files(files, config):
+    """Add the changelog and the linked files."""
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").replace("](docs/", "](")
+    files.append(File.generated(config, "changes.md", content=changes))
+    for page in [file for file in files if file.src_uri.endswith(".md") and file.abs_src_path]:
+        for target, _ in OUTSIDE.findall(Path(page.abs_src_path).read_text(encoding="utf-8")):
+            found = _outside(page.src_uri, target)
+            if found is not None and files.get_file_from_path(_copied(found)) is None:
+                files.append(File.generated(config, _copied(found), abs_src_path=str(ROOT / found)))
+    return files
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Fill in the commands; lead links out of docs/ to the copies."""
+    if page.file.src_uri == "cli.md":
+        markdown = markdown.replace(COMMANDS, commands())
+
+    def led(match):
+        found = _outside(page.file.src_uri, match[1])
+        if found is None:
+            return match[0]
+        to = "changes.md" if found == "CHANGELOG.md" else _copied(found)
+        return f"]({posixpath.relpath(to, posixpath.dirname(page.file.src_uri) or '.')}{match[2]})"
+
+    return OUTSIDE.sub(led, markdown)
+
+
+def _outside(page: str, target: str) -> str | None:
+    """Path from the repository's root of what a page links to outside docs/; None if it is inside or not there."""
+    path = posixpath.normpath(posixpath.join("docs", posixpath.dirname(page), target))
+    return None if path.startswith(("docs/", "../")) or not (ROOT / path).is_file() else path
+
+
+def _copied(path: str) -> str:
+    """Where the site keeps a file. As text, whatever it is: browsers then show it, and mkdocs does not read it."""
+    return f"files/{path}.txt"
+
+
+def commands() -> str:
+    """The help of every command, as Markdown."""
+    from cfb_mjx.cli import SUMMARY
+
+    parts = [f"| command | does |\n|---|---|\n{_rows(SUMMARY)}"]
+    parts += [f"## cfb {name}\n\n```text\n{help_of(name)}\n```" for name in SUMMARY]
+    return "\n\n".join(parts)
+
+
+def _rows(summary: dict[str, str]) -> str:
+    return "\n".join(f"| [`cfb {name}`](#cfb-{name}) | {text} |" for name, text in summary.items())
+
+
+def help_of(command: str) -> str:
+    """What ``cfb COMMAND --help`` prints, without colours, for a page of one width."""
+    from cfb_mjx.cli import main
+
+    printed = io.StringIO()
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = WIDTH
+    try:
+        with contextlib.redirect_stdout(printed):
+            main([command, "--help"])
+    finally:
+        os.environ.pop("COLUMNS")
+        if before is not None:
+            os.environ["COLUMNS"] = before
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue()).splitlines()
+    return "\n".join(line.rstrip() for line in lines).strip()
