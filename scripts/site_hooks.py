@@ -2,13 +2,17 @@
 
 - `cli.md` gets the help of every command, as the parsers print it: the page cannot be out of date.
 - CHANGELOG.md becomes the page `changes.md`.
+- Notebooks become pages as they were executed: text, code, printed output, figures. (mkdocs-jupyter would do it too,
+  with forty more packages and pages that name scripts on other servers.)
 - Files of the repository that pages link to (``../configs/...``) become part of the site, so that no link leads out of it.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import io
+import json
 import os
 import posixpath
 import re
@@ -19,14 +23,17 @@ from mkdocs.structure.files import File
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = "<!-- commands -->"
 """In `cli.md`, where the commands belong."""
+NOTEBOOK = re.compile(r"\]\(((?!https?:)[^)#\s]+)\.ipynb\)")
 OUTSIDE = re.compile(r"\]\(((?:\.\./)+[^)#\s]+)((?:#[^)\s]*)?)\)")
 WIDTH = "100"
 
 
 def on_files(files, config):
-    """Add the changelog and the linked files."""
+    """Add the changelog, the notebooks' pages and the linked files."""
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8").replace("](docs/", "](")
     files.append(File.generated(config, "changes.md", content=changes))
+    for notebook in [file for file in files if file.src_uri.endswith(".ipynb")]:
+        _add_notebook(files, notebook, config)
     for page in [file for file in files if file.src_uri.endswith(".md") and file.abs_src_path]:
         for target, _ in OUTSIDE.findall(Path(page.abs_src_path).read_text(encoding="utf-8")):
             found = _outside(page.src_uri, target)
@@ -47,7 +54,37 @@ def on_page_markdown(markdown, page, config, files):
         to = "changes.md" if found == "CHANGELOG.md" else _copied(found)
         return f"]({posixpath.relpath(to, posixpath.dirname(page.file.src_uri) or '.')}{match[2]})"
 
-    return OUTSIDE.sub(led, markdown)
+    return NOTEBOOK.sub(r"](\1.md)", OUTSIDE.sub(led, markdown))
+
+
+def _add_notebook(files, notebook: File, config) -> None:
+    """A page and its figures in place of a notebook, which stays beside it for whoever wants to run it."""
+    name = notebook.src_uri.removesuffix(".ipynb")
+    cells = json.loads(Path(notebook.abs_src_path).read_text(encoding="utf-8"))["cells"]
+    text, figures = notebook_page(cells, posixpath.basename(name))
+    for path, content in figures.items():
+        files.append(File.generated(config, posixpath.join(posixpath.dirname(name), path), content=content))
+    files.append(File.generated(config, f"{name}.md", content=text))
+
+
+def notebook_page(cells: list[dict], name: str) -> tuple[str, dict[str, bytes]]:
+    """Markdown of an executed notebook, and its figures by path."""
+    parts, figures = [], {}
+    for cell in cells:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        parts.append(f"```python\n{source}\n```")
+        for output in cell["outputs"]:
+            data = output.get("data", {})
+            if "image/png" in data:
+                path = f"{name}-{len(figures) + 1}.png"
+                figures[path] = base64.b64decode("".join(data["image/png"]))
+                parts.append(f"![figure]({path})")
+            elif text := "".join(output.get("text", data.get("text/plain", ""))).rstrip():
+                parts.append(f"```text\n{text}\n```")
+    return "\n\n".join(parts) + "\n", figures
 
 
 def _outside(page: str, target: str) -> str | None:
