@@ -4,7 +4,7 @@
 - CHANGELOG.md becomes the page `changes.md`.
 - Notebooks become pages as they were executed: text, code, printed output, figures. (mkdocs-jupyter would do it too,
   with forty more packages and pages that name scripts on other servers.)
-- Files of the repository that pages link to (``../configs/...``) become part of the site, so that no link leads out of it.
+- Files of the repository that pages link to (``../configs/...``) become part of the site: no link leads out of it.
 """
 
 from __future__ import annotations

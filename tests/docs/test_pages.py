@@ -38,7 +38,7 @@ page_outputs = _script("page_outputs")
 @pytest.fixture
 def _as_before():
     """Pages may register an effect and choose settings of jax; the other tests must not notice."""
-    known, settings = (dict(CATALOGUE), dict(KNOWN)), {name: jax.config.read(name) for name in SETTINGS}
+    known, settings = (dict(CATALOGUE), dict(KNOWN)), {name: getattr(jax.config, name) for name in SETTINGS}
     yield
     for now, before in zip((CATALOGUE, KNOWN), known, strict=True):
         now.clear()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import os
 import re
 import subprocess
@@ -54,10 +55,20 @@ def test_notebooks_show_their_figures(site):
         assert all((site / "notebooks" / figure).stat().st_size > 1000 for figure in figures)
 
 
-def test_the_reference_documents_what_is_public(site):
-    text = (site / "api" / "model.html").read_text()
-    assert 'id="cfb_mjx.model.Quadrotor"' in text
-    assert 'id="cfb_mjx.model.rollout"' in text
+@pytest.mark.parametrize("page", sorted((ROOT / "docs" / "api").glob("*.md")), ids=lambda page: page.stem)
+def test_the_reference_documents_all_that_is_public(site, page):
+    text = (site / "api" / f"{page.stem}.html").read_text()
+    for name in re.findall(r"^::: (cfb_mjx[\w.]*)$", page.read_text(), flags=re.M):
+        assert f'id="{name}"' in text
+        try:
+            package = importlib.import_module(name)
+        except ModuleNotFoundError:  # a class or function
+            continue
+        for public in getattr(package, "__all__", ()):
+            item = getattr(package, public)
+            if inspect.isclass(item) or inspect.isfunction(item):
+                # A function with the name of its module is documented by its full path.
+                assert any(f'id="{place}.{public}"' in text for place in (name, item.__module__)), public
 
 
 def test_pages_load_nothing_from_other_servers(site):
