@@ -54,6 +54,7 @@ def _same(found: str, said: str) -> bool:
     return np.allclose(*pairs, rtol=RTOL, atol=ATOL)
 
 
+@pytest.mark.xdist_group("pages")  # they share what one worker compiled
 @pytest.mark.parametrize("name", page_outputs.PAGES)
 @pytest.mark.usefixtures("_as_before")
 def test_python_on_a_page_runs_and_prints_what_the_page_says(name, tmp_path, monkeypatch):

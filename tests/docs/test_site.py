@@ -15,6 +15,8 @@ import pytest
 from cfb_mjx.cli import SUMMARY
 
 ROOT = Path(__file__).resolve().parents[2]
+# Built once.
+pytestmark = pytest.mark.xdist_group("site")
 MISSING = [name for name in ("mkdocs", "material", "mkdocstrings") if importlib.util.find_spec(name) is None]
 
 
