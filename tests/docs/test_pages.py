@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import re
 import shlex
@@ -138,6 +139,26 @@ def test_the_quick_commands_of_the_tutorial_work(tmp_path, monkeypatch, capsys):
         assert main(quick) == 0
     assert (tmp_path / "target-c" / "contract.json").exists()
     capsys.readouterr()
+
+
+def _strings(path: Path):
+    """All strings of a source file; what is filled in stands as an ellipsis."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(part.value if isinstance(part, ast.Constant) else "..." for part in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def test_messages_in_the_remedies_are_those_of_the_code():
+    said = "\n".join(text for path in (ROOT / "src").rglob("*.py") for text in _strings(path))
+    headings = re.findall(r"^### (.*)$", (DOCS / "faq.md").read_text(), flags=re.M)
+    quoted = [text for heading in headings for text in re.findall(r'"([^"]+)"', heading)]
+    assert len(quoted) > 10
+    foreign = {"Reverse-mode differentiation does not work for lax.while_loop"}  # jax's own
+    for text in set(quoted) - foreign:
+        for part in filter(None, (part.strip(" ;,") for part in text.split("..."))):
+            assert part in said, f"no message of the library says: {part}"
 
 
 def test_pages_speak_of_the_project_only():
