@@ -4,6 +4,7 @@
 - CHANGELOG.md becomes the page `changes.md`.
 - Notebooks become pages as they were executed: text, code, printed output, figures. (mkdocs-jupyter would do it too,
   with forty more packages and pages that name scripts on other servers.)
+- Lists are indented as Python-Markdown wants them; pages are written for GitHub's rules.
 - Files of the repository that pages link to (``../configs/...``) become part of the site: no link leads out of it.
 """
 
@@ -26,6 +27,7 @@ COMMANDS = "<!-- commands -->"
 NOTEBOOK = re.compile(r"\]\(((?!https?:)[^)#\s]+)\.ipynb\)")
 OUTSIDE = re.compile(r"\]\(((?:\.\./)+[^)#\s]+)((?:#[^)\s]*)?)\)")
 WIDTH = "100"
+ITEM = re.compile(r"( *)([-*]|\d+\.) +")
 
 
 def on_files(files, config):
@@ -54,7 +56,7 @@ def on_page_markdown(markdown, page, config, files):
         to = "changes.md" if found == "CHANGELOG.md" else _copied(found)
         return f"]({posixpath.relpath(to, posixpath.dirname(page.file.src_uri) or '.')}{match[2]})"
 
-    return NOTEBOOK.sub(r"](\1.md)", OUTSIDE.sub(led, markdown))
+    return lists(NOTEBOOK.sub(r"](\1.md)", OUTSIDE.sub(led, markdown)))
 
 
 def _add_notebook(files, notebook: File, config) -> None:
@@ -96,6 +98,33 @@ def _outside(page: str, target: str) -> str | None:
 def _copied(path: str) -> str:
     """Where the site keeps a file. As text, whatever it is: browsers then show it, and mkdocs does not read it."""
     return f"files/{path}.txt"
+
+
+def lists(markdown: str) -> str:
+    """Lists by GitHub's rules, made such by Python-Markdown's: four spaces a level, an empty line before the first."""
+    out, fenced, levels = [""], False, []
+    for line in markdown.split("\n"):
+        text, item = line.lstrip(" "), None if fenced else ITEM.match(line)
+        indent = len(line) - len(text)
+        # Within a paragraph GitHub takes only these for the beginning of a list.
+        if item and (levels or not out[-1] or text.startswith(("- ", "* ", "1. "))):
+            if not levels and out[-1]:
+                out.append("")
+            while levels and indent < levels[-1]:
+                levels.pop()
+            out.append("    " * len(levels) + text)
+            levels.append(item.end())
+        elif text and levels and indent >= levels[0]:
+            while not fenced and indent < levels[-1]:
+                levels.pop()
+            out.append("    " * len(levels) + " " * (indent - levels[-1]) + text)
+        else:
+            if text and not indent and (not out[-1] or text.startswith(("#", "|", "```"))):
+                levels = []
+            out.append(line)
+        if text.startswith("```"):
+            fenced = not fenced
+    return "\n".join(out[1:])
 
 
 def commands() -> str:

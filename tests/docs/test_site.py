@@ -41,6 +41,13 @@ def test_every_page_is_there(site):
     assert (site / "changes.html").exists()
 
 
+def test_lists_within_lists_are_lists(site):
+    text = (site / "closing-the-loop.html").read_text()
+    assert re.search(r"<ol>(?:(?!</ol>).)*<ul>\s*<li>\s*(?:<p>)?every absent effect", text, flags=re.S)
+    for page in site.glob("*.html"):
+        assert not re.search(r"<p>(?:(?!</p>).)*\n- ", page.read_text(), flags=re.S), page.name
+
+
 def test_every_command_is_explained(site):
     text = (site / "cli.html").read_text()
     for name in SUMMARY:
