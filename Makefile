@@ -8,7 +8,7 @@ PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13; do \
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 
-.PHONY: demo test test-long lint bench accuracy logs clean help
+.PHONY: demo test test-long lint bench accuracy logs docs clean help
 
 help:
 	@echo "make demo      set up and run the main job; the page is out/demo/index.html"
@@ -17,6 +17,7 @@ help:
 	@echo "make bench     measure speed beside crazyflow, write docs/performance.md"
 	@echo "make accuracy  measure the integrators, write docs/accuracy.md"
 	@echo "make logs      generate the shipped flight logs anew"
+	@echo "make docs      build the documentation; open site/index.html"
 
 demo: $(INSTALLED)
 	$(BIN)/cfb demo -o out/demo
@@ -38,6 +39,9 @@ accuracy: $(INSTALLED)
 logs: $(INSTALLED)
 	$(BIN)/python scripts/make_flight_logs.py
 
+docs: $(INSTALLED)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 $(INSTALLED): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "No Python 3.11 or newer found; install one or say PYTHON=/path/to/python3.11."; exit 1; }
 	@if command -v uv >/dev/null 2>&1; then \
@@ -55,4 +59,4 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .venv-peers out dist
+	rm -rf $(VENV) .venv-peers out dist site

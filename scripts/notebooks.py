@@ -1,0 +1,52 @@
+"""Run the notebooks of the documentation in place.
+
+    python scripts/notebooks.py [docs/notebooks/first_flight.ipynb ...]
+
+Needs ``pip install '.[docs]'``. What is written depends on the cells and on the versions only: no times, no names of
+machines. tests/docs/test_notebooks.py runs the same cells without Jupyter.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def execute(path: Path) -> None:
+    """Run all cells from the top and keep what they print and draw."""
+    import nbformat
+    from nbclient import NotebookClient
+
+    notebook = nbformat.read(path, as_version=4)
+    with tempfile.TemporaryDirectory() as folder:
+        client = NotebookClient(notebook, timeout=600, record_timing=False, resources={"metadata": {"path": folder}})
+        client.execute()
+    notebook.metadata = {
+        "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+        "language_info": {"name": "python"},
+    }
+    for number, cell in enumerate(notebook.cells):
+        cell.id, cell.metadata = f"cell-{number}", {}
+        for output in cell.get("outputs", []):
+            output.pop("metadata", None)
+            if output.output_type in ("display_data", "execute_result"):
+                output.metadata = {}
+                output.data = {k: v for k, v in output.data.items() if k in ("image/png", "text/plain")}
+                if "image/png" in output.data:
+                    output.data.pop("text/plain", None)  # the size of a figure in words
+    nbformat.validate(notebook)
+    nbformat.write(notebook, path)
+    print(f"{os.path.relpath(path)}: {path.stat().st_size / 1e3:.0f} kB")
+
+
+if __name__ == "__main__":
+    # Before the kernel starts: it inherits them.
+    from cfb_mjx.cli.runtime import set_up_xla
+
+    set_up_xla()
+    for name in sys.argv[1:] or sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):
+        execute(Path(name).resolve())
