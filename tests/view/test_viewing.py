@@ -148,6 +148,17 @@ def test_without_opengl_one_sentence_says_so(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_viewer_that_cannot_open_says_so_and_the_recording_stays(tmp_path, monkeypatch, capfd):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    assert main(["view", str(LOG), "-o", str(tmp_path / "yaw.rrd"), "--spawn"]) == 2
+    assert "viewer does not open here" in capfd.readouterr().err
+    assert (tmp_path / "yaw.rrd").exists()
+    assert main(["view", str(tmp_path / "none.rrd"), "--spawn"]) == 2
+    assert "there is no such file" in capfd.readouterr().err
+
+
 REFUSED = {
     "nothing to do": (["view", str(LOG)], "nothing to do"),
     "no log": (["view"], "at least one log"),

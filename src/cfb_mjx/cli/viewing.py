@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
-import sys
+import tempfile
 from pathlib import Path
 
 from cfb_mjx.cli.runtime import Progress, configure_jax
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import read_bytes, require_folder
+from cfb_mjx.files import require_folder
 from cfb_mjx.logs import read_log
 
 
@@ -30,7 +28,9 @@ def run_view(
         raise CfbError(f"--slow {slow}: must be above zero.")
     require_folder(output, video)
     if any(path.suffix == ".rrd" for path in paths):
-        _open(paths, output, video, spawn)
+        if not spawn or output is not None or video is not None or len(paths) > 1:
+            raise CfbError(f"{paths[0]}: is a recording already; open one with 'cfb view FILE.rrd --spawn'.")
+        _open(paths[0])
         return
     from cfb_mjx.view.film import Path3D, check_film, write_film
 
@@ -59,8 +59,11 @@ def run_view(
         from cfb_mjx.view.log_recording import write_log_recording
 
         evaluation = evaluate(drone, logs, progress=Progress("predictions"), faults=faults)
-        write_log_recording(output, drone, evaluation, residuals, spawn)
-        print(f"recording: {output}" if output is not None else "shown in rerun's viewer")
+        path = output or Path(tempfile.gettempdir()) / f"{logs[0].name}.rrd"
+        write_log_recording(path, drone, evaluation, residuals)
+        print(f"recording: {path}")
+        if spawn:
+            _open(path)
     if video is not None:
         log, driven = logs[0], residuals[0][1]
         thrust = np.asarray(rotors.thrust(drone.changed_parameters(), jnp.asarray(driven)))
@@ -70,14 +73,8 @@ def run_view(
         print(f"video: {video}")
 
 
-def _open(paths: list[Path], output: Path | None, video: Path | None, spawn: bool) -> None:
-    """A recording that is there already."""
-    if not spawn or output is not None or video is not None or len(paths) > 1:
-        raise CfbError(f"{paths[0]}: is a recording already; open one with 'cfb view FILE.rrd --spawn'.")
-    read_bytes(paths[0], 1)
-    rerun = shutil.which("rerun") or str(Path(sys.executable).parent / "rerun")
-    try:
-        subprocess.Popen([rerun, str(paths[0])])
-    except OSError as error:
-        raise CfbError(f"{paths[0]}: rerun's viewer does not open ({error}); run 'pip install rerun-sdk'.") from None
+def _open(path: Path) -> None:
+    from cfb_mjx.view.recorder import open_viewer
+
+    open_viewer(path)
     print("shown in rerun's viewer")

@@ -12,7 +12,7 @@ HEADER = ("quantity", "paper", "ours", "how it differs and why")
 TITLE = "How to Model Your Crazyflie Brushless, reproduced"
 
 
-def page(results: Mapping[str, Result], facts: Mapping[str, object], seconds: float) -> str:
+def page(results: Mapping[str, Result], facts: Mapping[str, object]) -> str:
     """Everything on one self-contained HTML page."""
     sections = [
         Section(
@@ -25,7 +25,7 @@ def page(results: Mapping[str, Result], facts: Mapping[str, object], seconds: fl
     ]
     lead = (
         "Every figure and table of the paper (ICRA 2026), from the shipped model, policies and logs, its numbers "
-        f"beside ours. Made in {seconds:.0f} s."
+        "beside ours."
     )
     return html_page(TITLE, lead, sections, facts)
 

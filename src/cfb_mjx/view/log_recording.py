@@ -22,11 +22,10 @@ _MOTORS = ("M1", "M2", "M3", "M4")
 
 
 def write_log_recording(
-    path: str | Path | None,
+    path: str | Path,
     model: Quadrotor,
     evaluation: Evaluation,
     residuals: Sequence[tuple[Residuals, np.ndarray]],
-    spawn: bool = False,
 ) -> None:
     """Record flights beside a model's view of them.
 
@@ -35,21 +34,20 @@ def write_log_recording(
     misses under ``residual``.
 
     Args:
-        path: file to write, ``.rrd``; None: only a viewer.
+        path: file to write, ``.rrd``.
         model: whose predictions and residuals are shown.
         evaluation: of the model on the flights.
         residuals: of each flight, with the rotor speeds (rows, 4) [rad/s] that drove the model.
-        spawn: open a viewer and show them there.
 
     Raises:
-        CfbError: rerun is not installed, no viewer opens, or the file cannot be written.
+        CfbError: rerun is not installed, or the file cannot be written.
     """
     roots = [part(one.log.name) for one in evaluation.logs]
     tabs = [
         tab(one.log, root, (Plot("command", (f"{root}/signal/command/**",)),))
         for one, root in zip(evaluation.logs, roots, strict=True)
     ]
-    with recording("cfb_view", tabs, path, spawn) as recorder:
+    with recording("cfb_view", tabs, path) as recorder:
         for one, root, (missed, driven) in zip(evaluation.logs, roots, residuals, strict=True):
             thrust = np.asarray(rotors.thrust(model.changed_parameters(), jnp.asarray(driven)))
             record_flight(recorder, root, one, RATE, thrust)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +14,11 @@ from typing import Any
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import replacing
+from cfb_mjx.files import read_bytes, replacing
 
 TIMELINE = "flight_time"
+_VIEWER_S = 4.0
+"""A viewer that cannot open has said so by then."""
 ARM_M = 0.05
 """From the middle of a drawn drone to a motor, along x and y."""
 METRES_PER_NEWTON = 1.0
@@ -55,38 +60,52 @@ def part(name: str) -> str:
 
 
 @contextlib.contextmanager
-def recording(
-    application: str, tabs: Sequence[Tab], path: str | Path | None = None, spawn: bool = False
-) -> Iterator[Recorder]:
-    """Record into a file, or into a viewer that is opened.
+def recording(application: str, tabs: Sequence[Tab], path: str | Path) -> Iterator[Recorder]:
+    """Record into a file.
 
     Args:
         application: name that rerun keeps settings of views under.
         tabs: how it is shown.
         path: file to write, ``.rrd``; an earlier one stays until the new one is whole.
-        spawn: open a viewer and show it there; without ``path`` only there.
 
     Raises:
-        CfbError: rerun is not installed, no viewer can be opened, or the file cannot be written.
+        CfbError: rerun is not installed, or the file cannot be written.
     """
-    where = "the viewer" if path is None else str(path)
-    rr = _rerun(where)
-    if path is not None and Path(path).suffix != ".rrd":
+    rr = _rerun(path)
+    if Path(path).suffix != ".rrd":
         raise CfbError(f"{path}: a recording must end in .rrd.")
-    with contextlib.ExitStack() as stack:
-        stream, sinks = rr.RecordingStream(application, make_default=False), []
-        if path is not None:
-            sinks.append(rr.FileSink(stack.enter_context(replacing(path))))
-        if spawn:
-            try:
-                rr.spawn(connect=False)
-            except Exception as error:  # rerun raises RuntimeError and others; all mean the same to the user
-                raise CfbError(f"rerun's viewer does not open here ({error}); write a file with -o instead.") from None
-            sinks.append(rr.GrpcSink())
-        stream.set_sinks(*sinks, default_blueprint=_blueprint(tabs))
+    with replacing(path) as temporary:
+        stream = rr.RecordingStream(application, make_default=False)
+        stream.save(temporary, default_blueprint=_blueprint(tabs))
         yield Recorder(rr, stream)
         stream.flush()
         stream.disconnect()
+
+
+def open_viewer(path: str | Path) -> None:
+    """Open rerun's viewer on a recording and leave it open.
+
+    Raises:
+        CfbError: there is no such file, rerun is not installed, or its viewer ends at once (no display).
+    """
+    read_bytes(path, 1)
+    _rerun(path)
+    with tempfile.TemporaryFile() as said:
+        viewer = subprocess.Popen(
+            [sys.executable, "-m", "rerun", str(path)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=said,
+            start_new_session=True,
+        )
+        try:
+            failed = viewer.wait(_VIEWER_S) != 0
+        except subprocess.TimeoutExpired:
+            return
+        if failed:
+            said.seek(0)
+            words = " ".join(said.read().decode(errors="replace").split())[-200:]
+            raise CfbError(f"{path}: rerun's viewer does not open here ({words}); copy the file to where it does.")
 
 
 class Recorder:
@@ -163,7 +182,7 @@ class Recorder:
         return [self._rr.TimeColumn(TIMELINE, duration=np.asarray(time, float))]
 
 
-def _rerun(where: str):
+def _rerun(where: str | Path):
     try:
         import rerun as rr
     except ImportError:
