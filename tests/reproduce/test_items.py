@@ -103,7 +103,7 @@ def test_pages_hold_every_row(tmp_path):
     table = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(table) == 3
     assert {line.count("|") for line in table} == {5}
-    html = page(results, {"date": "today"}, 1.0)
+    html = page(results, {"date": "today"})
     assert "&lt;c&gt;" in html
     assert not re.search(r'(src|href)="(?!data:)', html)
 

@@ -41,7 +41,7 @@ def view(
 
     Args:
         logs: flight logs (MCAP, parquet, csv), or one recording (.rrd) with --spawn.
-        output: recording to write (.rrd).
+        output: recording to write (.rrd); the first log's name in this folder by default.
         model: preset or model YAML, for thrust, predictions and residuals.
         set: parameters to change, for instance mass=0.045.
         spawn: open rerun's viewer.

@@ -22,8 +22,8 @@ def run_view(
     """
     if not paths:
         raise CfbError("view needs at least one log; see 'cfb view --help'.")
-    if output is None and not spawn and video is None:
-        raise CfbError("view has nothing to do; give -o FILE.rrd for a recording, --spawn for the viewer, or --video.")
+    if output is None and not spawn and video is None and paths[0].suffix != ".rrd":
+        output = Path(f"{paths[0].stem}.rrd")
     if slow <= 0:
         raise CfbError(f"--slow {slow}: must be above zero.")
     require_folder(output, video)
