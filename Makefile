@@ -31,7 +31,7 @@ test-long: $(INSTALLED)
 	PLAIN_XLA=1 $(BIN)/python -m pytest -m long
 
 bench: $(INSTALLED) .venv-peers/.installed
-	$(BIN)/cfb bench --peer-python .venv-peers/bin/python --json benchmarks/results.json --markdown docs/performance.md
+	$(BIN)/cfb bench --roofline --peer-python .venv-peers/bin/python --json benchmarks/results.json --markdown docs/performance.md
 
 accuracy: $(INSTALLED)
 	$(BIN)/python scripts/accuracy.py

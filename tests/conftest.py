@@ -33,6 +33,24 @@ def pytest_configure(config) -> None:
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 
 
+SETTINGS = (
+    "jax_enable_x64",
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_default_matmul_precision",
+)
+
+
+@pytest.fixture(autouse=True)
+def settings_as_before():
+    """Commands that a test runs in this process set up jax as they need it; the next test must not notice."""
+    before = {name: getattr(jax.config, name) for name in SETTINGS}
+    yield
+    for name, value in before.items():
+        if getattr(jax.config, name) != value:
+            jax.config.update(name, value)
+
+
 MAPS = Path("/proc/self/maps")
 MANY_MAPS = 20_000
 """Linux gives a process 65530 memory maps, and every compiled program keeps some: a worker that keeps the programs of

@@ -53,7 +53,14 @@ class Peer:
         self.process.stderr.close()
 
 
-def run_bench(drones: list[int], json: Path | None, markdown: Path | None, peer_python: Path | None, quick: bool):
+def run_bench(
+    drones: list[int],
+    json: Path | None,
+    markdown: Path | None,
+    peer_python: Path | None,
+    quick: bool,
+    roofline: bool = False,
+):
     """Measure, print, write.
 
     Raises:
@@ -74,8 +81,9 @@ def run_bench(drones: list[int], json: Path | None, markdown: Path | None, peer_
         times = _alternate(group, repetitions)
         if not quick:
             slow = [workloads.rollout(count, "mjx"), workloads.rollout(count, "mjx-floor"), workloads.stock_mjx(count)]
+            slow.append(workloads.rollout_policy(count))
             if count <= 8192:
-                slow.append(workloads.rollout_gradient(count))
+                slow += [workloads.rollout_gradient(count), workloads.rollout_ten(count)]
             times += _alternate(slow, 5)
             group += slow
         for item, seconds in zip(group, times, strict=True):
@@ -99,6 +107,12 @@ def run_bench(drones: list[int], json: Path | None, markdown: Path | None, peer_
         if peer:
             peer.close()
     result = {"rows": rows, "peers": peers, "environment": environment()}
+    if roofline:
+        from cfb_mjx.cli.roofline import roofline as measure
+        from cfb_mjx.cli.roofline import section
+
+        result["roofline"] = measure()
+        print(section(result["roofline"]))
     for line in ratios(result):
         print(line)
     if json is not None:
@@ -152,6 +166,8 @@ def page(result: dict) -> str:
     for peer in result["peers"]:
         name = f"{peer['name']} {peer['version']}"
         table.append(f"| rollout | {name} | {peer['drones']} | {peer['steps_per_s']:.3g} | {peer['compile_s']:.2f} | |")
+    from cfb_mjx.cli.roofline import section
+
     gpu = "" if jax.default_backend() != "cpu" else "GPU: not measured (none on this machine).\n"
     comparison = "\n".join(f"- {line}" for line in ratios(result))
     return f"""# Performance
@@ -163,7 +179,8 @@ Written by `make bench` (`cfb bench --peer-python ... --markdown docs/performanc
 Steps per second of all drones together, float32; the best of several runs that take turns with the peer's.
 `rollout`: open loop, {workloads.STEPS} steps of 4 ms (MJX fewer), one command held per drone, final state only.
 `rollout_randomised`: the same, every drone with its own parameters. `rollout_gradient`: reverse-mode gradient of a
-100-step rollout with respect to all parameters. Bodies: `rigid` closed form; `mjx` MuJoCo XLA without contact;
+100-step rollout with respect to all parameters, `rollout_ten` with respect to ten. `rollout_policy`: the shipped policy
+`target` in the loop, a command every 8 ms. Bodies: `rigid` closed form; `mjx` MuJoCo XLA without contact;
 `mjx-floor` with floor contact; `mjx-stock` plain `mjx.step` on the same MJCF without contact. crazyflow runs
 first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`, in a process with XLA's default
 options; ours runs with the option the `cfb` command sets for itself on CPU ([model.md](model.md#speed)):
@@ -174,4 +191,5 @@ arguments, results and temporaries.
 
 {gpu}
 {chr(10).join(table)}
-"""
+
+{section(result["roofline"]) if "roofline" in result else ""}"""

@@ -326,6 +326,7 @@ def bench(
     markdown: File = None,
     peer_python: File = None,
     quick: bool = False,
+    roofline: bool = False,
 ) -> None:
     """Measure throughput: simulation steps per second of every body, compile time and memory.
 
@@ -335,10 +336,11 @@ def bench(
         markdown: write the results as a Markdown page here.
         peer_python: a Python that has crazyflow installed, to measure it side by side.
         quick: fewer rows and repetitions, for a first look.
+        roofline: measure also what this machine can do at most, and how much of it the hot paths use.
     """
     from cfb_mjx.cli.benchmark import run_bench
 
-    run_bench(list(drones), json, markdown, peer_python, quick)
+    run_bench(list(drones), json, markdown, peer_python, quick, roofline)
 
 
 def version() -> None:

@@ -11,6 +11,8 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
+from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.envs.observation import Estimate
 from cfb_mjx.files import shipped
 from cfb_mjx.model import MjxBody, Quadrotor, rollout_final
 from cfb_mjx.model.mjx_body import mjx
@@ -32,6 +34,8 @@ class Workload:
     run: Callable[[], None]
     compile_s: float
     peak_mb: float
+    trace: tuple[Callable, tuple] = (lambda: None, ())
+    """The function and its arguments, before compiling."""
 
     def seconds(self) -> float:
         """Wall time of one run."""
@@ -51,7 +55,7 @@ def _compile(what: str, body: str, drones: int, steps: int, function, *arguments
     def run():
         jax.block_until_ready(compiled(*arguments))
 
-    return Workload(what, body, drones, steps, run, compile_s, peak / 2**20)
+    return Workload(what, body, drones, steps, run, compile_s, peak / 2**20, (function, arguments))
 
 
 def _start(model: Quadrotor, drones: int):
@@ -98,6 +102,91 @@ def rollout_gradient(drones: int) -> Workload:
         return jnp.mean(jnp.sum(final.position**2, axis=-1))
 
     return _compile("rollout_gradient", "rigid", drones, 100, jax.grad(loss), model, states, commands)
+
+
+def rollout_policy(drones: int) -> Workload:
+    """Closed loop: the shipped policy `target` commands every 8 ms on the true state, two steps of 4 ms each."""
+    model = Quadrotor.from_file("cfb-guards")
+    controller = load_policy(shipped_policies()["target"]).controller
+    states, _ = _start(model, drones)
+    offsets = 0.3 * jax.random.normal(jax.random.key(2), (drones, 3))
+    states = eqx.tree_at(lambda s: s.position, states, offsets)
+    commands = STEPS // 4
+
+    def fly(model, state):
+        def estimate(at):
+            return Estimate(at.position, at.velocity, at.quaternion, at.body_rate)
+
+        def one(carry, _):
+            at, memory = carry
+            memory, u = controller.command(memory, estimate(at))
+            return (rollout_final(model, at, u[None], hold=2), memory), None
+
+        memory = controller.start(estimate(state), model.hover_command())
+        return jax.lax.scan(one, (state, memory), length=commands)[0][0]
+
+    together = jax.vmap(fly, in_axes=(None, 0))
+    return _compile("rollout_policy", "rigid", drones, 2 * commands, together, model, states)
+
+
+def rollout_ten(drones: int) -> Workload:
+    """As `rollout_gradient`, with respect to ten parameters only, forward: the ten derivatives of the loss at once."""
+    model = Quadrotor.from_file("cfb-guards")
+    states, commands = _start(model, drones)
+    names = ("mass", "inertia", "rotor_inertia", "motor_time_constant", "motor_gain", "thrust_scale", "torque_scale")
+
+    def changed(x):
+        scale = dict(zip(names, (x[0], x[1:4], x[4], x[5], x[6], x[7], x[8]), strict=True))
+        parameters = model.parameters
+        for name, factor in scale.items():
+            parameters = eqx.tree_at(lambda p, n=name: getattr(p, n), parameters, getattr(parameters, name) * factor)
+        spacing = parameters.rotor_spacing * x[9]
+        return eqx.tree_at(lambda m: m.parameters, model, eqx.tree_at(lambda p: p.rotor_spacing, parameters, spacing))
+
+    def loss(x, s, u):
+        final = jax.vmap(lambda s, u: rollout_final(changed(x), s, u, hold=100))(s, u)
+        return jnp.mean(jnp.sum(final.position**2, axis=-1))
+
+    return _compile("rollout_ten", "rigid", drones, 100, jax.grad(loss), jnp.ones(10), states, commands)
+
+
+def fit_jacobian() -> Workload:
+    """Residuals of a fit to the shipped logs, and their derivatives by its parameters; a step is a row of a log."""
+    from cfb_mjx.logs import read_log
+    from cfb_mjx.sysid.identification.fitting import fit_slopes
+    from cfb_mjx.sysid.identification.flight_data import prepare
+    from cfb_mjx.sysid.identification.noise import Noise
+    from cfb_mjx.sysid.identification.unknowns import choose
+
+    nominal = Quadrotor.from_file("cfb-guards").parameters
+    logs = [read_log(path) for path in sorted(shipped("data", "flight_logs").glob("*.mcap"))]
+    data = prepare(logs)
+    unknowns = choose("inertia,rotor_inertia,motor,thrust_scale,torque_scale", nominal)
+    segments, noise = jax.tree.map(jnp.asarray, (data.segments, Noise.first(data)))
+
+    def slopes(vector, segments):
+        return fit_slopes(unknowns, vector, noise, segments, True, False)
+
+    count, rows = data.segments.valid.shape
+    return _compile("fit_jacobian", f"{len(unknowns.names)} parameters", count, rows, slopes, unknowns.start, segments)
+
+
+def ppo_update(drones: int = 512) -> Workload:
+    """One update of PPO with the shipped configuration: flights of all drones, and the learning from them."""
+    from cfb_mjx.train.config import load_config
+    from cfb_mjx.train.run import Training, build
+
+    training = Training.prepare(load_config("target", (f"ppo.drones={drones}",)), {})
+    nominal, config = training.nominal(), training.config
+    task = config.build_task()
+    algorithm = build(config, task, nominal)
+    state = algorithm.begin(jax.random.PRNGKey(0), training.first_controller(nominal))
+    arrays, rest = eqx.partition(state, eqx.is_array)
+
+    def update(arrays):
+        return eqx.filter(algorithm._update(eqx.combine(arrays, rest)), eqx.is_array)
+
+    return _compile("ppo", "rigid", drones, config.ppo.unroll * task.hold(nominal), update, arrays)
 
 
 def stock_mjx(drones: int) -> Workload:

@@ -55,11 +55,15 @@ def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 
 
 
 def _fly(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Components:
+    # Reverse mode keeps the state of every step and computes the rest of the step again: what it would keep otherwise
+    # costs more to write and read than to compute, and there is twenty times as much of it.
+    step = jax.checkpoint(lambda components, row: advance(prepared, components, row), prevent_cse=False)
+
     def one(components, row):
         if hold == 1:
-            return advance(prepared, components, row), None
+            return step(components, row), None
         # scan, not fori_loop: it has a reverse mode.
-        return jax.lax.scan(lambda c, _: (advance(prepared, c, row), None), components, length=hold)[0], None
+        return jax.lax.scan(lambda c, _: (step(c, row), None), components, length=hold)[0], None
 
     if rows[0].shape[0] == 1:
         return one(components, jax.tree.map(lambda x: x[0], rows))[0]

@@ -1,0 +1,100 @@
+"""Counting what a program does, from its trace: floating-point operations, transcendental functions, bytes moved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+PLAIN = {
+    "add", "sub", "mul", "div", "max", "min", "neg", "abs", "sqrt", "rsqrt", "sign", "floor", "round", "clamp",
+    "add_any", "square",
+}  # fmt: skip
+TRANSCENDENTAL = {
+    "exp", "exp2", "expm1", "log", "log1p", "tanh", "sin", "cos", "tan", "atan2", "asin", "acos", "logistic", "pow",
+    "erf", "erf_inv", "cbrt",
+}  # fmt: skip
+REDUCTIONS = {"reduce_sum", "reduce_max", "reduce_min", "cumsum"}
+
+
+class Operations(NamedTuple):
+    """Of one call."""
+
+    plain: float
+    """Additions, multiplications, comparisons, divisions, roots; two for each multiply-accumulate of a product."""
+    transcendental: float
+    """Exponentials, tangents and the like, each counted as one."""
+    moved: float
+    """Bytes that must pass from one step of a loop to the next, or in and out of a matrix product."""
+
+    def __add__(self, other: Operations) -> Operations:
+        return Operations(*(a + b for a, b in zip(self, other, strict=True)))
+
+    def times(self, factor: float) -> Operations:
+        """So many calls."""
+        return Operations(*(factor * x for x in self))
+
+
+NOTHING = Operations(0.0, 0.0, 0.0)
+
+
+def operations(function: Callable, *arguments: Any) -> Operations:
+    """What a call of ``function`` on such arguments does, by its definition: before a compiler simplifies it.
+
+    Loops count their turns; of branches the costliest counts. A loop without a known number of turns counts once.
+    """
+    return _of(jax.make_jaxpr(function)(*arguments).jaxpr)
+
+
+def _of(jaxpr) -> Operations:
+    total = NOTHING
+    for equation in jaxpr.eqns:
+        total += _equation(equation)
+    return total
+
+
+def _equation(equation) -> Operations:
+    name, parameters = equation.primitive.name, equation.params
+    if name == "scan":
+        carried = parameters["num_carry"]
+        constants = parameters["num_consts"]
+        body = parameters["jaxpr"].jaxpr
+        # Carry in and out, what is read of the sequences and written to them.
+        crossing = 2 * _bytes(body.invars[constants : constants + carried])
+        crossing += _bytes(body.invars[constants + carried :]) + _bytes(body.outvars[carried:])
+        return (_of(body) + Operations(0.0, 0.0, crossing)).times(parameters["length"])
+    if name == "cond":
+        return max((_of(branch.jaxpr) for branch in parameters["branches"]), key=lambda o: o.plain + o.transcendental)
+    inner = [p for key, p in parameters.items() if hasattr(p, "eqns") or hasattr(getattr(p, "jaxpr", None), "eqns")]
+    if inner:
+        total = NOTHING
+        for one in inner:
+            total += _of(one if hasattr(one, "eqns") else one.jaxpr)
+        return total
+    out = equation.outvars[0].aval
+    if not hasattr(out, "dtype") or not jnp.issubdtype(out.dtype, jnp.floating):
+        return NOTHING
+    if name == "dot_general":
+        (left, _), _ = parameters["dimension_numbers"]
+        contracted = math.prod(equation.invars[0].aval.shape[i] for i in left)
+        return Operations(2.0 * out.size * contracted, 0.0, _bytes(equation.invars) + _bytes(equation.outvars))
+    if name in REDUCTIONS:
+        return Operations(float(equation.invars[0].aval.size), 0.0, 0.0)
+    if name == "integer_pow":
+        return Operations(float(out.size) * max(1, abs(parameters["y"]) - 1), 0.0, 0.0)
+    if name in PLAIN:
+        return Operations(float(out.size), 0.0, 0.0)
+    return Operations(0.0, float(out.size), 0.0) if name in TRANSCENDENTAL else NOTHING
+
+
+def _bytes(variables) -> float:
+    return float(
+        sum(
+            v.aval.size * v.aval.dtype.itemsize
+            for v in variables
+            if hasattr(v.aval, "dtype") and not jnp.issubdtype(v.aval.dtype, jax.dtypes.prng_key)
+        )
+    )
