@@ -11,8 +11,9 @@ from pathlib import Path
 
 from campaign import ROOT, facts_line
 
-from cfb_mjx.cli.exporting import RESULTS, run_export
+from cfb_mjx.cli.exporting import run_export
 from cfb_mjx.cli.runtime import environment, set_up_xla
+from cfb_mjx.deploy.export import RESULTS
 from cfb_mjx.files import write_json, write_text
 
 POLICIES = ("target", "target-adaptive", "flip", "double-flip", "triple-flip")

@@ -361,6 +361,20 @@ def test_the_command_exports_checks_and_says_so(tmp_path, capfd):
         subprocess.run(["python3", str(ACCEPTANCE), str(tmp_path / "c")], check=True)
 
 
+def test_nothing_of_an_earlier_export_is_left(tmp_path):
+    exported = export_policy(find_deployment("double-flip"), tmp_path / "c")
+    (exported.folder / "check.json").write_text("{}")
+    (exported.folder / "notes.txt").write_text("mine")
+    again = export_policy(find_deployment("target"), tmp_path / "c")
+    found = {path.name for path in again.folder.iterdir()}
+    assert {path.name for path in again.folder.glob("*.c")} - {path.name for path in again.sources} == {
+        "controller_out_of_tree.c"
+    }
+    assert "check.json" not in found
+    assert "notes.txt" in found
+    assert "cfb_policy_set_flip" not in "".join(path.read_text() for path in again.folder.glob("*.[ch]"))
+
+
 def test_an_own_policy_file_is_exported(tmp_path):
     policy = random_policy(1, Layout())
     save_policy(policy, tmp_path / "mine.npz")

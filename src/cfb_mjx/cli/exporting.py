@@ -13,7 +13,6 @@ NEAR_M = 1e-3
 """How near each other the C and JAX have to hover."""
 FLASH, RAM, STEP_S = 64 * 1024, 8 * 1024, 1e-3
 """What a step may take on the drone."""
-RESULTS = "check.json"
 
 
 def run_export(policy: str, output: Path, knobs: str | None, holder: str, check: bool) -> None:
@@ -39,6 +38,7 @@ def run_export(policy: str, output: Path, knobs: str | None, holder: str, check:
 def _check(exported) -> None:
     from cfb_mjx.deploy import cortex
     from cfb_mjx.deploy.compiled import FLAGS, compile_policy
+    from cfb_mjx.deploy.export import RESULTS
     from cfb_mjx.deploy.flights import fly_beside
     from cfb_mjx.deploy.parity import TOLERANCE, compare
 

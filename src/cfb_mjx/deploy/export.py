@@ -18,8 +18,12 @@ from cfb_mjx.files import output_folder, plain, write_texts
 
 FIXED = ("cfb_network.h", "cfb_network.c", "cfb_pilot.h", "cfb_policy.h", "cfb_policy.c", "controller_out_of_tree.c")
 BUILD = ("Kbuild", "Makefile", "app-config", "README.md")
-LIBRARY = ("cfb_policy.c", "cfb_network.c", "cfb_data.c")
-"""What makes the plain library, beside the pilot."""
+LIBRARY = ("cfb_policy.c", "cfb_pilot.c", "cfb_network.c", "cfb_data.c")
+"""What makes the plain library."""
+PILOTS = {True: "cfb_pilot_flip.c", False: "cfb_pilot_hold.c"}
+"""Both are exported under one name, so that nothing of an earlier export is left beside a later one."""
+RESULTS = "check.json"
+"""What ``cfb export --check`` writes."""
 _NEVER = 1e9
 """A time, speed or angle that is not reached."""
 
@@ -33,7 +37,7 @@ class Exported(NamedTuple):
     @property
     def sources(self) -> list[Path]:
         """Of the plain library."""
-        return [self.folder / name for name in (*LIBRARY, f"{_pilot(self.deployment)}.c")]
+        return [self.folder / name for name in LIBRARY]
 
 
 def export_policy(deployment: Deployment, folder: str | Path) -> Exported:
@@ -44,13 +48,15 @@ def export_policy(deployment: Deployment, folder: str | Path) -> Exported:
     """
     folder = output_folder(folder)
     write_texts(folder, sources(deployment))
+    # It was about what has just been overwritten.
+    (folder / RESULTS).unlink(missing_ok=True)
     return Exported(folder, deployment)
 
 
 def sources(deployment: Deployment) -> dict[str, str]:
     """Names and texts of all files of an export."""
-    pilot = f"{_pilot(deployment)}.c"
-    texts = {name: _filled(_template(name), deployment) for name in (*FIXED, *BUILD, pilot)}
+    texts = {name: _filled(_template(name), deployment) for name in (*FIXED, *BUILD)}
+    texts["cfb_pilot.c"] = _filled(_template(PILOTS[deployment.flips]), deployment)
     texts["cfb_sizes.h"] = _sizes(deployment)
     texts["cfb_data.h"] = _header(deployment)
     texts["cfb_data.c"] = _data(deployment)
@@ -60,10 +66,6 @@ def sources(deployment: Deployment) -> dict[str, str]:
 
 def _template(name: str) -> str:
     return files("cfb_mjx.deploy").joinpath("c", name).read_text(encoding="utf-8")
-
-
-def _pilot(deployment: Deployment) -> str:
-    return "cfb_pilot_flip" if deployment.flips else "cfb_pilot_hold"
 
 
 def _filled(text: str, deployment: Deployment) -> str:
@@ -89,7 +91,6 @@ def _marks(deployment: Deployment) -> dict[str, str]:
         "WHAT": f"A network that flies the drone to a target and holds it there, every {step_ms:g} ms.",
         "VERSION": __version__,
         "HASH": " and ".join(p.weights_sha256[:12] for p in deployment.policies.values()),
-        "PILOT": _pilot(deployment),
         "PILOT_DOES": "what flies: the network",
         "DELAY_MS": delay,
         "BLIND_MS": f"{BLIND_STEPS * step_ms:g}",

@@ -1,4 +1,4 @@
-/* What flies: a network that holds a target (cfb_pilot_hold.c), or one that flips and returns (cfb_pilot_flip.c). */
+/* What flies: a network that holds a target, or one that flips and returns. */
 #ifndef CFB_PILOT_H
 #define CFB_PILOT_H
 
