@@ -59,20 +59,21 @@ def _of(jaxpr) -> Operations:
 def _equation(equation) -> Operations:
     name, parameters = equation.primitive.name, equation.params
     if name == "scan":
-        carried = parameters["num_carry"]
-        constants = parameters["num_consts"]
-        body = parameters["jaxpr"].jaxpr
-        # Carry in and out, what is read of the sequences and written to them.
-        crossing = 2 * _bytes(body.invars[constants : constants + carried])
-        crossing += _bytes(body.invars[constants + carried :]) + _bytes(body.outvars[carried:])
+        body = _plain(parameters["jaxpr"])
+        # By their axes, since versions of jax name the parts differently: what is read of sequences and written to them
+        # has one axis less inside; the carry comes before it.
+        read = [b for a, b in zip(equation.invars, body.invars, strict=True) if _deeper(a, b)]
+        written = [b for a, b in zip(equation.outvars, body.outvars, strict=True) if _deeper(a, b)]
+        carry = body.outvars[: len(body.outvars) - len(written)]
+        crossing = 2 * _bytes(carry) + _bytes(read) + _bytes(written)
         return (_of(body) + Operations(0.0, 0.0, crossing)).times(parameters["length"])
     if name == "cond":
-        return max((_of(branch.jaxpr) for branch in parameters["branches"]), key=lambda o: o.plain + o.transcendental)
+        return max((_of(_plain(branch)) for branch in parameters["branches"]), key=lambda o: o.plain + o.transcendental)
     inner = [p for key, p in parameters.items() if hasattr(p, "eqns") or hasattr(getattr(p, "jaxpr", None), "eqns")]
     if inner:
         total = NOTHING
         for one in inner:
-            total += _of(one if hasattr(one, "eqns") else one.jaxpr)
+            total += _of(_plain(one))
         return total
     out = equation.outvars[0].aval
     if not hasattr(out, "dtype") or not jnp.issubdtype(out.dtype, jnp.floating):
@@ -88,6 +89,14 @@ def _equation(equation) -> Operations:
     if name in PLAIN:
         return Operations(float(out.size), 0.0, 0.0)
     return Operations(0.0, float(out.size), 0.0) if name in TRANSCENDENTAL else NOTHING
+
+
+def _plain(jaxpr):
+    return jaxpr.jaxpr if hasattr(jaxpr, "jaxpr") else jaxpr
+
+
+def _deeper(outside, inside) -> bool:
+    return outside.aval.ndim > inside.aval.ndim
 
 
 def _bytes(variables) -> float:
