@@ -38,13 +38,14 @@ def _film(log: Path, path: Path) -> None:
 
     from cfb_mjx.logs import read_log
     from cfb_mjx.model import Quadrotor, rotors
+    from cfb_mjx.train.flips import FLOOR_M
     from cfb_mjx.view.film import Path3D, write_film
 
     flight = read_log(log)
     rows = flight.time < 2.4
     parameters = Quadrotor.from_file("cfb-guards").parameters
     thrust = np.asarray(rotors.thrust(parameters, jnp.asarray(flight.rotor_speed)))
-    above = flight.position + np.array([0.0, 0.0, 2.0])
+    above = flight.position + np.array([0.0, 0.0, FLOOR_M])
     shown = Path3D(flight.time[rows], above[rows], flight.quaternion[rows], thrust[rows])
     write_film(path, shown, size=(480, 360), rate=20, speed=0.5)
 

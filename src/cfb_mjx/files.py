@@ -62,6 +62,18 @@ def require_folder(*paths: str | os.PathLike | None) -> None:
             raise CfbError(f"{path}: the folder {Path(path).parent} does not exist; create it first.")
 
 
+def require_ending(path: str | os.PathLike, endings: tuple[str, ...], demand: str) -> Path:
+    """The path, if it ends in one of ``endings``, in small or capital letters.
+
+    Raises:
+        CfbError: another ending; ``demand`` says which it must be.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in endings:
+        raise CfbError(f"{path}: {demand}.")
+    return path
+
+
 def output_folder(path: str | os.PathLike) -> Path:
     """Make the folder a command writes its files into, with those above it.
 

@@ -50,10 +50,7 @@ def operations(function: Callable, *arguments: Any) -> Operations:
 
 
 def _of(jaxpr) -> Operations:
-    total = NOTHING
-    for equation in jaxpr.eqns:
-        total += _equation(equation)
-    return total
+    return sum(map(_equation, jaxpr.eqns), NOTHING)
 
 
 def _equation(equation) -> Operations:
@@ -69,12 +66,9 @@ def _equation(equation) -> Operations:
         return (_of(body) + Operations(0.0, 0.0, crossing)).times(parameters["length"])
     if name == "cond":
         return max((_of(_plain(branch)) for branch in parameters["branches"]), key=lambda o: o.plain + o.transcendental)
-    inner = [p for key, p in parameters.items() if hasattr(p, "eqns") or hasattr(getattr(p, "jaxpr", None), "eqns")]
+    inner = [_plain(p) for p in parameters.values() if hasattr(_plain(p), "eqns")]
     if inner:
-        total = NOTHING
-        for one in inner:
-            total += _of(_plain(one))
-        return total
+        return sum(map(_of, inner), NOTHING)
     out = equation.outvars[0].aval
     if not hasattr(out, "dtype") or not jnp.issubdtype(out.dtype, jnp.floating):
         return NOTHING

@@ -10,12 +10,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
+from jaxtyping import Array
 
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.envs.observation import Estimate
 from cfb_mjx.files import shipped
 from cfb_mjx.model import MjxBody, Quadrotor, rollout_final
 from cfb_mjx.model.mjx_body import mjx
+from cfb_mjx.model.state import State
 from cfb_mjx.parameters import load_randomisation, sample_parameters
 
 STEPS = 500
@@ -34,7 +36,7 @@ class Workload:
     run: Callable[[], None]
     compile_s: float
     peak_mb: float
-    trace: tuple[Callable, tuple] = (lambda: None, ())
+    trace: tuple[Callable, tuple]
     """The function and its arguments, before compiling."""
 
     def seconds(self) -> float:
@@ -97,11 +99,13 @@ def rollout_gradient(drones: int) -> Workload:
     model = Quadrotor.from_file("cfb-guards")
     states, commands = _start(model, drones)
 
-    def loss(m, s, u):
-        final = jax.vmap(lambda s, u: rollout_final(m, s, u, hold=100))(s, u)
-        return jnp.mean(jnp.sum(final.position**2, axis=-1))
+    return _compile("rollout_gradient", "rigid", drones, 100, jax.grad(_distance), model, states, commands)
 
-    return _compile("rollout_gradient", "rigid", drones, 100, jax.grad(loss), model, states, commands)
+
+def _distance(model: Quadrotor, states: State, commands: Array) -> Array:
+    """Mean square of the final distance after 100 steps."""
+    final = jax.vmap(lambda s, u: rollout_final(model, s, u, hold=100))(states, commands)
+    return jnp.mean(jnp.sum(final.position**2, axis=-1))
 
 
 def rollout_policy(drones: int) -> Workload:
@@ -130,7 +134,7 @@ def rollout_policy(drones: int) -> Workload:
 
 
 def rollout_ten(drones: int) -> Workload:
-    """As `rollout_gradient`, with respect to ten parameters only, forward: the ten derivatives of the loss at once."""
+    """As `rollout_gradient`, with respect to ten parameters only."""
     model = Quadrotor.from_file("cfb-guards")
     states, commands = _start(model, drones)
     names = ("mass", "inertia", "rotor_inertia", "motor_time_constant", "motor_gain", "thrust_scale", "torque_scale")
@@ -143,11 +147,8 @@ def rollout_ten(drones: int) -> Workload:
         spacing = parameters.rotor_spacing * x[9]
         return eqx.tree_at(lambda m: m.parameters, model, eqx.tree_at(lambda p: p.rotor_spacing, parameters, spacing))
 
-    def loss(x, s, u):
-        final = jax.vmap(lambda s, u: rollout_final(changed(x), s, u, hold=100))(s, u)
-        return jnp.mean(jnp.sum(final.position**2, axis=-1))
-
-    return _compile("rollout_ten", "rigid", drones, 100, jax.grad(loss), jnp.ones(10), states, commands)
+    gradient = jax.grad(lambda x, s, u: _distance(changed(x), s, u))
+    return _compile("rollout_ten", "rigid", drones, 100, gradient, jnp.ones(10), states, commands)
 
 
 def fit_jacobian() -> Workload:

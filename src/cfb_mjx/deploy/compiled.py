@@ -55,10 +55,7 @@ class CompiledPolicy:
 
     def step(self, position, velocity, quaternion, body_rate, target=(0.0, 0.0, 0.0)) -> np.ndarray:
         """Commands of M1..M4, (4,), float32."""
-        inputs = [np.ascontiguousarray(x, np.float32) for x in (position, velocity, quaternion, body_rate, target)]
-        command = np.empty(4, np.float32)
-        self._library.cfb_policy_step(*(x.ctypes.data for x in inputs), command.ctypes.data)
-        return command
+        return self.steps(np.concatenate([position, velocity, quaternion, body_rate, target])[None])[0]
 
     def steps(self, inputs: np.ndarray) -> np.ndarray:
         """Many steps in a row.

@@ -12,9 +12,9 @@ from cfb_mjx.envs.observation import Layout
 
 FORMAT = "cfb_mjx contract 1"
 BLIND_STEPS = 5
-"""Steps without an estimate before the motors are stopped; as in ``cfb_policy.h``."""
+"""Steps without an estimate before the motors are stopped."""
 LARGEST = 1e6
-"""No estimate is larger; as in ``cfb_policy.c``."""
+"""No estimate is larger."""
 
 
 def contract(deployment: Deployment) -> dict[str, Any]:

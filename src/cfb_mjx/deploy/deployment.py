@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.control.manoeuvre import Manoeuvre
@@ -122,8 +121,3 @@ def _flip(name: str, turner: PolicyFile, manoeuvre: ManoeuvreFile, holder: str |
     found = Deployment(name, held, turner, manoeuvre)
     _ = found.pilot  # says so where they do not go together
     return found
-
-
-def float32(x: Any) -> np.ndarray:
-    """As the drone computes."""
-    return np.asarray(jnp.asarray(x, jnp.float32))

@@ -12,8 +12,8 @@ import numpy as np
 
 from cfb_mjx import __version__
 from cfb_mjx.control.policy_file import PolicyFile
-from cfb_mjx.deploy.contract import BLIND_STEPS, contract
-from cfb_mjx.deploy.deployment import CATCH_S, Deployment, float32
+from cfb_mjx.deploy.contract import BLIND_STEPS, LARGEST, contract
+from cfb_mjx.deploy.deployment import CATCH_S, Deployment
 from cfb_mjx.files import output_folder, plain, write_texts
 
 FIXED = ("cfb_network.h", "cfb_network.c", "cfb_pilot.h", "cfb_policy.h", "cfb_policy.c", "controller_out_of_tree.c")
@@ -93,6 +93,8 @@ def _marks(deployment: Deployment) -> dict[str, str]:
         "HASH": " and ".join(p.weights_sha256[:12] for p in deployment.policies.values()),
         "PILOT_DOES": "what flies: the network",
         "DELAY_MS": delay,
+        "BLIND_STEPS": f"{BLIND_STEPS}",
+        "LARGEST_BITS": f"{np.float32(LARGEST).view(np.uint32):#x}",
         "BLIND_MS": f"{BLIND_STEPS * step_ms:g}",
         "FLIP": "",
     }
@@ -182,13 +184,16 @@ def _network(name: str, policy: PolicyFile) -> str:
     parts, layers = [f"/* weights_sha256 {policy.weights_sha256} */"], []
     for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         # A row for each output, so that the sums walk through memory.
-        parts += [_array(f"{name}_weight_{i}", float32(weight).T), _array(f"{name}_bias_{i}", float32(bias))]
+        parts += [
+            _array(f"{name}_weight_{i}", np.asarray(weight, np.float32).T),
+            _array(f"{name}_bias_{i}", np.asarray(bias, np.float32)),
+        ]
         inputs, outputs = weight.shape
         layers.append(f"    {{{inputs}, {outputs}, {name}_weight_{i}, {name}_bias_{i}}},")
     scales = "NULL"
     if layout.setpoint_scales:
         scales = f"{name}_setpoint_scales"
-        parts.append(_array(scales, float32(layout.setpoint_scales)))
+        parts.append(_array(scales, np.asarray(layout.setpoint_scales, np.float32)))
     fields = {
         "position": int(layout.position),
         "body_velocity": int(layout.body_velocity),

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
+from cfb_mjx.control.pilot import Pilot
 from cfb_mjx.deploy.compiled import CompiledPolicy
 from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.deploy.parity import begin
-from cfb_mjx.envs import TargetTask
-from cfb_mjx.envs.episode import longest_delay_s, reset, step
+from cfb_mjx.envs import Estimate, TargetTask
+from cfb_mjx.envs.episode import Episode, longest_delay_s, reset, step
+from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
 
 
@@ -65,29 +68,33 @@ def fly_beside(
     steps = round(seconds / dt)
     position, command = np.empty((2, steps, 3)), np.empty((2, steps, 4), np.float32)
 
-    @eqx.filter_jit
-    def first(start: State):
-        episode = reset(task, plant, jax.random.PRNGKey(seed), start)
-        return episode, pilot.start(episode.estimate, hover)
-
-    @eqx.filter_jit
-    def commanded(memory, estimate):
-        return pilot.command(memory, estimate)
-
-    @eqx.filter_jit
-    def flown(episode, u):
-        return step(task, episode, u)[0]
-
     for which in range(2):
-        episode, memory = first(start)
+        episode, memory = _first(task, plant, pilot, start, hover, jax.random.PRNGKey(seed))
         begin(deployment, compiled)
         for i in range(steps):
             if which == 0:
                 seen = episode.estimate
                 u = compiled.step(seen.position, seen.velocity, seen.quaternion, seen.body_rate)
             else:
-                memory, u = commanded(memory, episode.estimate)
+                memory, u = _commanded(pilot, memory, episode.estimate)
             command[which, i] = u
-            episode = flown(episode, jnp.asarray(u, jnp.float32))
+            episode = _flown(task, episode, jnp.asarray(u, jnp.float32))
             position[which, i] = episode.state.position
     return Beside(position, command, dt)
+
+
+# Compiled once for all flights of a policy.
+@eqx.filter_jit
+def _first(task: TargetTask, plant: Quadrotor, pilot: Pilot, start: State, hover: Array, key: Array):
+    episode = reset(task, plant, key, start)
+    return episode, pilot.start(episode.estimate, hover)
+
+
+@eqx.filter_jit
+def _commanded(pilot: Pilot, memory: Any, estimate: Estimate):
+    return pilot.command(memory, estimate)
+
+
+@eqx.filter_jit
+def _flown(task: TargetTask, episode: Episode, u: Array) -> Episode:
+    return step(task, episode, u)[0]

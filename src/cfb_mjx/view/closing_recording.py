@@ -59,7 +59,7 @@ def tab(log: FlightLog, root: str, more: tuple[Plot, ...] = ()) -> Tab:
 
 
 def record_residuals(
-    recorder: Recorder, root: str, residuals: dict[str, tuple[Residuals, str | None]], rate: float, signals: bool = True
+    recorder: Recorder, root: str, residuals: dict[str, tuple[Residuals, str | None]], rate: float
 ) -> None:
     """Residuals of one flight, and the signals that could drive them.
 
@@ -68,7 +68,6 @@ def record_residuals(
         root: entity of the flight.
         residuals: by label, of the same rows, with a colour each; None: the colour of the axis.
         rate: rows per second kept.
-        signals: also those that could drive them.
     """
     first = next(iter(residuals.values()))[0]
     step = max(1, round(1 / (rate * float(np.median(np.diff(first.time))))))
@@ -80,7 +79,7 @@ def record_residuals(
                 entity = f"{root}/residual/{_plain(axis)}/{label}"
                 own = AXES.get(axis[-1]) if colour is None else colour
                 recorder.series(entity, time, values[keep], f"{axis} {label}, {unit}", own)
-    for name, values in first.drivers.items() if signals else ():
+    for name, values in first.drivers.items():
         if np.isfinite(values[keep]).any():
             recorder.series(
                 f"{root}/signal/{_plain(name)}", time, values[keep], f"{name}, {UNITS[name]}", AXES.get(name[-1])

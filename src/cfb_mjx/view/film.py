@@ -10,14 +10,13 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import replacing, shipped
+from cfb_mjx.files import replacing, require_ending, shipped
 
 SUFFIXES = (".mp4", ".gif")
 SIZE, RATE = (640, 480), 25.0
@@ -46,10 +45,7 @@ def check_film(path: str | Path) -> Path:
     Raises:
         CfbError: another ending.
     """
-    path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise CfbError(f"{path}: a film must end in {' or '.join(SUFFIXES)}.")
-    return path
+    return require_ending(path, SUFFIXES, f"a film must end in {' or '.join(SUFFIXES)}")
 
 
 def write_film(
@@ -82,13 +78,13 @@ def write_film(
     pictures = _pictures(path, flight, size, rate / speed, azimuth_deg)
     with replacing(path) as temporary:
         if encoder is None:
-            _write_gif(temporary, list(pictures), rate)
+            _write_gif(temporary, pictures, rate)
         else:
             _write_mp4(encoder, temporary, pictures, size, rate)
 
 
-def _pictures(path: Path, flight: Path3D, size, rate: float, azimuth_deg: float) -> Iterator[np.ndarray]:
-    """Pictures (height, width, 3), drawn in a process of its own with the first OpenGL that works."""
+def _pictures(path: Path, flight: Path3D, size, rate: float, azimuth_deg: float) -> np.ndarray:
+    """Pictures (n, height, width, 3), drawn in a process of its own with the first OpenGL that works."""
     with tempfile.TemporaryDirectory(prefix="cfb-film-") as folder:
         job = Path(folder) / "job.npz"
         np.savez(job, **_job(flight, size, rate, azimuth_deg))
@@ -106,7 +102,7 @@ def _pictures(path: Path, flight: Path3D, size, rate: float, azimuth_deg: float)
                 "(Debian: apt install libegl1 libgl1-mesa-dri, or libosmesa6)."
             )
     width, height = size
-    yield from np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
 
 
 def _job(flight: Path3D, size, rate: float, azimuth_deg: float) -> dict[str, np.ndarray]:
@@ -145,16 +141,16 @@ def _ffmpeg(path: Path) -> str:
     return get_ffmpeg_exe()
 
 
-def _write_mp4(encoder: str, path: Path, pictures: Iterator[np.ndarray], size, rate: float) -> None:
+def _write_mp4(encoder: str, path: Path, pictures: np.ndarray, size, rate: float) -> None:
     command = [encoder, "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
     command += ["-s", f"{size[0]}x{size[1]}", "-r", f"{rate:g}", "-i", "-", "-c:v", "libx264", "-pix_fmt", "yuv420p"]
     command += ["-crf", "23", "-movflags", "+faststart", "-f", "mp4", str(path)]
-    done = subprocess.run(command, input=b"".join(p.tobytes() for p in pictures), capture_output=True)
+    done = subprocess.run(command, input=pictures.tobytes(), capture_output=True)
     if done.returncode:
         raise CfbError(f"{path}: ffmpeg failed ({done.stderr.decode(errors='replace').strip()[:200]}).")
 
 
-def _write_gif(path: Path, pictures: list[np.ndarray], rate: float) -> None:
+def _write_gif(path: Path, pictures: np.ndarray, rate: float) -> None:
     from PIL import Image
 
     # Of a picture most is sky and floor; this method keeps the colours of what is small as well.

@@ -5,8 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from cfb_mjx.errors import CfbError
-from cfb_mjx.files import replacing
+from cfb_mjx.files import replacing, require_ending
 
 MEASURED = "#222222"
 # Okabe and Ito's palette.
@@ -63,10 +62,7 @@ def check_path(path: str | os.PathLike) -> Path:
     Raises:
         CfbError: another ending.
     """
-    path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise CfbError(f"{path}: a figure must end in {', '.join(SUFFIXES)}.")
-    return path
+    return require_ending(path, SUFFIXES, f"a figure must end in {', '.join(SUFFIXES)}")
 
 
 def save(figure, path: Path) -> None:

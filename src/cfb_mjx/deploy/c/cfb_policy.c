@@ -29,7 +29,7 @@ static int sensible(const float *values, int length) {
   for (int i = 0; i < length; i++) {
     uint32_t bits;
     memcpy(&bits, &values[i], sizeof bits);
-    if ((bits & 0x7fffffffu) > 0x49742400u) return 0;
+    if ((bits & 0x7fffffffu) > @LARGEST_BITS@u) return 0;
   }
   return 1;
 }

@@ -29,7 +29,7 @@ void cfb_policy_step(const float position[3], const float velocity[3], const flo
 /* Time between two steps, s. */
 float cfb_policy_dt(void);
 
-#define CFB_POLICY_BLIND_STEPS 5
+#define CFB_POLICY_BLIND_STEPS @BLIND_STEPS@
 
 typedef enum {
   CFB_FINE,    /* the last step was a normal one */
