@@ -9,7 +9,6 @@ import shlex
 import sys
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
@@ -22,7 +21,6 @@ DOCS = ROOT / "docs"
 NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 # Numbers of a fit or a flight may differ a little between versions and processors.
 RTOL, ATOL = 0.05, 0.011
-SETTINGS = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs", "jax_enable_x64"
 
 
 def _script(name: str):
@@ -38,14 +36,12 @@ page_outputs = _script("page_outputs")
 
 @pytest.fixture
 def _as_before():
-    """Pages may register an effect and choose settings of jax; the other tests must not notice."""
-    known, settings = (dict(CATALOGUE), dict(KNOWN)), {name: getattr(jax.config, name) for name in SETTINGS}
+    """Pages may register an effect; the other tests must not notice."""
+    known = dict(CATALOGUE), dict(KNOWN)
     yield
     for now, before in zip((CATALOGUE, KNOWN), known, strict=True):
         now.clear()
         now.update(before)
-    for name, value in settings.items():
-        jax.config.update(name, value)
 
 
 def _same(found: str, said: str) -> bool:

@@ -1,34 +1,17 @@
 """The MCAP logs open in rerun's own loader."""
 
-import subprocess
-import sys
-
 import pytest
 
 from cfb_mjx.logs import write_mcap
+from tests.rerun_command import rerun
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
 
-def _rerun(*arguments, home):
-    # A home folder of its own: no settings are read or written and nothing is reported anywhere.
-    environment = {"HOME": str(home), "PATH": "/usr/bin:/bin", "RUST_LOG": "warn"}
-    done = subprocess.run(
-        [sys.executable, "-m", "rerun", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        env=environment,
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
 def test_rerun_draws_the_pose_and_reads_every_topic(short, tmp_path):
     write_mcap(short, tmp_path / "flight.mcap")
-    _rerun("mcap", "convert", tmp_path / "flight.mcap", "-o", tmp_path / "flight.rrd", home=tmp_path)
-    stats = _rerun("rrd", "stats", tmp_path / "flight.rrd", home=tmp_path)
+    rerun("mcap", "convert", tmp_path / "flight.mcap", "-o", tmp_path / "flight.rrd", home=tmp_path)
+    stats = rerun("rrd", "stats", tmp_path / "flight.rrd", home=tmp_path)
     for entity in ("/pose", "/velocity", "/body_rate", "/specific_force", "/command", "/rotor_speed", "/battery"):
         assert f"\n{entity}: " in stats
     # Foxglove's message is understood, not merely carried along.

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 import xml.etree.ElementTree as ElementTree
 from base64 import b64decode
 from dataclasses import replace
@@ -26,6 +24,7 @@ from cfb_mjx.sysid.tracing.structure import BLOCK, OFFSET, binned, edges_of, exp
 from cfb_mjx.sysid.tracing.trace import Found, Trace
 from cfb_mjx.view import closing_words as words
 from cfb_mjx.view.closing import write_report
+from tests.rerun_command import rerun
 from tests.simulated_log import simulated_log
 
 # They share fixtures and compiled programs.
@@ -133,18 +132,10 @@ def test_recording_opens(folder, tmp_path):
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     path = folder / "residual.rrd"
     assert 5e4 < path.stat().st_size < 3e6
-    done = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "stats", str(path)],
-        capture_output=True,
-        text=True,
-        env={"HOME": str(tmp_path), "PATH": "/usr/bin:/bin", "RUST_LOG": "warn"},
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    found = rerun("rrd", "stats", path, home=tmp_path)
     for entity in ("residual/force_x/before", "residual/torque_z/after", "world/drone", "world/prediction_after"):
-        assert f"/flight\\ 2/{entity}: " in done.stdout, done.stdout
-    assert "/flight\\ 3/residual/rotor_M1" not in done.stdout
+        assert f"/flight\\ 2/{entity}: " in found, found
+    assert "/flight\\ 3/residual/rotor_M1" not in found
 
 
 def test_residuals_see_a_drag_that_is_not_there(outcome):

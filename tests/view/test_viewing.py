@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,22 +17,9 @@ from cfb_mjx.logs import read_log
 from cfb_mjx.model import Quadrotor, rotors
 from cfb_mjx.sysid.tracing.residuals import model_residuals
 from cfb_mjx.view import film, recorder
+from tests.rerun_command import rerun
 
 LOG = shipped("data", "flight_logs", "yaw.mcap")
-
-
-def stats(path: Path, home: Path) -> str:
-    """What rerun itself finds in a recording."""
-    done = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "stats", str(path)],
-        capture_output=True,
-        text=True,
-        env={"HOME": str(home), "PATH": "/usr/bin:/bin", "RUST_LOG": "warn"},
-        timeout=60,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def test_a_log_becomes_a_recording_with_thrust_predictions_and_residuals(tmp_path, monkeypatch, capfd):
@@ -41,7 +27,7 @@ def test_a_log_becomes_a_recording_with_thrust_predictions_and_residuals(tmp_pat
     monkeypatch.chdir(tmp_path)
     assert main(["view", str(LOG)]) == 0
     assert "recording: yaw.rrd" in capfd.readouterr().out
-    found = stats(tmp_path / "yaw.rrd", tmp_path)
+    found = rerun("rrd", "stats", tmp_path / "yaw.rrd", home=tmp_path)
     for entity in (
         "world/drone",
         "world/drone/thrust",
@@ -61,7 +47,7 @@ def test_the_flight_of_a_controller_is_recorded_and_logged(tmp_path, capfd):
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
     outputs = ["--recording", str(tmp_path / "step.rrd"), "--log", str(tmp_path / "step.mcap")]
     assert main(["fly", "target", "--task", "step", "--plants", "2", *outputs]) == 0
-    found = stats(tmp_path / "step.rrd", tmp_path)
+    found = rerun("rrd", "stats", tmp_path / "step.rrd", home=tmp_path)
     for entity in ("world/0/drone/thrust", "world/1/drone", "world/set-point", "signal/command/M2"):
         assert f"/{entity}: " in found, entity
     assert "/world/1/drone/thrust" not in found

@@ -7,7 +7,7 @@ import numpy as np
 from cfb_mjx.cli.flying import Outputs
 from cfb_mjx.model import Quadrotor, rotors
 from cfb_mjx.train.flips import FLOOR_M
-from cfb_mjx.train.flying import Flight
+from cfb_mjx.train.flying import Flight, steps_flown
 
 HEIGHT_M = 1.0
 """Of the target above the floor of a film; flips are flown `FLOOR_M` above it."""
@@ -45,8 +45,7 @@ def write_flights(outputs: Outputs, flown: Flight, dt: float, nominal: Quadrotor
 
         position = np.asarray(flown.position[0], float)
         # A drone that is lost is filmed until then.
-        kept = np.isfinite(position).all(axis=1) & ~np.asarray(flown.failed[0])
-        rows = slice(None) if kept.all() else slice(int(np.argmin(kept)))
+        rows = slice(steps_flown(flown))
         above = np.array([0.0, 0.0, FLOOR_M if turning else HEIGHT_M])
         thrust = np.asarray(rotors.thrust(parameters, flown.rotor_speed[0]))
         time = dt * (1 + np.arange(len(position)))

@@ -7,7 +7,7 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.rotation import to_body
-from cfb_mjx.train.flying import Flight
+from cfb_mjx.train.flying import Flight, steps_flown
 
 
 def flight_log(flown: Flight, dt: float, name: str, gravity: float = 9.81, drone: int = 0) -> FlightLog:
@@ -26,9 +26,8 @@ def flight_log(flown: Flight, dt: float, name: str, gravity: float = 9.81, drone
         CfbError: the drone was lost so early that nothing is left of its flight.
     """
     flight = {key: np.asarray(getattr(flown, key), float)[drone] for key in _FIELDS}
-    # A row holds the command that follows it; what is not finite any more, or has failed, is no flight.
-    well = np.isfinite(np.concatenate(list(flight.values()), axis=1)).all(axis=1) & ~np.asarray(flown.failed)[drone]
-    rows = len(well) - 1 if well.all() else int(np.argmin(well)) - 1
+    # A row holds the command that follows it.
+    rows = steps_flown(flown, drone) - 1
     if rows < 2:
         raise CfbError(f"{name}: the drone was lost at once; there is no flight to log.")
     velocity, quaternion = flight["velocity"], flight["quaternion"][:rows]

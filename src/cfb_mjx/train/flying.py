@@ -41,6 +41,18 @@ class Flight(NamedTuple):
     """(*drones, steps, 4), rad/s."""
 
 
+def steps_flown(flown: Flight, drone: int = 0) -> int:
+    """How many steps one drone of several flew before it was lost; all of them if it never was.
+
+    Args:
+        flown: flights, axes (drones, steps).
+        drone: which.
+    """
+    numbers = [np.asarray(x)[drone] for x in (*flown[:5], flown.rotor_speed)]
+    well = np.isfinite(np.concatenate(numbers, axis=1)).all(axis=1) & ~np.asarray(flown.failed)[drone]
+    return len(well) if well.all() else int(np.argmin(well))
+
+
 def fly(
     pilot: Pilot,
     task: TargetTask,
