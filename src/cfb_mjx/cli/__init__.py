@@ -22,6 +22,7 @@ SUMMARY = {
     "refine": "fit the numbers of named effects, to innovations or to predictions",
     "train": "train a controller, by PPO or by back-propagation through the model",
     "fly": "fly a controller in simulation and measure it",
+    "sweep": "run a command many times over, on this machine or a cluster",
     "export": "write a policy as C for the drone, and check that it does the same there",
     "view": "show flights: a rerun recording with predictions and residuals, or a film",
     "bench": "measure throughput, compile time and memory",
@@ -34,7 +35,10 @@ SUMMARY = {
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point. Exit status: 0 done, 1 a fault in the library, 2 bad input, 130 interrupted."""
+    """Entry point.
+
+    Exit status: 0 done, 1 a fault in the library, 2 bad input, 3 another process of several gone, 130 interrupted.
+    """
     set_up_xla()
     try:
         with heard():

@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import os
 import subprocess
+import tempfile
 from pathlib import Path
 
 import jax
 
 from cfb_mjx.cli import workloads
 from cfb_mjx.cli.runtime import environment
+from cfb_mjx.cli.timed_process import TimedProcess
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json, write_text
+from cfb_mjx.model.acceleration import kernel_is_chosen
 
-PEER_STEPS = 500
 
-
-class Peer:
+class Peer(TimedProcess):
     """A crazyflow process that times one run per request, so that its runs can alternate with ours."""
 
     name = "crazyflow"
 
-    def __init__(self, python: Path, drones: int):
+    def __init__(self, python: Path, drones: int, network: Path | None = None):
         script = Path(__file__).with_name("peers") / "crazyflow_peer.py"
         try:
             self.process = subprocess.Popen(
-                [str(python), str(script), str(drones)],
+                [str(python), str(script), str(drones), *([] if network is None else [str(network)])],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
@@ -36,21 +37,11 @@ class Peer:
         except OSError as error:
             raise CfbError(f"--peer-python {python}: cannot be run ({error.strerror}).") from None
         answer = self.process.stdout.readline().split()
-        if len(answer) != 3 or answer[0] != "ready":
+        if len(answer) != 4 or answer[0] != "ready":
             last = (self.process.communicate()[1].strip().splitlines() or ["no output"])[-1]
             raise CfbError(f"--peer-python {python}: crazyflow does not run there ({last}).")
-        self.version, self.compile_s, self.drones = answer[1], float(answer[2]), drones
-
-    def seconds(self) -> float:
-        self.process.stdin.write("\n")
-        self.process.stdin.flush()
-        return float(self.process.stdout.readline())
-
-    def close(self) -> None:
-        self.process.stdin.close()
-        self.process.wait()
-        self.process.stdout.close()
-        self.process.stderr.close()
+        self.version, self.compile_s, self.steps, self.drones = answer[1], float(answer[2]), int(answer[3]), drones
+        self.what = "rollout" if network is None else "rollout_policy"
 
 
 def run_bench(
@@ -76,25 +67,30 @@ def run_bench(
     print(f"{'what':<20}{'body':<12}{'drones':>7}{'steps/s':>12}{'compile s':>11}{'memory MB':>11}")
     for count in drones:
         group = [workloads.rollout(count), workloads.rollout_randomised(count)]
+        group += [workloads.rollout(count, "rigid-plain")] if kernel_is_chosen() else []
         peer = Peer(peer_python, count) if peer_python is not None else None
         group += [peer] if peer else []
         times = _alternate(group, repetitions)
         if not quick:
             slow = [workloads.rollout(count, "mjx"), workloads.rollout(count, "mjx-floor"), workloads.stock_mjx(count)]
             slow.append(workloads.rollout_policy(count))
+            if peer:
+                with tempfile.TemporaryDirectory() as folder:
+                    slow.append(Peer(peer_python, count, workloads.network_file(Path(folder))))
             if count <= 8192:
                 slow += [workloads.rollout_gradient(count), workloads.rollout_ten(count)]
             times += _alternate(slow, 5)
             group += slow
         for item, seconds in zip(group, times, strict=True):
-            if item is peer:
+            if isinstance(item, Peer):
                 peers.append(
-                    {"name": item.name, "version": item.version, "drones": count}
-                    | {"steps_per_s": count * PEER_STEPS / seconds, "compile_s": item.compile_s}
+                    {"name": item.name, "version": item.version, "what": item.what, "drones": count}
+                    | {"steps_per_s": count * item.steps / seconds, "compile_s": item.compile_s}
                 )
                 print(
-                    f"{'rollout':<20}{item.name:<12}{count:>7}{peers[-1]['steps_per_s']:>12.3g}{item.compile_s:>11.2f}"
+                    f"{item.what:<20}{item.name:<12}{count:>7}{peers[-1]['steps_per_s']:>12.3g}{item.compile_s:>11.2f}"
                 )
+                item.close()
                 continue
             row = {"what": item.what, "body": item.body, "drones": count, "steps_per_s": count * item.steps / seconds}
             row |= {"compile_s": item.compile_s, "peak_mb": item.peak_mb}
@@ -104,8 +100,6 @@ def run_bench(
                 f"{item.compile_s:>11.2f}{item.peak_mb:>11.1f}",
                 flush=True,
             )
-        if peer:
-            peer.close()
     result = {"rows": rows, "peers": peers, "environment": environment()}
     if roofline:
         from cfb_mjx.cli.roofline import roofline as measure
@@ -144,9 +138,13 @@ def ratios(result: dict) -> list[str]:
         ours = _speed(result, "rollout", "rigid", drones)
         for peer in result["peers"]:
             if peer["drones"] == drones:
-                lines.append(
-                    f"{drones} drones: closed form {ours / peer['steps_per_s']:.1f} x {peer['name']} {peer['version']}"
-                )
+                speed = _speed(result, peer["what"], "rigid", drones) / peer["steps_per_s"]
+                what = "closed form" if peer["what"] == "rollout" else "the same network in the loop"
+                lines.append(f"{drones} drones: {what} {speed:.1f} x {peer['name']} {peer['version']}")
+        if ten := _speed(result, "rollout_ten", "rigid", drones):
+            lines.append(f"{drones} drones: a gradient by ten parameters costs {ours / ten:.1f} x the rollout")
+        if plain := _speed(result, "rollout", "rigid-plain", drones):
+            lines.append(f"{drones} drones: the kernel {ours / plain:.2f} x the plain program")
         free, floor, stock = (_speed(result, "rollout", b, drones) for b in ("mjx", "mjx-floor", "mjx-stock"))
         if free and floor and stock:
             lines.append(f"{drones} drones: MJX without floor {free / stock:.2f} x stock mjx.step")
@@ -165,7 +163,9 @@ def page(result: dict) -> str:
         )
     for peer in result["peers"]:
         name = f"{peer['name']} {peer['version']}"
-        table.append(f"| rollout | {name} | {peer['drones']} | {peer['steps_per_s']:.3g} | {peer['compile_s']:.2f} | |")
+        table.append(
+            f"| {peer['what']} | {name} | {peer['drones']} | {peer['steps_per_s']:.3g} | {peer['compile_s']:.2f} | |"
+        )
     from cfb_mjx.cli.roofline import section
 
     gpu = "" if jax.default_backend() != "cpu" else "GPU: not measured (none on this machine).\n"
@@ -182,9 +182,10 @@ Steps per second of all drones together, float32; the best of several runs that 
 100-step rollout with respect to all parameters, `rollout_ten` with respect to ten. `rollout_policy`: the shipped policy
 `target` in the loop, a command every 8 ms. Bodies: `rigid` closed form; `mjx` MuJoCo XLA without contact;
 `mjx-floor` with floor contact; `mjx-stock` plain `mjx.step` on the same MJCF without contact. crazyflow runs
-first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`, in a process with XLA's default
-options; ours runs with the option the `cfb` command sets for itself on CPU ([model.md](model.md#speed)):
-`XLA_FLAGS={os.environ.get("XLA_FLAGS", "")}`. Memory is the compiled program's
+first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`, and with the same network in its loop
+at 250 Hz, a command every 8 ms, in a process with XLA's default options; ours runs with the option the `cfb` command
+sets for itself on CPU ([model.md](model.md#speed)): `XLA_FLAGS={os.environ.get("XLA_FLAGS", "")}`.
+Memory is the compiled program's
 arguments, results and temporaries.
 
 {comparison}

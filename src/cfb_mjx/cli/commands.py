@@ -12,6 +12,7 @@ from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat
 from cfb_mjx.cli.deploying_commands import export
 from cfb_mjx.cli.learning_commands import fly, train
 from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce, view
+from cfb_mjx.cli.sweep_commands import sweep
 from cfb_mjx.errors import CfbError
 
 
@@ -52,6 +53,7 @@ def evaluate(
     json: File = None,
     figure: File = None,
     observer: bool = False,
+    devices: int = 1,
 ) -> None:
     """Measure how well a model predicts flights, open loop, at 50, 100, 200 and 500 ms.
 
@@ -65,12 +67,13 @@ def evaluate(
         json: write the results here.
         figure: draw prediction against measurement here (.png, .svg, .pdf).
         observer: add predictions with disturbances estimated from the data before each window starts.
+        devices: of this machine that share the windows.
     """
     if not logs:
         raise CfbError("evaluate needs at least one log; see 'cfb evaluate --help'.")
     from cfb_mjx.cli.evaluating import run_evaluate
 
-    run_evaluate(list(logs), model, flat(set), json, figure, observer)
+    run_evaluate(list(logs), model, flat(set), json, figure, observer, devices)
 
 
 def benchmark_nanodrone(
@@ -107,6 +110,7 @@ def fit(
     robust: bool = False,
     commands_only: bool = False,
     compare: bool = False,
+    devices: int = 1,
 ) -> None:
     """Refit the model to flights, with uncertainty, and judge it on data kept from the fit.
 
@@ -129,6 +133,7 @@ def fit(
         robust: let outliers count linearly instead of squared.
         commands_only: do not use measured rotor speeds to drive the body.
         compare: show what the other estimator would say; multiple shooting is blind to feedback.
+        devices: of this machine that share the flights.
     """
     if not logs:
         raise CfbError("fit needs at least one log; see 'cfb fit --help'.")
@@ -147,6 +152,7 @@ def fit(
         estimator,
         robust,
         figure,
+        devices,
     )
 
 
@@ -362,6 +368,7 @@ COMMANDS = {
     "refine": refine,
     "train": train,
     "fly": fly,
+    "sweep": sweep,
     "export": export,
     "view": view,
     "bench": bench,

@@ -26,7 +26,13 @@ _UNITS = {"m": "m", "mps": "m/s", "deg": "deg", "radps": "rad/s"}
 
 
 def run_evaluate(
-    paths: list[Path], model: str, changes: list[str], json: Path | None, figure: Path | None, observer: bool = False
+    paths: list[Path],
+    model: str,
+    changes: list[str],
+    json: Path | None,
+    figure: Path | None,
+    observer: bool = False,
+    devices: int = 1,
 ) -> None:
     """Evaluate, print a table, write what was asked for.
 
@@ -35,8 +41,9 @@ def run_evaluate(
     """
     require_folder(json, figure)
     logs = [read_log(path) for path in paths]  # before jax loads: a bad log is refused at once
-    configure_jax(x64=True)
+    configure_jax(x64=True, devices=devices)
     described = changed_model(model, changes)
+    from cfb_mjx.devices import Devices
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid import evaluate
     from cfb_mjx.sysid.observer import Observer
@@ -45,7 +52,12 @@ def run_evaluate(
     settings = Observer() if observer else None
     faults = SensorFaults.from_mappings(described.effects, model)
     evaluation = evaluate(
-        Quadrotor.from_file(described), logs, progress=Progress("evaluating"), observer=settings, faults=faults
+        Quadrotor.from_file(described),
+        logs,
+        progress=Progress("evaluating"),
+        observer=settings,
+        faults=faults,
+        over=Devices.take(devices),
     )
     alignment = {log.name: _alignment(log) for log in logs}
     result = evaluation.to_json()

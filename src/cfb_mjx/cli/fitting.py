@@ -30,6 +30,7 @@ def run_fit(
     estimator: str = "auto",
     robust: bool = False,
     figure: Path | None = None,
+    devices: int = 1,
 ) -> None:
     """Fit, print a table, write the model and what else was asked for.
 
@@ -41,24 +42,25 @@ def run_fit(
     logs = [read_log(path) for path in paths]
     judged = [read_log(path) for path in held_out] or [_last(log) for log in logs]
     fitted = logs if held_out else [_first(log) for log in logs]
-    configure_jax(x64=True)
+    configure_jax(x64=True, devices=devices)
+    from cfb_mjx.devices import Devices
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import save_model_file
     from cfb_mjx.sysid import evaluate
     from cfb_mjx.sysid.identification.fitting import fit
 
-    base = changed_model(model, changes)
+    base, over = changed_model(model, changes), Devices.take(devices)
     kept = [path.name for path in held_out] or f"last {HELD_OUT_SHARE:.0%} of each log"
-    result = fit(fitted, base.parameters(), parameters, not commands_only, robust, estimator, Progress("fitting"))
+    result = fit(fitted, base.parameters(), parameters, not commands_only, robust, estimator, Progress("fitting"), over)
     corrected = replace(
         result.model_file(base, f"cfb fit on {len(paths)} log(s), {date.today().isoformat()}"),
         name=output.stem,
         description=f"{base.name} refitted to {', '.join(log.name for log in logs)}",
         provenance=provenance("fit", base.name, "fit_logs_sha256", paths, held_out=kept),
     )
-    other = _other(result, fitted, base, not commands_only, robust) if compare else None
-    before = evaluate(Quadrotor.from_file(base), judged)
-    after = evaluate(Quadrotor.from_file(corrected), judged)
+    other = _other(result, fitted, base, not commands_only, robust, over) if compare else None
+    before = evaluate(Quadrotor.from_file(base), judged, over=over)
+    after = evaluate(Quadrotor.from_file(corrected), judged, over=over)
     save_model_file(corrected, output)
     _print(result, other, before, after)
     print(f"model: {output}")
@@ -80,13 +82,14 @@ def _last(log: FlightLog) -> FlightLog:
     return log.slice(log.time[0] + (1 - HELD_OUT_SHARE) * log.duration, log.time[-1])
 
 
-def _other(result, logs, base, use_measured, robust):
+def _other(result, logs, base, use_measured, robust, over):
     """The estimator that was not chosen, for comparison; None where it cannot run."""
     from cfb_mjx.sysid.identification.fitting import fit
 
     other = "shooting" if result.estimator == "innovation" else "innovation"
     try:
-        return fit(logs, base.parameters(), result.names, use_measured, robust, other, Progress(f"fitting ({other})"))
+        bar = Progress(f"fitting ({other})")
+        return fit(logs, base.parameters(), result.names, use_measured, robust, other, bar, over)
     except CfbError:
         return None
 

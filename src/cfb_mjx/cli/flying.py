@@ -54,6 +54,7 @@ def run_fly(
     seed: int,
     outputs: Outputs,
     turn: Turn,
+    devices: int = 1,
 ) -> None:
     """Fly, print what was measured, write what was asked for.
 
@@ -75,11 +76,13 @@ def run_fly(
         raise CfbError(f"--plants {plants}: at least one drone must fly.")
     if magnitude < 0:
         raise CfbError(f"--magnitude {magnitude}: must be zero or positive.")
-    configure_jax(x64=False)
+    configure_jax(x64=False, devices=devices)
+    import equinox as eqx
     import jax
     import numpy as np
 
     from cfb_mjx.control.pilot import find_pilot
+    from cfb_mjx.devices import Devices
     from cfb_mjx.envs import Noise, TargetTask
     from cfb_mjx.envs.episode import QUIET, longest_delay_s
     from cfb_mjx.model import Quadrotor
@@ -115,9 +118,15 @@ def run_fly(
             raise CfbError(f"--knobs, --set, --holder, --search and --keep are for flips, not for --task {task}.")
     test = flips if task in FLIPS else flying.TESTS[task]
     keys = jax.random.split(jax.random.PRNGKey(seed), plants)
+    over = Devices.take(devices)
+    together = over.divided(lambda pilot, drone, keys: test(pilot, course, drone, keys), (None, None, 0), 0)
 
     def fly(drone):
-        measured, flown = test(pilot, course, drone, keys)
+        if over.several:
+            found = over.here(eqx.filter_jit(together)(pilot, drone, over.along(over.padded(keys))))
+            measured, flown = jax.tree.map(lambda x: x[:plants], found)
+        else:
+            measured, flown = test(pilot, course, drone, keys)
         good = None if rotations is None else np.asarray(measured.completed(rotations))
         return summary(task, {k: np.asarray(v) for k, v in measured._asdict().items()}, good), flown
 

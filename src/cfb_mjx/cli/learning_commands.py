@@ -21,6 +21,9 @@ def train(
     resume: bool = False,
     force: bool = False,
     devices: int = 1,
+    coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None,
+    processes: int | None = None,
+    process: int | None = None,
 ) -> None:
     """Train a controller. Interrupt it whenever you like: --resume goes on to the same result.
 
@@ -37,12 +40,18 @@ def train(
         start: policy to start from, in place of random weights.
         resume: go on from the checkpoint in the folder.
         force: train on a model that is a predictor, not a plant.
-        devices: of this machine over which the drones are spread.
+        devices: of this machine, or of each of several processes, over which the drones are spread.
+        coordinator: where several processes meet that train one policy together: the address of process 0, or auto
+            within srun or mpirun.
+        processes: how many they are; not with auto.
+        process: which of them this is, from 0; not with auto.
     """
+    from cfb_mjx.cli.hosts import Hosts
     from cfb_mjx.cli.training import run_train
 
+    hosts = Hosts.asked(coordinator, processes, process)
     choices = {"model": model, "algorithm": algorithm, "seed": seed}
-    run_train(task, config, output, tuple(flat(set)), choices, start, resume, force, devices)
+    run_train(task, config, output, tuple(flat(set)), choices, start, resume, force, devices, hosts)
 
 
 def fly(
@@ -65,6 +74,7 @@ def fly(
     holder: Annotated[str, tyro.conf.arg(metavar="CONTROLLER")] = "target",
     search: Literal["height", "margin"] | None = None,
     keep: File = None,
+    devices: int = 1,
 ) -> None:
     """Fly a controller in simulation and measure it.
 
@@ -95,8 +105,9 @@ def fly(
         search: look for the knobs of a flip first: least height on the model, or largest margin on drones of the
             randomisation.
         keep: write the knobs that were flown here, for --knobs.
+        devices: of this machine that share the flights of many plants.
     """
     from cfb_mjx.cli.flying import Outputs, Turn, run_fly
 
     outputs, turn = Outputs(json, figure, recording, video, log), Turn(knobs, tuple(flat(set)), holder, search, keep)
-    run_fly(controller, task, model, plants, magnitude, randomisation, on, noise, seed, outputs, turn)
+    run_fly(controller, task, model, plants, magnitude, randomisation, on, noise, seed, outputs, turn, devices)

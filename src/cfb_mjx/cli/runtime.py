@@ -15,14 +15,20 @@ up to 4 times faster; nothing changes elsewhere. XLA reads it when jax starts it
 for themselves; scripts put it into XLA_FLAGS (docs/model.md). Not for derivatives of the MJX body: jaxlib 0.10.1 aborts
 while compiling some of them with it (`differentiate_mjx`)."""
 
+_CPU_DEVICES = "xla_force_host_platform_device_count"
 
-def configure_jax(x64: bool) -> None:
+
+def configure_jax(x64: bool, devices: int = 1) -> None:
     """Set precision and the persistent compile cache. Commands call this; importing the library never does.
+
+    With ``devices``, a CPU shows itself to jax as so many, unless ``XLA_FLAGS`` says otherwise.
 
     The cache lies in the user's cache folder (``XDG_CACHE_HOME`` is honoured); ``JAX_COMPILATION_CACHE_DIR`` overrides
     it. Where jax has not been loaded yet, XLA's CPU kernels are told to share results (`XLA_CPU_FLAGS`).
     """
     set_up_xla()
+    if devices > 1 and _CPU_DEVICES not in os.environ["XLA_FLAGS"]:
+        os.environ["XLA_FLAGS"] += f" --{_CPU_DEVICES}={devices}"
     import jax
 
     jax.config.update("jax_enable_x64", x64)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
+from cfb_mjx.cli.hosts import Hosts, joined
 from cfb_mjx.cli.runtime import Progress, configure_jax, differentiate_mjx, environment, say
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_no_file, write_json
@@ -28,6 +28,7 @@ def run_train(
     resume: bool,
     force: bool,
     devices: int,
+    hosts: Hosts | None = None,
 ) -> None:
     """Train, and write policy, learning curve, configuration and checkpoint into ``output``.
 
@@ -35,10 +36,24 @@ def run_train(
         CfbError: a bad configuration, model or policy; an earlier training in the folder; another one to resume.
     """
     require_no_file(output)
-    if devices > 1 and "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        flag = f"--xla_force_host_platform_device_count={devices}"
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {flag}".strip()
-    configure_jax(x64=False)
+    goes_on = f"what was saved in {output} is intact: start every process again with --resume to go on from there."
+    with joined(hosts, goes_on):
+        _train(task, config, output, changes, choices, start, resume, force, devices)
+
+
+def _train(
+    task: str,
+    config: str | None,
+    output: Path,
+    changes: tuple[str, ...],
+    choices: dict,
+    start: Path | None,
+    resume: bool,
+    force: bool,
+    devices: int,
+) -> None:
+    configure_jax(x64=False, devices=devices)
+    from cfb_mjx.hosts import first
     from cfb_mjx.train.config import load_config, with_changes
     from cfb_mjx.train.run import POLICY, Training, train
     from cfb_mjx.view.learning import learning_figure
@@ -51,17 +66,21 @@ def run_train(
     facts = environment()
     versions = {name: facts[name] for name in ("cfb_mjx", "jax", "jaxlib", "python")}
     training = Training.prepare(settings, versions, start, force)
-    say(f"{settings.algorithm} on {training.described.name}, randomisation x {settings.randomisation.magnitude:g}")
+    if first():
+        say(f"{settings.algorithm} on {training.described.name}, randomisation x {settings.randomisation.magnitude:g}")
     bar = Progress("training")
 
     def advanced(done: int, total: int, rate: float, left: float) -> None:
-        bar(done, total, f"{rate / 1e3:.0f} k commands/s, {_clock(left)} left")
+        if first():
+            bar(done, total, f"{rate / 1e3:.0f} k commands/s, {_clock(left)} left")
 
     def reported(row: dict) -> None:
         judged = "".join(f", {label} {row[key]:.3g}{unit}" for key, label, unit in _JUDGED if key in row)
         say(f"{_clock(row['seconds'])}: {row['commands'] / 1e6:.3g} M commands, loss {row['loss']:.3g}{judged}")
 
     rows = train(training, output, resume, advanced, reported, devices=devices)
+    if not first():
+        return
     learning_figure(rows, output / "curve.png", f"{settings.algorithm}, {training.described.name}")
     write_json(output / NEWEST, {"environment": facts, "last": rows[-1]})
     print(f"policy: {output / POLICY}\nlearning curve: {output / 'curve.csv'}, {output / 'curve.png'}")

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jaxtyping import Array
 
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.envs.observation import Estimate
 from cfb_mjx.files import shipped
 from cfb_mjx.model import MjxBody, Quadrotor, rollout_final
+from cfb_mjx.model.acceleration import using
 from cfb_mjx.model.mjx_body import mjx
 from cfb_mjx.model.state import State
 from cfb_mjx.parameters import load_randomisation, sample_parameters
@@ -70,13 +74,15 @@ def _start(model: Quadrotor, drones: int):
 
 def rollout(drones: int, body: str = "rigid") -> Workload:
     """Open loop, one command held per drone, final state only: what crazyflow's ``sim.step(n)`` does."""
-    bodies = {"rigid": None, "mjx": False, "mjx-floor": True}
-    choices = {} if body == "rigid" else {"body": MjxBody(floor=bodies[body])}
+    mjx_floor = {"mjx": False, "mjx-floor": True}
+    choices = {"body": MjxBody(floor=mjx_floor[body])} if body in mjx_floor else {}
     model = Quadrotor.from_file("cfb-guards", **choices)
-    steps = STEPS if body == "rigid" else max(5, min(200, MJX_WORK // drones))
+    steps = max(5, min(200, MJX_WORK // drones)) if choices else STEPS
     states, commands = _start(model, drones)
     fly = jax.vmap(lambda m, s, u: rollout_final(m, s, u, hold=steps), in_axes=(None, 0, 0))
-    return _compile("rollout", body, drones, steps, fly, model, states, commands)
+    # Beside the kernel that a GPU gets, the program it would have got without.
+    with using("plain") if body == "rigid-plain" else contextlib.nullcontext():
+        return _compile("rollout", body, drones, steps, fly, model, states, commands)
 
 
 def rollout_randomised(drones: int) -> Workload:
@@ -131,6 +137,15 @@ def rollout_policy(drones: int) -> Workload:
 
     together = jax.vmap(fly, in_axes=(None, 0))
     return _compile("rollout_policy", "rigid", drones, 2 * commands, together, model, states)
+
+
+def network_file(folder: Path) -> Path:
+    """The network of `rollout_policy` as arrays w0, b0, w1 ..., for a peer."""
+    network = load_policy(shipped_policies()["target"]).controller.network
+    layers = enumerate(zip(network.weights, network.biases, strict=True))
+    path = folder / "network.npz"
+    np.savez(path, **{f"{k}{i}": np.asarray(x) for i, layer in layers for k, x in zip("wb", layer, strict=True)})
+    return path
 
 
 def rollout_ten(drones: int) -> Workload:

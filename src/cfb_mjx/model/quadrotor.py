@@ -105,6 +105,9 @@ class Prepared(eqx.Module):
     rotors: rotors.RotorConstants
     body: object
     dt: Array
+    wrench_once: bool = eqx.field(static=True, default=True)
+    """Keep XLA from computing the wrench anew for every component of the acceleration; a derivative, which needs more
+    than the wrench again, is faster without."""
 
 
 def prepare(model: Quadrotor, dt: float | Float[Array, ""] | None = None) -> Prepared:
@@ -177,8 +180,8 @@ def _integrate(prepared: Prepared, state: Components, path: rotors.RotorPath) ->
         speed, rate = stages[stage]
         loads = path.mean if model.rotor_loads == "mean" else rotors.loads_at(prepared.rotors, speed, rate)
         wrench = loaded(model, parameters, loads, conditions(prepared, at, speed))
-        # Every component of the acceleration needs the wrench; without the barrier XLA recomputes it for each.
-        wrench = jax.lax.optimization_barrier(wrench)
+        if prepared.wrench_once:
+            wrench = jax.lax.optimization_barrier(wrench)
         about_center = Wrench(wrench.force, wrench.torque - parameters.center_of_gravity.cross(wrench.force))
         return model.body.accelerations(prepared.body, at, about_center)
 

@@ -10,9 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cfb_mjx.devices import Devices
+from cfb_mjx.model import acceleration, fleet
+from cfb_mjx.model.bodies import RigidBody
+from cfb_mjx.model.effects import CATALOGUE
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec
+
+_MANY = 10
+"""Steps from which it pays to fly drones in groups (`cfb_mjx.model.fleet`)."""
 
 
 def rollout(
@@ -38,20 +45,34 @@ def rollout(
         raise ValueError(f"{steps} commands, each held {hold} steps, cannot be kept every {every}")
     prepared = prepare(model)
 
-    def fly(components, rows):
-        components = _fly(prepared, components, rows, hold)
-        return components, components
+    def plain(prepared, state, commands):
+        def fly(components, rows):
+            components = _fly(prepared, components, rows, hold)
+            return components, components
 
-    rows = jax.tree.map(lambda x: x.reshape(steps // every, every), Vec.unstack(commands))
-    _, kept = jax.lax.scan(fly, _carry(prepared, state, commands), rows)
+        rows = jax.tree.map(lambda x: x.reshape(steps // every, every), Vec.unstack(commands))
+        return jax.lax.scan(fly, _carry(prepared, state, commands), rows)[1]
+
+    kept = acceleration.fly(plain, _carry, prepared, state, commands, hold=hold, every=every)
     return stack(kept, prepared.parameters.center_of_gravity)
 
 
 def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 4"], *, hold: int = 1) -> State:
     """As `rollout`, but return the last state only; the trajectory is never stored."""
     prepared = prepare(model)
-    final = _fly(prepared, _carry(prepared, state, commands), Vec.unstack(commands), hold)
+
+    def plain(prepared, state, commands):
+        fly = fleet.fly if _in_groups(model, hold * commands.shape[0]) else _fly
+        return fly(prepared, _carry(prepared, state, commands), Vec.unstack(commands), hold)
+
+    final = acceleration.fly(plain, _carry, prepared, state, commands, hold=hold)
     return stack(final, prepared.parameters.center_of_gravity)
+
+
+def _in_groups(model: Quadrotor, steps: int) -> bool:
+    # An effect of the user's own may do what XLA cannot put into one function: a matrix product, say.
+    known = all(type(effect) in CATALOGUE.values() for effect in model.effects)
+    return jax.default_backend() == "cpu" and isinstance(model.body, RigidBody) and known and steps >= _MANY
 
 
 def _fly(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Components:
@@ -70,14 +91,20 @@ def _fly(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Co
     return jax.lax.scan(one, components, rows)[0]
 
 
-def _carry(prepared: Prepared, state: State, commands: Array):
+def _carry(prepared: Prepared, state: State, commands: Array) -> Components:
     # One precision throughout, or the scan's carry would change type.
     dtype = jnp.result_type(prepared.parameters.mass, state.position, commands)
     components = unstack(begin(prepared.model, state), prepared.parameters.center_of_gravity)
     return jax.tree.map(lambda x: x.astype(dtype), components)
 
 
-def in_chunks(function: Callable, size: int, *arguments, progress: Callable[[int, int], None] | None = None):
+def in_chunks(
+    function: Callable,
+    size: int,
+    *arguments,
+    progress: Callable[[int, int], None] | None = None,
+    over: Devices | None = None,
+):
     """``vmap(function)(*arguments)`` executed ``size`` examples at a time, results gathered in host memory.
 
     Let ``function`` draw what is large (parameters, commands) from a PRNG key and return what is small: then a million
@@ -88,21 +115,25 @@ def in_chunks(function: Callable, size: int, *arguments, progress: Callable[[int
         size: examples per compiled call.
         arguments: pytrees with a common leading axis.
         progress: called with (done, total) after each chunk.
+        over: devices that share every chunk, `Devices.take(n)`: of this process, or of several that run as one, which
+            then all call this with the same arguments.
 
     Returns:
-        The pytree of stacked results as numpy arrays.
+        The pytree of stacked results as numpy arrays; in every process.
     """
     total = len(jax.tree.leaves(arguments)[0])
     if size < 1 or total < 1:
         raise ValueError(f"{total} examples cannot be run {size} at a time")
-    batched = eqx.filter_jit(jax.vmap(function))
+    over = over or Devices.take()
+    batched = eqx.filter_jit(over.mapped(function))
+    width = -(-min(size, total) // over.count) * over.count
     pieces = []
     for start in range(0, total, size):
         stop = min(start + size, total)
         # The last chunk repeats its final example, so that it reuses the compiled program.
-        index = np.minimum(np.arange(start, start + min(size, total)), stop - 1)
-        result = batched(*jax.tree.map(lambda x, i=index: x[i], arguments))
-        pieces.append(jax.tree.map(lambda x, n=stop - start: np.asarray(x[:n]), result))
+        index = np.minimum(np.arange(start, start + width), stop - 1)
+        result = over.here(batched(*over.along(jax.tree.map(lambda x, i=index: x[i], arguments))))
+        pieces.append(jax.tree.map(lambda x, n=stop - start: x[:n], result))
         if progress is not None:
             progress(stop, total)
     return jax.tree.map(lambda *parts: np.concatenate(parts), *pieces)

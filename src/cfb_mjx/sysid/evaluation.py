@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 
+from cfb_mjx.devices import Devices
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog, require_own_names
 from cfb_mjx.model import Quadrotor, State
@@ -87,6 +88,7 @@ def evaluate(
     progress: Callable[[int, int], None] | None = None,
     observer: Observer | None = None,
     faults: SensorFaults = HEALTHY,
+    over: Devices | None = None,
 ) -> Evaluation:
     """Predict every window of every log, open loop, and compare with what was measured.
 
@@ -96,7 +98,8 @@ def evaluate(
 
     With an ``observer`` the variants `OBSERVED` are added: the same predictions with the disturbances it estimated
     from data before each window's start. With sensor ``faults`` the model flies what a healthy chain would have
-    recorded, and its predictions are compared with what this one records.
+    recorded, and its predictions are compared with what this one records. The windows of every log are divided ``over``
+    devices; the replay of the log before them is not, which is one walk along its rows.
 
     Raises:
         CfbError: two logs of one name, or no log allows a window.
@@ -105,7 +108,7 @@ def evaluate(
     precise = Quadrotor(model.parameters, model.effects, body=model.body, integrator="rk4", rotor_loads="instant")
     results = []
     for index, log in enumerate(logs):
-        results.append(_evaluate_log(precise, log, horizons, observer, faults))
+        results.append(_evaluate_log(precise, log, horizons, observer, faults, over))
         if progress is not None:
             progress(index + 1, len(logs))
     if not any(len(result.windows) for result in results):
@@ -116,7 +119,12 @@ def evaluate(
 
 
 def _evaluate_log(
-    model: Quadrotor, log: FlightLog, horizons: tuple[float, ...], observer: Observer | None, faults: SensorFaults
+    model: Quadrotor,
+    log: FlightLog,
+    horizons: tuple[float, ...],
+    observer: Observer | None,
+    faults: SensorFaults,
+    over: Devices | None,
 ) -> LogEvaluation:
     delay = delay_of(log, model.parameters)
     recorded = find_windows(log, horizons, delay)
@@ -127,11 +135,11 @@ def _evaluate_log(
     predictions: dict[str, State | None] = dict.fromkeys(VARIANTS + OBSERVED)
     if len(windows):
         start, memory = start_of_windows(model, log, windows, delay)
-        predictions["commands_in"] = predict(model, windows, start, memory)
-        predictions["rotor_speed_in"] = _measured_in(model, windows, measured, memory)
+        predictions["commands_in"] = predict(model, windows, start, memory, over)
+        predictions["rotor_speed_in"] = _measured_in(model, windows, measured, memory, over)
         predictions["hold"] = hold(recorded, horizons)
         if observer is not None:
-            predictions |= _observed(model, log, delay, windows, measured, memory, observer)
+            predictions |= _observed(model, log, delay, windows, measured, memory, observer, over)
     predictions = {
         variant: predicted if predicted is None or variant == "hold" else faults.as_recorded(predicted, horizons)
         for variant, predicted in predictions.items()
@@ -145,11 +153,13 @@ def _evaluate_log(
     return LogEvaluation(log, delay, recorded, measured, predictions, errors)
 
 
-def _measured_in(model: Quadrotor, windows: Windows, measured: np.ndarray, memory: tuple) -> State | None:
+def _measured_in(
+    model: Quadrotor, windows: Windows, measured: np.ndarray, memory: tuple, over: Devices | None
+) -> State | None:
     """Predictions with measured rotor speeds in, of the windows where they were measured."""
     if not measured.any():
         return None
-    return predict(model, select(windows, measured), memory=jax.tree.map(lambda x: x[measured], memory))
+    return predict(model, select(windows, measured), memory=jax.tree.map(lambda x: x[measured], memory), over=over)
 
 
 def _observed(
@@ -160,11 +170,12 @@ def _observed(
     measured: np.ndarray,
     memory: tuple,
     observer: Observer,
+    over: Devices | None,
 ) -> dict[str, State | None]:
     """The two variants with what ``observer`` knows at the windows' starts."""
     known = at_starts(observe(model, log, delay, observer), log, windows)
     windows, model = replace(windows, body_rate=known.body_rate), observed_model(model, observer)
     return {
-        "commands_in_observer": predict(model, windows, known.rotor_speed, (*memory, known.memory(rotors=True))),
-        "rotor_speed_in_observer": _measured_in(model, windows, measured, (*memory, known.memory(rotors=False))),
+        "commands_in_observer": predict(model, windows, known.rotor_speed, (*memory, known.memory(rotors=True)), over),
+        "rotor_speed_in_observer": _measured_in(model, windows, measured, (*memory, known.memory(rotors=False)), over),
     }

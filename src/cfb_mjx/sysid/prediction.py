@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cfb_mjx.devices import Devices
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.quadrotor import Quadrotor, begin, commanded_path, integrate_commanded, integrate_measured, prepare
 from cfb_mjx.model.state import State, stack, unstack
@@ -21,7 +22,13 @@ WINDOWS_PER_BLOCK, STEPS_PER_BLOCK = 128, 160
 _STATE = ("position", "velocity", "quaternion", "body_rate")
 
 
-def predict(model: Quadrotor, windows: Windows, rotor_speed: np.ndarray | None = None, memory: tuple = ()) -> State:
+def predict(
+    model: Quadrotor,
+    windows: Windows,
+    rotor_speed: np.ndarray | None = None,
+    memory: tuple = (),
+    over: Devices | None = None,
+) -> State:
     """Predict the measured states at the horizons.
 
     Args:
@@ -30,6 +37,7 @@ def predict(model: Quadrotor, windows: Windows, rotor_speed: np.ndarray | None =
         rotor_speed: (W, 4) rotor speeds at the window starts, rad/s, with the logged commands in; None feeds the
             measured rotor speeds instead.
         memory: what the effects remember at the window starts (`start_of_windows`).
+        over: devices to divide the windows over.
 
     Returns:
         `State` of numpy arrays (W, H, ...); W must not be 0.
@@ -43,19 +51,20 @@ def predict(model: Quadrotor, windows: Windows, rotor_speed: np.ndarray | None =
     steps = STEPS_PER_BLOCK * -(-max(width, 1) // STEPS_PER_BLOCK)
     step = np.pad(windows.step, ((0, 0), (0, steps - width)))
     inputs = np.pad(inputs, ((0, 0), (0, steps - width), (0, 0)), mode="edge")
-    found = []
-    for first in range(0, count, WINDOWS_PER_BLOCK):
-        chosen = slice(first, min(first + WINDOWS_PER_BLOCK, count))
-        padded = [jax.tree.map(lambda x, c=chosen: _pad(x[c], WINDOWS_PER_BLOCK), x) for x in (state, step, inputs)]
-        trajectory = _predict_batch(model, *padded, measured)
+    found, over = [], over or Devices.take()
+    rows = -(-WINDOWS_PER_BLOCK // over.count) * over.count
+    for first in range(0, count, rows):
+        chosen = slice(first, min(first + rows, count))
+        padded = [jax.tree.map(lambda x, c=chosen: _pad(x[c], rows), x) for x in (state, step, inputs)]
+        trajectory = over.here(_predict_batch(model, *over.along(padded), measured, over))
         index = np.arange(chosen.stop - first)[:, None], windows.at[chosen]
         found.append(jax.tree.map(lambda x, i=index: np.asarray(x)[i], trajectory))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
 
 
 @eqx.filter_jit
-def _predict_batch(model: Quadrotor, state: State, step, inputs, measured: bool) -> State:
-    flown = jax.vmap(lambda *x: predict_one(model, *x, measured))(state, step, inputs)
+def _predict_batch(model: Quadrotor, state: State, step, inputs, measured: bool, over: Devices) -> State:
+    flown = over.mapped(lambda *x: predict_one(model, *x, measured))(state, step, inputs)
     return eqx.tree_at(lambda s: s.memory, flown, (), is_leaf=lambda x: isinstance(x, tuple))
 
 

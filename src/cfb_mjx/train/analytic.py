@@ -16,6 +16,7 @@ import optax
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import NeuralController
+from cfb_mjx.devices import Devices
 from cfb_mjx.envs.episode import Episode, Task, choose, observe, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.train.algorithm import in_progress, strong
@@ -36,8 +37,10 @@ class AnalyticState(eqx.Module):
 class Analytic:
     """The algorithm; see `cfb_mjx.train.algorithm.Algorithm`."""
 
-    def __init__(self, settings: AnalyticSettings, task: Task, nominal: Quadrotor):
+    def __init__(self, settings: AnalyticSettings, task: Task, nominal: Quadrotor, over: Devices | None = None):
         self.settings, self.task, self.nominal = settings, task, nominal
+        self.devices = Devices.take() if over is None else over
+        self.devices.require(settings.drones, "drones")
         self.updates = settings.updates
         self.horizon = max(1, round(settings.horizon_s / task.layout.control_dt_s))
         self.steps_per_update = settings.drones * self.horizon
@@ -64,13 +67,15 @@ class Analytic:
         controller = eqx.apply_updates(state.controller, changes)
         of_episodes, key = jax.random.split(state.key)
         over = ~alive | (episodes.count >= self.task.episode_steps)
-        fresh = self._reset(jax.random.split(of_episodes, self.settings.drones))
+        reset = self.devices.divided(self._reset, (0,), 0)
+        fresh = reset(jax.random.split(of_episodes, self.settings.drones))
         episodes = choose(over, fresh, episodes)
         metrics = {"loss": loss, "failing": jnp.mean(~alive), "gradient": optax.tree.norm(gradient)}
         return AnalyticState(controller, optimizer, episodes, key, state.count + 1), metrics
 
     def _loss(self, controller: NeuralController, episodes: Episode):
-        costs, episodes, alive = jax.vmap(self._fly, in_axes=(None, 0))(controller, episodes)
+        fly = self.devices.divided(jax.vmap(self._fly, in_axes=(None, 0)), (None, 0), 0)
+        costs, episodes, alive = fly(controller, episodes)
         return jnp.mean(costs), (episodes, alive)
 
     def _fly(self, controller: NeuralController, episode: Episode):

@@ -19,6 +19,7 @@ import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import Network, NeuralController
+from cfb_mjx.devices import Devices
 from cfb_mjx.envs.episode import Episode, Task, choose, observe, reset, step
 from cfb_mjx.envs.observation import Estimate, frame
 from cfb_mjx.model.quadrotor import Quadrotor
@@ -51,8 +52,10 @@ class PpoState(eqx.Module):
 class Ppo:
     """The algorithm; see `cfb_mjx.train.algorithm.Algorithm`."""
 
-    def __init__(self, settings: PpoSettings, task: Task, nominal: Quadrotor):
+    def __init__(self, settings: PpoSettings, task: Task, nominal: Quadrotor, over: Devices | None = None):
         self.settings, self.task, self.nominal = settings, task, nominal
+        self.devices = Devices.take() if over is None else over
+        self.devices.require(settings.drones // settings.minibatches, "drones of a minibatch")
         self.updates = settings.updates
         self.steps_per_update = settings.drones * settings.unroll
         self.brax = parts()
@@ -93,7 +96,9 @@ class Ppo:
     def _update(self, state: PpoState) -> tuple[PpoState, dict]:
         of_flight, of_learning, key = jax.random.split(state.key, 3)
         episodes, data, outcome = self._collect(state.actor, state.episodes, of_flight)
-        last = jax.vmap(self._show)(episodes)["hidden"]
+        show = self.devices.divided(jax.vmap(self._show), (0,), 0)
+        # Every device needs what all drones saw: a batch is drawn from all of them.
+        data, last = self.devices.whole((data, show(episodes)["hidden"]))
         learnt, losses = jax.lax.scan(
             partial(self._epoch, data, last),
             (state.actor, state.critic, state.optimizer),
@@ -109,16 +114,34 @@ class Ppo:
 
     def _collect(self, actor: Actor, episodes: Episode, key: PRNGKeyArray):
         """Fly ``unroll`` commands with every drone; data has axes (unroll, drones)."""
+        # Drawing drones and starts costs as much as flying: once per few commands is enough, as no drone fails twice
+        # within them.
+        each = math.gcd(self.settings.unroll, 8)
 
-        def some(episodes, key):
+        def drawn(key):
             of_reset, of_flight = jax.random.split(key)
-            fresh = self._reset(jax.random.split(of_reset, self.settings.drones))
-            return jax.lax.scan(partial(one, fresh), episodes, jax.random.split(of_flight, each))
+            noise = jax.vmap(lambda key: jax.random.normal(key, (self.settings.drones, 4)))
+            return jax.random.split(of_reset, self.settings.drones), noise(jax.random.split(of_flight, each))
 
-        def one(fresh, episodes, of_action):
+        # For all drones at once, so that what a drone is given does not depend on which device flies it.
+        of_reset, noise = jax.vmap(drawn)(jax.random.split(key, self.settings.unroll // each))
+        fly = self.devices.divided(self._fly, (None, 0, 1, 2), (0, 2))
+        episodes, flown = fly(actor, episodes, of_reset, noise)
+        data, outcome = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), flown)
+        return episodes, data, outcome
+
+    def _fly(self, actor: Actor, episodes: Episode, of_reset: PRNGKeyArray, noise: Float[Array, "n each drones 4"]):
+        """Fly so many drones; where one fails, another begins, drawn anew once per ``each`` commands."""
+
+        def some(episodes, given):
+            of_reset, noise = given
+            return jax.lax.scan(partial(one, self._reset(of_reset)), episodes, noise)
+
+        def one(fresh, episodes, noise):
             shown = jax.vmap(self._show)(episodes)
             logits = _logits(actor, shown["seen"])
-            raw = self.distribution.sample_no_postprocessing(logits, of_action)
+            normal = self.distribution.create_dist(logits)
+            raw = noise * normal.scale + normal.loc
             action = self.distribution.postprocess(raw)
             after, outcome = jax.vmap(partial(step, self.task))(episodes, 0.5 * (1 + action))
             over = outcome.failed | outcome.timed_out
@@ -131,20 +154,15 @@ class Ppo:
             }
             return choose(over, fresh, after), (kept, outcome)
 
-        # Drawing drones and starts costs as much as flying: once per few commands is enough, as no drone fails twice
-        # within them.
-        each = math.gcd(self.settings.unroll, 8)
-        episodes, flown = jax.lax.scan(some, episodes, jax.random.split(key, self.settings.unroll // each))
-        data, outcome = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), flown)
-        return episodes, data, outcome
+        return jax.lax.scan(some, episodes, (of_reset, noise))
 
     def _epoch(self, data: dict[str, Array], last: Array, learnt: tuple, key: PRNGKeyArray) -> tuple[tuple, dict]:
         of_order, of_entropy = jax.random.split(key)
-        order = jax.random.permutation(of_order, self.settings.drones)
         count = self.settings.minibatches
-        # Whole flights of some of the drones make a batch.
-        batches = jax.tree.map(lambda x: jnp.moveaxis(x[:, order].reshape(len(x), count, -1, *x.shape[2:]), 1, 0), data)
-        batches = batches, last[order].reshape(count, -1, last.shape[-1]), jax.random.split(of_entropy, count)
+        # Whole flights of some of the drones make a batch, of which every device takes its share.
+        order = self.devices.along(jax.random.permutation(of_order, self.settings.drones).reshape(count, -1), 1)
+        batches = jax.tree.map(lambda x: self.devices.along(jnp.moveaxis(x[:, order], 1, 0), 2), data)
+        batches = batches, self.devices.along(last[order], 1), jax.random.split(of_entropy, count)
 
         def one(learnt, batch):
             actor, critic, optimizer = learnt

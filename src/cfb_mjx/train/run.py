@@ -18,9 +18,11 @@ import yaml
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
+from cfb_mjx.devices import Devices
 from cfb_mjx.envs.episode import longest_delay_s
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, write_text
+from cfb_mjx.hosts import as_first, first, from_first
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import hover_command
 from cfb_mjx.parameters import ModelFile, load_model_file
@@ -127,7 +129,8 @@ def train(
         progress: called after every update with updates done, all updates, commands flown per second, seconds left.
         report: called with every new row of the learning curve.
         evaluate: fly the hover test at every checkpoint.
-        devices: of this machine over which the drones are spread.
+        devices: of this process over which the drones are spread; where several processes run as one
+            (`cfb_mjx.hosts`), of each of them. Then the first alone reads and writes files, and reports.
 
     Returns:
         The learning curve, one row per checkpoint.
@@ -135,21 +138,22 @@ def train(
     Raises:
         CfbError: an earlier training is in the way, the checkpoint is of another training, or there are fewer devices.
     """
-    output = output_folder(output)
+    output = Path(output)
     checkpoint = output / CHECKPOINT
-    about = _found(checkpoint, output, training, resume)
-    nominal = training.nominal()
+    about = from_first(lambda: _found(checkpoint, output_folder(output), training, resume))
+    over, nominal = Devices.take(devices), training.nominal()
     task = training.config.build_task(longest_delay_s(nominal))
     task.hold(nominal)
-    algorithm = build(training.config, task, nominal)
+    algorithm = build(training.config, task, nominal, over)
     key = jax.random.fold_in(jax.random.PRNGKey(training.config.seed), 1)
     state = algorithm.begin(key, training.first_controller(nominal))
     done, seconds, rows = 0, 0.0, []
     if about is not None:
-        state = load_state(checkpoint, state)
+        state = _loaded(checkpoint, state)
         done, seconds, rows = about["updates"], about["seconds"], about["rows"]
-    state = _spread(state, devices)
-    write_text(output / CONFIG, yaml.safe_dump(training.config.to_mapping(), sort_keys=False))
+    state = spread(as_first(state), over)
+    if first():
+        write_text(output / CONFIG, yaml.safe_dump(training.config.to_mapping(), sort_keys=False))
     for end in segments(algorithm.updates, training.config.checkpoints):
         if end <= done:
             continue
@@ -163,28 +167,33 @@ def train(
             left = pace * (algorithm.updates - update - 1)
             progress(update + 1, algorithm.updates, algorithm.steps_per_update / pace, left)
         done, seconds = end, seconds + spent
-        controller = algorithm.controller(state)
         row = {"update": done, "commands": done * algorithm.steps_per_update, "seconds": round(seconds, 2)}
         row |= {name: float(value) for name, value in metrics.items()}
-        row |= _judged(controller, training, task, nominal) if evaluate else {}
+        whole = over.here(state)
+        if first():
+            controller = jax.tree.map(
+                lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, algorithm.controller(whole)
+            )
+            row |= _judged(controller, training, task, nominal) if evaluate else {}
+            save_policy(training.policy(controller), output / POLICY)
+            write_text(output / CURVE, _csv([*rows, row]))
+            # Last: what it says is done must be on disk.
+            about = {"updates": done, "seconds": seconds, "rows": [*rows, row]}
+            save_checkpoint(checkpoint, whole, training.identity() | about)
+            report(row)
         rows.append(row)
-        save_policy(training.policy(controller), output / POLICY)
-        write_text(output / CURVE, _csv(rows))
-        # Last: what it says is done must be on disk.
-        save_checkpoint(checkpoint, state, {**training.identity(), "updates": done, "seconds": seconds, "rows": rows})
-        report(row)
     return rows
 
 
-def build(config: TrainingConfig, task, nominal: Quadrotor) -> Algorithm:
-    """The algorithm of a configuration."""
+def build(config: TrainingConfig, task, nominal: Quadrotor, over: Devices | None = None) -> Algorithm:
+    """The algorithm of a configuration, over these devices (one by default)."""
     if config.algorithm == "ppo":
         from cfb_mjx.train.ppo import Ppo
 
-        return Ppo(config.ppo, task, nominal)
+        return Ppo(config.ppo, task, nominal, over)
     from cfb_mjx.train.analytic import Analytic
 
-    return Analytic(config.analytic, task, nominal)
+    return Analytic(config.analytic, task, nominal, over)
 
 
 def segments(updates: int, count: int) -> list[int]:
@@ -192,20 +201,21 @@ def segments(updates: int, count: int) -> list[int]:
     return sorted({round(updates * (i + 1) / count) for i in range(count)} - {0})
 
 
-def _spread(state: Any, devices: int) -> Any:
-    """Drones over the devices, everything else on each: the compiler then divides the work along the data."""
-    if devices == 1:
-        return state
-    if devices > jax.local_device_count():
-        raise CfbError(f"{devices} devices were asked for, {jax.local_device_count()} are here; ask for fewer.")
-    drones = len(state.episodes.count)
-    if drones % devices:
-        raise CfbError(f"{drones} drones cannot be spread over {devices} devices evenly; change the number of drones.")
-    mesh = jax.sharding.Mesh(jax.local_devices()[:devices], ("drones",))
-    along, whole = (jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec(*axes)) for axes in (("drones",), ()))
-    shared = jax.tree.map(lambda x: jax.device_put(x, whole) if eqx.is_array(x) else x, state)
-    episodes = jax.tree.map(lambda x: jax.device_put(x, along), state.episodes)
-    return eqx.tree_at(lambda s: s.episodes, shared, episodes)
+def spread(state: Any, over: Devices) -> Any:
+    """Drones over the devices, everything else on each."""
+    episodes = over.along(state.episodes)
+    return eqx.tree_at(lambda s: s.episodes, over.whole(state), episodes)
+
+
+def _loaded(checkpoint: Path, like: Any) -> Any:
+    """In the first process the state of the checkpoint, elsewhere ``like`` it; all fail where it is damaged."""
+    found = [like]
+
+    def load() -> None:
+        found[0] = load_state(checkpoint, like)
+
+    from_first(load)
+    return found[0]
 
 
 def _found(checkpoint: Path, output: Path, training: Training, resume: bool) -> dict[str, Any] | None:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 
+from cfb_mjx.devices import Devices
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.parameters import Parameters
@@ -54,6 +55,7 @@ def fit(
     robust: bool = False,
     estimator: Literal["auto", "innovation", "shooting"] = "auto",
     progress: Callable[[int, int], None] | None = None,
+    over: Devices | None = None,
 ) -> Fit:
     """Fit parameters to flights; what the flights cannot tell gets no number.
 
@@ -68,6 +70,7 @@ def fit(
             (`shooting`), which is not. ``auto`` takes the first, which is right with and without
             feedback, unless the observation delay is asked for: that shows in the pose only, which it does not read.
         progress: called with (done, total).
+        over: devices to divide the segments of the flights over.
 
     Raises:
         CfbError: unknown parameters, or logs without enough contiguous data.
@@ -75,23 +78,27 @@ def fit(
     if parameters is None:
         base = default_parameters(logs)
         if estimator == "shooting" or not use_measured or "thrust_scale" not in base:
-            return fit(logs, nominal, base, use_measured, robust, estimator, progress)
-        whole = fit(logs, nominal, ",".join([base, *EXTRAS]), use_measured, robust, estimator, progress)
+            return fit(logs, nominal, base, use_measured, robust, estimator, progress, over)
+        whole = fit(logs, nominal, ",".join([base, *EXTRAS]), use_measured, robust, estimator, progress, over)
         kept = [name for name in EXTRAS if _differs(whole, name)]
         if len(kept) == len(EXTRAS):
             return whole
-        return fit(logs, nominal, ",".join([base, *kept]), use_measured, robust, estimator, progress)
+        return fit(logs, nominal, ",".join([base, *kept]), use_measured, robust, estimator, progress, over)
     unknowns = choose(parameters, nominal)
     if estimator == "auto":
         estimator = "shooting" if "observation_delay" in unknowns.names else "innovation"
     if estimator == "shooting":
-        return shoot(logs, nominal, unknowns.names, use_measured=use_measured, robust=robust, progress=progress)
+        return shoot(
+            logs, nominal, unknowns.names, use_measured=use_measured, robust=robust, progress=progress, over=over
+        )
     data = prepare(list(logs))
     if data.segments is None or data.rows < 100:
         names = ", ".join(log.name for log in logs)
         raise CfbError(f"{names}: too short a flight to fit; at least a second without a gap is needed.")
-    segments = jax.tree.map(jnp.asarray, data.segments)
+    segments = _on_devices(data.segments, over)
     vector, noise = unknowns.start, Noise.first(data)
+    if over is not None:  # placed as the rounds return it, or the second would compile anew
+        vector, noise = over.whole((vector, noise))
     for done in range(ROUNDS):
         before = vector
         noise = fit_noise(unknowns, vector, noise, segments, use_measured, robust)
@@ -104,6 +111,14 @@ def fit(
         progress(ROUNDS, ROUNDS)
     linear = fit_slopes(unknowns, vector, noise, segments, use_measured, robust)
     return _finish(unknowns, vector, noise, segments, *linear, data.rows)
+
+
+def _on_devices(segments: Segments, over: Devices | None) -> Segments:
+    if over is None or not over.several:
+        return jax.tree.map(jnp.asarray, segments)
+    # What is added to divide evenly counts for nothing.
+    valid = np.concatenate([segments.valid, np.zeros((-len(segments.valid) % over.count, segments.valid.shape[1]))])
+    return eqx.tree_at(lambda s: s.valid, over.shared(segments), over.along(valid))
 
 
 def _finish(unknowns: Unknowns, vector, noise: Noise, segments: Segments, residual, jacobian, rows: int) -> Fit:

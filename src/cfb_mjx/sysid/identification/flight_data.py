@@ -8,6 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from cfb_mjx.devices import Devices
 from cfb_mjx.logs import FlightLog
 
 ROWS_PER_SEGMENT = 641
@@ -32,6 +33,8 @@ class Segments(eqx.Module):
     """1 for rows used to find the rotor speed and the filter's state only."""
     body_rate: Float[Array, "s n 3"]
     specific_force: Float[Array, "s n 3"]
+    over: Devices | None = eqx.field(static=True, default=None)
+    """What they are divided over."""
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,14 @@ the gyro and the accelerometer say is predicted from the past alone.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cfb_mjx.devices import mapped
 from cfb_mjx.model import rotors
 from cfb_mjx.model.quadrotor import wrench_of
 from cfb_mjx.model.vector import Vec
@@ -62,7 +65,7 @@ def drive(
         )
         return Drive(torque, thrust)
 
-    return jax.vmap(one)(segments)
+    return mapped(one, segments.over)(segments)
 
 
 def innovations(
@@ -91,7 +94,7 @@ def innovations(
         use = counts[:, None] * jnp.concatenate([jnp.ones(4), jnp.full(4, 1.0) * piece.measured])
         return error * use, jnp.where(use > 0, variance, 1.0)
 
-    return jax.vmap(one)(segments, driven)
+    return mapped(one, segments.over)(segments, driven)
 
 
 def _modelled_speed(parameters: Parameters, piece: Segments) -> Float[Array, "n 4"]:
@@ -129,7 +132,18 @@ def whitened(
 
 
 def negative_log_likelihood(parameters, noise, segments, driven: Drive, robust: bool = False) -> Float[Array, ""]:
-    """Of all innovations, per row, without the constant."""
-    error, variance = innovations(parameters, noise, segments, driven, robust)
+    """Of all innovations, per row, without the constant; over devices differentiable by the noise alone."""
     rows = jnp.maximum(jnp.sum(segments.valid), 1.0)
-    return 0.5 * jnp.sum(jnp.log(variance) + surprise(error / jnp.sqrt(variance), robust)) / rows
+    if segments.over is None:
+        return _surprisal(parameters, noise, segments, driven, robust) / rows
+
+    def share(noise, parameters, segments, driven):
+        return _surprisal(parameters, noise, segments, driven, robust)
+
+    batch = replace(segments, over=None), driven
+    return segments.over.summed(share, (parameters,), batch)(noise) / rows
+
+
+def _surprisal(parameters, noise, segments, driven: Drive, robust: bool) -> Float[Array, ""]:
+    error, variance = innovations(parameters, noise, segments, driven, robust)
+    return 0.5 * jnp.sum(jnp.log(variance) + surprise(error / jnp.sqrt(variance), robust))

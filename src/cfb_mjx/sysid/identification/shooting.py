@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cfb_mjx.devices import Devices, mapped
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.bodies import Body, RigidBody
@@ -50,6 +51,7 @@ def shoot(
     robust: bool = False,
     body: Body | None = None,
     progress: Callable[[int, int], None] | None = None,
+    over: Devices | None = None,
 ) -> Fit:
     """Least squares on the prediction errors every 20 ms up to 200 ms, weighted by the sensors' noise.
 
@@ -64,22 +66,25 @@ def shoot(
         robust: let outliers count linearly instead of squared.
         body: the body to predict with, `RigidBody()` or `MjxBody(floor=False)`.
         progress: called with (done, total).
+        over: devices to divide the windows over.
 
     Raises:
         CfbError: unknown parameters, or no window in any log.
     """
     unknowns = choose(parameters, nominal)
     delayed = "observation_delay" in unknowns.names
-    data = batches(logs, None, float(nominal.observation_delay), use_measured)
+    data = batches(logs, None, float(nominal.observation_delay), use_measured, over)
     if not data:
         raise CfbError(f"{', '.join(log.name for log in logs)}: no prediction window fits; fly at least 1.2 s.")
     body = RigidBody() if body is None else body
-    vector = unknowns.start
+    # Placed as the rounds return it, or the second would compile anew.
+    vector = unknowns.start if over is None else over.whole(unknowns.start)
     for done in range(ROUNDS):
         before = vector
         if delayed and done:
-            data = batches(logs, float(unknowns.apply(vector).observation_delay), 0.0, use_measured)
+            data = batches(logs, float(unknowns.apply(vector).observation_delay), 0.0, use_measured, over)
         whiten = _whitening(unknowns, vector, data, body, free_start)
+        whiten = whiten if over is None else over.along(whiten)
         vector = _solve(unknowns, vector, data, body, whiten, robust)
         if progress is not None:
             progress(done + 1, ROUNDS)
@@ -129,7 +134,7 @@ def _errors(
         ]
         return (jnp.concatenate(error, axis=1) / noise).ravel()
 
-    return batch.live[:, None] * jax.vmap(one)(
+    return batch.live[:, None] * mapped(one, batch.over)(
         batch.lead_step,
         batch.lead_command,
         batch.state,

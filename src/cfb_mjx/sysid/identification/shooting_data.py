@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cfb_mjx.devices import Devices
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.state import State
 from cfb_mjx.sysid.identification.flight_data import white_noise
@@ -40,9 +43,13 @@ class Batch(eqx.Module):
     delay: Float[Array, ""]
     """Age of the pose in a row that was assumed when the windows were cut, s."""
     measured: bool = eqx.field(static=True)
+    over: Devices | None = eqx.field(static=True, default=None)
+    """What the windows are divided over."""
 
 
-def batches(logs: list[FlightLog], delay: float | None, fallback: float, use_measured: bool) -> list[Batch]:
+def batches(
+    logs: list[FlightLog], delay: float | None, fallback: float, use_measured: bool, over: Devices | None = None
+) -> list[Batch]:
     """Windows of the logs, those with and those without measured rotor speeds.
 
     Args:
@@ -50,6 +57,7 @@ def batches(logs: list[FlightLog], delay: float | None, fallback: float, use_mea
         delay: age of the pose in every log, s; None takes each log's own.
         fallback: for logs that do not know theirs, s.
         use_measured: feed measured rotor speeds where there are some.
+        over: devices to divide the windows over.
     """
     pieces: dict[tuple[bool, float], list[dict]] = {}
     for log in logs:
@@ -62,7 +70,18 @@ def batches(logs: list[FlightLog], delay: float | None, fallback: float, use_mea
                 chosen = np.flatnonzero(good == measured)
                 if len(chosen):
                     pieces.setdefault((measured, age), []).append(_arrays(log, windows, chosen, measured))
-    return [_stack(parts, measured, age) for (measured, age), parts in pieces.items()]
+    found = [_stack(parts, measured, age) for (measured, age), parts in pieces.items()]
+    return found if over is None else [_divided(batch, over) for batch in found]
+
+
+def _divided(batch: Batch, over: Devices) -> Batch:
+    if not over.several:
+        return batch
+    # Added windows count for nothing, and the delay is one for all.
+    more = -len(batch.live) % over.count
+    live = np.concatenate([np.asarray(batch.live), np.zeros(more)])
+    alike = replace(batch, delay=np.broadcast_to(batch.delay, batch.live.shape))
+    return replace(over.shared(alike), live=over.along(live), delay=over.whole(batch.delay))
 
 
 def _arrays(log: FlightLog, windows: Windows, chosen: np.ndarray, measured: bool) -> dict:

@@ -1,0 +1,288 @@
+"""Many steps of many drones, and their derivatives, as operations that see the whole batch.
+
+Written drone by drone under ``vmap``, a step is thirty small kernels over all drones, and its derivative two hundred;
+between them every number goes through memory. On CPU the drones are flown a few at a time through all steps instead,
+each group in one compiled function (`cfb_mjx.model.grouped`) whose numbers stay in the nearest cache, and so are their
+derivatives. To form groups an operation has to know its batch, which code under ``vmap`` does not: hence primitives of
+jax. There are three: the flight, its push of tangents forward, and its pull of cotangents back. All mean what the same
+steps under ``vmap``, ``jvp`` and ``vjp`` mean, which is also how they are computed elsewhere.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+from cfb_mjx.model.grouped import grouped
+from cfb_mjx.model.quadrotor import Prepared, advance
+from cfb_mjx.model.state import Components
+from cfb_mjx.model.vector import Vec
+
+
+class _Flight(NamedTuple):
+    """What is static in a flight: everything but its arrays (state, rows of commands, constants of the drone)."""
+
+    structure: Any
+    static: tuple
+    """Leaves that are no arrays; None in the place of arrays."""
+    state: int
+    """How many of the arrays are the state's, the first ones; the rows come next."""
+    hold: int
+
+    @property
+    def arrays(self) -> int:
+        """How many arrays there are."""
+        return self.static.count(None)
+
+
+def fly(prepared: Prepared, state: Components, rows: Vec, hold: int) -> Components:
+    """Advance ``state`` by all ``rows`` of commands, each held for ``hold`` steps; return the last state.
+
+    Args:
+        prepared: the drone, without batch axes; its body must be `RigidBody`.
+        state: where it starts; every component a scalar.
+        rows: four arrays (n,).
+        hold: steps per row.
+    """
+    # What steps need of the parameters has been prepared; effects bring their own.
+    prepared = eqx.tree_at(lambda p: p.model.parameters, prepared, None)
+    leaves, structure = jax.tree.flatten((state, rows.stack(), prepared))
+    dynamic = [isinstance(x, jax.Array | np.ndarray | np.generic) for x in leaves]
+    arrays = [jnp.asarray(x, leaves[0].dtype) for x, d in zip(leaves, dynamic, strict=True) if d]
+    static = tuple(None if d else x for x, d in zip(leaves, dynamic, strict=True))
+    flight = _Flight(structure, static, len(jax.tree.leaves(state)), hold)
+    flown = _FLY.bind(*arrays, flight=flight, drones=None, batched=(False,) * len(arrays), moving=())
+    return jax.tree.unflatten(jax.tree.structure(state), flown)
+
+
+def _steps(
+    flight: _Flight, batched: Sequence[bool], lanes: int, *arrays: Array, wrench_once: bool = True
+) -> list[Array]:
+    """The flight of ``lanes`` drones, their axis the last one of what is ``batched`` and of the last state's numbers.
+
+    On its way the state is one array (numbers, lanes), not one per number: what reverse mode keeps of every step is
+    then written in place.
+    """
+    count = flight.state
+    axes = tuple(-1 if b else None for b in batched[count:])
+    packed = jnp.stack([jnp.broadcast_to(x, (lanes,)) for x in arrays[:count]])
+    rows, constants = arrays[count], arrays[count + 1 :]
+
+    def step(packed, row, *constants):
+        def one(*arrays):
+            remaining = iter(arrays)
+            leaves = [next(remaining) if x is None else x for x in flight.static]
+            state, row, prepared = jax.tree.unflatten(flight.structure, leaves)
+            prepared = dataclasses.replace(prepared, wrench_once=wrench_once)
+            return jax.tree.leaves(advance(prepared, state, Vec.unstack(row)))
+
+        return jnp.stack(jax.vmap(one, in_axes=(0,) * count + axes)(*_numbers(packed), row, *constants))
+
+    # Reverse mode computes a step again from its start: to store all of it costs more.
+    step = jax.checkpoint(step, prevent_cse=False)
+
+    def one(packed, row):
+        if flight.hold == 1:
+            return step(packed, row, *constants), None
+        # scan, not fori_loop: it has a reverse mode.
+        return jax.lax.scan(lambda c, _: (step(c, row, *constants), None), packed, length=flight.hold)[0], None
+
+    return _numbers(one(packed, rows[0])[0] if rows.shape[0] == 1 else jax.lax.scan(one, packed, rows)[0])
+
+
+def _numbers(packed: Array) -> list[Array]:
+    # split, not indexing: its transpose is one concatenation, and not a sum of arrays that are mostly zero.
+    return [x.reshape(x.shape[1:]) for x in jax.lax.split(packed, (1,) * packed.shape[0])]
+
+
+def _flown(flight, batched, moving, lanes, *arrays):
+    return _steps(flight, batched, lanes, *arrays)
+
+
+def _pushed(flight, batched, moving, lanes, *operands):
+    """Tangents of the last state; operands are the flight's arrays and the tangents of those that are ``moving``."""
+    function, moved = _varied(flight, batched, moving, lanes, operands)
+    own = batched[flight.arrays :]
+    tangents = (_each(x, b, lanes) for x, b in zip(operands[flight.arrays :], own, strict=True))
+    return jax.jvp(function, moved, list(tangents))[1]
+
+
+def _pulled(flight, batched, moving, lanes, *operands):
+    """Cotangents, drone by drone, of the ``moving`` arrays; operands are the arrays and the last state's cotangents."""
+    function, moved = _varied(flight, batched, moving, lanes, operands)
+    own = batched[flight.arrays :]
+    cotangents = (_each(x, b, lanes) for x, b in zip(operands[flight.arrays :], own, strict=True))
+    return list(jax.vjp(function, *moved)[1](list(cotangents)))
+
+
+def _varied(flight, batched, moving, lanes, operands):
+    """The flight as a function of its moving arrays, and these; every drone has its own.
+
+    A derivative by what all drones share is then summed once at the end instead of in every step.
+    """
+    arrays, own = list(operands[: flight.arrays]), list(batched[: flight.arrays])
+    moved = [_each(arrays[i], own[i], lanes) for i in moving]
+    for i in moving:
+        own[i] = True
+
+    def function(*moved):
+        for i, x in zip(moving, moved, strict=True):
+            arrays[i] = x
+        return _steps(flight, own, lanes, *arrays, wrench_once=False)
+
+    return function, moved
+
+
+def _each(x: Array, batched: bool, lanes: int) -> Array:
+    return x if batched else jnp.broadcast_to(x[..., None], (*x.shape, lanes))
+
+
+OPERATIONS = {"fly": _flown, "fly_push": _pushed, "fly_pull": _pulled}
+"""What each primitive means."""
+
+
+def _evaluated(what, *operands, flight, drones, batched, moving, in_groups):
+    """One of the three above for the whole batch."""
+    if drones is None:
+        operands, batched = [x[..., None] for x in operands], (True,) * len(operands)
+    size = drones or 1
+
+    def some(*operands):
+        lanes = next(x.shape[-1] for x, b in zip(operands, batched, strict=True) if b)
+        return what(flight, batched, moving, lanes, *operands)
+
+    found = grouped(some, operands, batched, size) if in_groups else some(*operands)
+    return [x[..., 0] for x in found] if drones is None else list(found)
+
+
+def _primitive(name: str) -> Primitive:
+    primitive, what = Primitive(name), OPERATIONS[name]
+    primitive.multiple_results = True
+
+    @lru_cache(maxsize=256)
+    def compiled(names, values):
+        return jax.jit(partial(primitive.bind, **dict(zip(names, values, strict=True))))
+
+    @primitive.def_impl
+    def _(*operands, **static):
+        return compiled(tuple(static), tuple(static.values()))(*operands)
+
+    @primitive.def_abstract_eval
+    def _(*operands, flight, drones, batched, moving):
+        shapes = [()] * flight.state
+        if what is _pulled:
+            shapes = [operands[i].shape[:-1] if batched[i] else operands[i].shape for i in moving]
+        axis = () if drones is None else (drones,)
+        return [jax.core.ShapedArray((*shape, *axis), operands[0].dtype) for shape in shapes]
+
+    plain = partial(_evaluated, what, in_groups=False)
+    mlir.register_lowering(primitive, mlir.lower_fun(plain, multiple_results=True))
+    fast = mlir.lower_fun(partial(_evaluated, what, in_groups=True), multiple_results=True)
+    mlir.register_lowering(primitive, fast, platform="cpu")
+    batching.primitive_batchers[primitive] = partial(_batch, primitive)
+    ad.primitive_jvps[primitive] = partial(_differentiate, plain)
+    return primitive
+
+
+def meaning(name: str, operands: Sequence[jax.ShapeDtypeStruct], static: dict[str, Any]):
+    """The plain steps that an operation of this name stands for, traced; for those who count what programs do."""
+    return jax.make_jaxpr(partial(_evaluated, OPERATIONS[name], in_groups=False, **static))(*operands)
+
+
+def _batch(primitive, operands, axes, *, flight, drones, batched, moving):
+    size = next(x.shape[a] for x, a in zip(operands, axes, strict=True) if a is not None)
+    joined = [_join(x, a, b, size, drones) for x, a, b in zip(operands, axes, batched, strict=True)]
+    own = tuple(b or a is not None for a, b in zip(axes, batched, strict=True))
+    found = primitive.bind(*joined, flight=flight, drones=size * (drones or 1), batched=own, moving=moving)
+    where = [x.ndim - 1 for x in found]
+    if drones is not None:
+        found = [x.reshape(*x.shape[:-1], size, drones) for x in found]
+    return found, where
+
+
+def _join(x: Array, axis: int | None, batched: bool, size: int, drones: int | None) -> Array:
+    """The new batch axis and the earlier one, where there is one, as a single last axis."""
+    if axis is None and not batched:
+        return x
+    if drones is None:
+        return jnp.moveaxis(x, axis, -1)
+    x = x[None] if axis is None else jnp.moveaxis(x, axis, 0)
+    x = x if batched else x[..., None]
+    x = jnp.moveaxis(jnp.broadcast_to(x, (size, *x.shape[1:-1], drones)), 0, -2)
+    return x.reshape(*x.shape[:-2], size * drones)
+
+
+def _differentiate(plain, primals, tangents, **static):
+    """Of the push and the pull: second derivatives, by the plain steps."""
+    moving = [i for i, t in enumerate(tangents) if type(t) is not ad.Zero]
+
+    def function(*moved):
+        operands = list(primals)
+        for i, x in zip(moving, moved, strict=True):
+            operands[i] = x
+        return plain(*operands, **static)
+
+    return jax.jvp(function, [primals[i] for i in moving], [tangents[i] for i in moving])
+
+
+def _push(primals, tangents, *, flight, drones, batched, moving):
+    moving = tuple(i for i, t in enumerate(tangents) if type(t) is not ad.Zero)
+    pushed = _PUSH.bind(
+        *primals,
+        *(tangents[i] for i in moving),
+        flight=flight,
+        drones=drones,
+        batched=batched + tuple(batched[i] for i in moving),
+        moving=moving,
+    )
+    return _FLY.bind(*primals, flight=flight, drones=drones, batched=batched, moving=()), pushed
+
+
+def _pull(cotangents, *operands, flight, drones, batched, moving):
+    count = flight.arrays
+    primals, tangents = operands[:count], operands[count:]
+    wanted = [ad.is_undefined_primal(x) for x in tangents]
+    cotangents = [ad.instantiate_zeros(x) for x in cotangents]
+    pulled = iter(
+        _PULL.bind(
+            *primals,
+            *cotangents,
+            flight=flight,
+            drones=drones,
+            batched=batched[:count] + (drones is not None,) * flight.state,
+            moving=tuple(i for i, w in zip(moving, wanted, strict=True) if w),
+        )
+    )
+    found = [next(pulled) if w else None for w in wanted]
+    if drones is not None:
+        shared = [i for i, x in enumerate(found) if x is not None and not batched[count + i]]
+        for i, total in zip(shared, _totals([found[i] for i in shared]), strict=True):
+            found[i] = total
+    return [None] * count + found
+
+
+def _totals(parts: list[Array]) -> list[Array]:
+    """The sum over the last axis of each."""
+    if not parts:
+        return []
+    # One sum of many rows, since XLA compiles and calls every sum on its own.
+    total = jnp.sum(jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in parts]), axis=-1)
+    ends = np.cumsum([x[..., 0].size for x in parts])
+    return [y.reshape(x.shape[:-1]) for y, x in zip(jnp.split(total, ends[:-1]), parts, strict=True)]
+
+
+_FLY = _primitive("fly")
+_PUSH = _primitive("fly_push")
+_PULL = _primitive("fly_pull")
+ad.primitive_jvps[_FLY] = _push
+ad.primitive_transposes[_PUSH] = _pull

@@ -1,0 +1,146 @@
+"""A function of small arrays, computed one number at a time.
+
+Registers of a GPU hold numbers, and a kernel language such as Triton's knows no arrays of three. JAX's trace of a
+function of small arrays is therefore carried out again here with every array taken apart: what only moves numbers about
+(slices, stacks, reshapes) happens in Python, what computes is done number by number. A number may itself stand for a
+block of drones. So the code that flies one drone in plain JAX serves inside a kernel too, without a second version.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Literal
+
+_ELEMENTWISE = """
+    abs add and ceil clamp convert_element_type cos div eq exp expm1 floor ge gt integer_pow is_finite le log log1p lt
+    max min mul ne neg not or pow rsqrt select_n sign sin sqrt square sub tan tanh
+"""
+ELEMENTWISE = frozenset(_ELEMENTWISE.split())
+"""Operations known to exist in Triton's language as well as in JAX's; all have one result."""
+CALLS = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call"))
+
+
+def _broadcast(array: np.ndarray, shape, broadcast_dimensions, **_) -> np.ndarray:
+    placed = [1] * len(shape)
+    for dimension, size in zip(broadcast_dimensions, array.shape, strict=True):
+        placed[dimension] = size
+    return np.broadcast_to(array.reshape(placed), shape)
+
+
+def _slice(array: np.ndarray, start_indices, limit_indices, strides) -> np.ndarray:
+    strides = strides or (1,) * array.ndim
+    return array[tuple(slice(*which) for which in zip(start_indices, limit_indices, strides, strict=True))]
+
+
+MOVES: dict[str, Callable[..., np.ndarray]] = {
+    "broadcast_in_dim": _broadcast,
+    "concatenate": lambda *arrays, dimension: np.concatenate(arrays, axis=dimension),
+    "copy": lambda array: array,
+    # Barriers keep XLA from computing things twice; a kernel's compiler finds common parts by itself.
+    "optimization_barrier": lambda *arrays: arrays,
+    "reshape": lambda array, new_sizes, **_: array.reshape(new_sizes),
+    "slice": _slice,
+    "squeeze": lambda array, dimensions: array.squeeze(dimensions),
+    "stack": lambda *arrays, axis: np.stack(arrays, axis=axis),
+    "transpose": lambda array, permutation: array.transpose(permutation),
+}
+"""Operations that only move numbers about, on arrays of objects."""
+
+
+@dataclass(frozen=True)
+class Program:
+    """A traced function of arrays whose parts are all known here."""
+
+    traced: ClosedJaxpr
+    used: tuple[bool, ...]
+    """Which arguments the results depend on."""
+
+    def __call__(self, *arguments: np.ndarray | None) -> list[np.ndarray]:
+        """Results as arrays of numbers, from arguments likewise; those not used may be None."""
+        return _run(self.traced.jaxpr, self.traced.consts, arguments)
+
+
+def trace(function: Callable, *examples) -> Program | None:
+    """The program of ``function``, which takes arrays and returns a sequence of them; None if parts are unknown here.
+
+    Args:
+        function: works on arrays alone, closed over nothing that is traced.
+        examples: arrays or `jax.ShapeDtypeStruct`, as many as there are arguments.
+    """
+    traced = jax.make_jaxpr(function)(*examples)
+    if not _known(traced.jaxpr):
+        return None
+    needed = _needed(traced.jaxpr)[1]
+    return Program(traced, tuple(v in needed for v in traced.jaxpr.invars))
+
+
+def _inner(equation) -> ClosedJaxpr:
+    return equation.params["call_jaxpr" if "call_jaxpr" in equation.params else "jaxpr"]
+
+
+def _known(jaxpr) -> bool:
+    for equation in _needed(jaxpr)[0]:
+        name = equation.primitive.name
+        if name in CALLS:
+            if not _known(_inner(equation).jaxpr):
+                return False
+        elif name not in ELEMENTWISE and name not in MOVES:
+            return False
+    return True
+
+
+def _needed(jaxpr) -> tuple[list, set]:
+    """The equations the results depend on, in order, and every variable these read."""
+    needed, kept = {v for v in jaxpr.outvars if not isinstance(v, Literal)}, []
+    for equation in reversed(jaxpr.eqns):
+        if needed.intersection(equation.outvars):
+            kept.append(equation)
+            needed.update(v for v in equation.invars if not isinstance(v, Literal))
+    return kept[::-1], needed
+
+
+def _run(jaxpr, constants, arguments) -> list[np.ndarray]:
+    values = dict(zip(jaxpr.constvars, map(_numbers, constants), strict=True))
+    values.update(zip(jaxpr.invars, arguments, strict=True))
+
+    def read(atom) -> np.ndarray:
+        return _numbers(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, Literal) else values[atom]
+
+    for equation in _needed(jaxpr)[0]:
+        name, inputs = equation.primitive.name, [read(atom) for atom in equation.invars]
+        if name in CALLS:
+            inner = _inner(equation)
+            results = _run(inner.jaxpr, inner.consts, inputs)
+        elif name in MOVES:
+            results = MOVES[name](*inputs, **equation.params)
+            results = results if isinstance(results, tuple) else (results,)
+        else:
+            results = (_each(equation, inputs),)
+        values.update(zip(equation.outvars, results, strict=True))
+    return [read(atom) for atom in jaxpr.outvars]
+
+
+def _numbers(array) -> np.ndarray:
+    """An array of NumPy numbers: such a number is written into a kernel, where an array could not be."""
+    array = np.asarray(array)
+    numbers = np.empty(array.shape, object)
+    for index in np.ndindex(array.shape):
+        numbers[index] = array[index]
+    return numbers
+
+
+def _each(equation, inputs: Sequence[np.ndarray]) -> np.ndarray:
+    shape = equation.outvars[0].aval.shape
+    inputs = [np.broadcast_to(array, shape) for array in inputs]
+    results = np.empty(shape, object)
+    for index in np.ndindex(shape):
+        numbers = [array[index] for array in inputs]
+        block = np.broadcast_shapes(*map(np.shape, numbers))
+        alike = [x if np.shape(x) == block else jnp.broadcast_to(x, block) for x in numbers]
+        results[index] = equation.primitive.bind(*alike, **equation.params)
+    return results

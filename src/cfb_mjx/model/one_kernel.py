@@ -1,0 +1,35 @@
+"""A computation that XLA's CPU compiler turns into one function, instead of one call per fused operation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import Array
+
+
+def one_kernel(function: Callable[..., Array], *arrays: Array) -> Array:
+    """``function(*arrays)``, for CPU: compiled as one function with its loops inside.
+
+    XLA's CPU runtime otherwise calls every fused operation of every turn of a loop on its own: a time step of a hundred
+    drones is some thirty calls of a few hundred nanoseconds, which is most of its time. XLA does the same by itself for
+    loops over less than 1 kB, by marking a call it does not inline; here the mark is set from outside. Nothing else
+    depends on it: a compiler that does not know the mark computes the same, slower.
+
+    Only for what moves little: within such a function XLA copies an array of which a slice is updated together with
+    others (pack what a loop keeps of every turn into one array), and a matrix product is a plain loop.
+
+    Args:
+        function: its result must depend on every argument, also after the compiler has simplified it: jaxlib 0.10.1
+            aborts where a marked call ignores one.
+        arrays: its arguments.
+    """
+
+    def inner(*arrays):
+        # Calls within inherit the mark unless told otherwise, and then are not inlined either.
+        with set_xla_metadata(xla_cpu_small_call="false", inlineable="true"):
+            return function(*arrays)
+
+    with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+        return jax.jit(inner)(*arrays)

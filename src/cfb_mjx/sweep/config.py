@@ -1,0 +1,156 @@
+"""The file that describes a sweep, read strictly."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from glob import glob
+from pathlib import Path
+from typing import Any
+
+from cfb_mjx.documents import load_named, refuse_unknown
+from cfb_mjx.errors import CfbError
+from cfb_mjx.sweep.kinds import KINDS
+from cfb_mjx.sweep.parameters import Parameters
+
+FORMAT = "cfb_mjx sweep 1"
+FOLDER = "sweeps"
+_KEYS = {"format", "description", "command", "arguments", "over", "each", "cpus", "gpus"}
+
+
+@dataclass(frozen=True)
+class Point:
+    """Some of what varies: values by key, and what to call them (None: after the values)."""
+
+    values: dict[str, Any]
+    label: str | None = None
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep as its file says it.
+
+    Attributes:
+        path: of the file.
+        parameters: of the command that every task runs.
+        arguments: the same for all, by key (``seed``, ``set.mass``).
+        over: lists whose product is taken.
+        each: cases, combined with that product.
+        cpus: of a task; its computations are held to as many threads.
+        gpus: of a task.
+    """
+
+    path: Path
+    parameters: Parameters
+    arguments: dict[str, Any]
+    over: dict[str, list[Any]]
+    each: tuple[Point, ...]
+    cpus: float = 1.0
+    gpus: float = 0.0
+
+
+def load_sweep(name_or_path: str | Path, functions: Mapping[str, Callable]) -> Sweep:
+    """Read a sweep of a YAML file, or a shipped one by its name.
+
+    Args:
+        name_or_path: of the sweep; its patterns are looked up from the current folder.
+        functions: of the commands, by name; their signatures say what a task may be given.
+
+    Raises:
+        CfbError: one sentence on what is wrong and where.
+    """
+    path, raw = load_named(name_or_path, "sweep", FORMAT, FOLDER)
+    refuse_unknown(raw, _KEYS, path, "")
+    command = raw.get("command")
+    if command not in KINDS:
+        raise CfbError(f"{path}: 'command' must be one of {', '.join(KINDS)}, found {command!r}.")
+    parameters = Parameters.of(command, functions[command], KINDS[command])
+    arguments = _flat(_mapping(raw, "arguments", path), parameters, f"{path}: arguments")
+    over = _flat(_mapping(raw, "over", path), parameters, f"{path}: over")
+    for key, values in over.items():
+        if not isinstance(values, list) or not values:
+            raise CfbError(f"{path}: over.{key} must be a list of values, found {values!r}.")
+    each = _each(raw.get("each"), parameters, path)
+    if not over and not each:
+        raise CfbError(f"{path}: nothing varies; list values under 'over', or cases under 'each'.")
+    return Sweep(
+        path,
+        parameters,
+        arguments,
+        over,
+        each or (Point({}),),
+        _share(raw, "cpus", 1, path),
+        _share(raw, "gpus", 0, path),
+    )
+
+
+def _mapping(raw: Mapping, key: str, path: Path) -> dict:
+    value = raw.get(key) or {}
+    if not isinstance(value, dict):
+        raise CfbError(f"{path}: '{key}' must be a mapping, found {value!r}.")
+    return value
+
+
+def _flat(mapping: Mapping, parameters: Parameters, where: str) -> dict[str, Any]:
+    """Keys as in Python (``held_out``), changes dotted: ``set: {mass: 0.04}`` is ``set.mass: 0.04``."""
+    flat: dict[str, Any] = {}
+    for raw_key, value in mapping.items():
+        name, dot, rest = str(raw_key).partition(".")
+        name = name.replace("-", "_")
+        if not dot and parameters.shapes.get(name) == "pairs":
+            if not isinstance(value, dict):
+                raise CfbError(f"{where}.{name} must be a mapping NAME: VALUE, found {value!r}.")
+            entries = {f"{name}.{key}": v for key, v in value.items()}
+        else:
+            entries = {f"{name}{dot}{rest}": value}
+        if both := sorted(set(flat) & set(entries)):
+            raise CfbError(f"{where}: '{both[0]}' is given twice.")
+        flat |= {key: _plain(v) for key, v in entries.items()}
+    return flat
+
+
+def _plain(value: Any) -> Any:
+    """YAML reads 2026-01-31 as a date; here it is the name of something."""
+    if isinstance(value, list):
+        return [_plain(v) for v in value]
+    return value if value is None or isinstance(value, str | bool | int | float | dict) else str(value)
+
+
+def _each(raw: Any, parameters: Parameters, path: Path) -> tuple[Point, ...]:
+    if raw is None:
+        return ()
+    if isinstance(raw, dict):
+        return _matches(raw, path)
+    if not isinstance(raw, list) or not raw or not all(isinstance(case, dict) and case for case in raw):
+        raise CfbError(f"{path}: 'each' must be a list of mappings, or one NAME: PATTERN of files or folders.")
+    points = []
+    for number, case in enumerate(raw, 1):
+        values = {key: value for key, value in case.items() if key != "name"}
+        label = None if case.get("name") is None else str(case["name"])
+        points.append(Point(_flat(values, parameters, f"{path}: each, case {number}"), label))
+    return tuple(points)
+
+
+def _matches(raw: dict, path: Path) -> tuple[Point, ...]:
+    """One case for every file or folder that matches a pattern."""
+    if len(raw) != 1 or not all(isinstance(pattern, str) for pattern in raw.values()):
+        raise CfbError(f"{path}: 'each' must be a list of mappings, or one NAME: PATTERN of files or folders.")
+    ((key, pattern),) = raw.items()
+    found = sorted(glob(pattern, recursive=True))
+    if not found:
+        raise CfbError(f"{path}: each.{key}: nothing matches {pattern} in {Path.cwd()}.")
+    paths = [Path(name) for name in found]
+    return tuple(Point({str(key).replace("-", "_"): str(p)}, p.name if p.is_dir() else p.stem) for p in paths)
+
+
+def _share(raw: Mapping, key: str, default: float, path: Path) -> float:
+    value = raw.get(key, default)
+    least = "positive" if key == "cpus" else "zero or positive"
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or not 0 <= value < math.inf or (key == "cpus" and value == 0):
+        raise CfbError(f"{path}: '{key}' must be a {least} number, found {value!r}.")
+    # Ray shares a processor, not several and a half.
+    if value > 1 and value != int(value):
+        raise CfbError(f"{path}: '{key}' above 1 must be a whole number, found {value!r}.")
+    return float(value)
