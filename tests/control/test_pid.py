@@ -1,5 +1,7 @@
 """The firmware's PID: signs against the library's own geometry, and flights of the library's drone with late poses."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -175,6 +177,28 @@ def test_batched_and_differentiable():
     assert many.shape == (3, 4)
     slope = jax.jacrev(command)(gains[1], pid)
     np.testing.assert_allclose(slope, (many[2] - many[0]) / 200, rtol=1e-9)
+
+
+def test_float64_after_float32_in_one_process():
+    """Constants that jax has met in float32 must not stay so."""
+
+    def flown():
+        parameters = load_model_file("cfb-guards").parameters()
+        pid, level = FirmwarePid.hovering(parameters), Quadrotor(parameters).hover_state()
+
+        def loop(pid, level):
+            return jax.lax.scan(
+                lambda memory, _: step(pid, memory, level, Setpoint.hover(level.position)), init(pid, level), length=3
+            )[1]
+
+        return eqx.filter_jit(loop)(pid, jax.tree.map(jnp.asarray, level))
+
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
+        single = flown()
+    double = flown()
+    assert (single.dtype, double.dtype) == (jnp.float32, jnp.float64)
+    np.testing.assert_allclose(single, double, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("goal", "yaw_deg"), [((1.0, 0.0, 0.0), 0.0), ((0.6, -0.8, 0.4), 50.0)])

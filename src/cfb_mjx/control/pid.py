@@ -31,9 +31,9 @@ DIVIDER = 5
 """The position and velocity loops run in every fifth step, at 100 Hz."""
 _OVERHEAD = 1.1
 """Output limits of the position and velocity loops exceed the velocity and tilt limits by this factor."""
-_LEGACY = np.array([1.0, -1.0, 1.0])
+_LEGACY = (1.0, -1.0, 1.0)
 """Roll, pitch, yaw to the firmware's signs, and back."""
-_MIXING = np.array([[-0.5, 0.5, 1.0], [-0.5, -0.5, -1.0], [0.5, -0.5, 1.0], [0.5, 0.5, -1.0]])
+_MIXING = ((-0.5, 0.5, 1.0), (-0.5, -0.5, -1.0), (0.5, -0.5, 1.0), (0.5, 0.5, -1.0))
 """Roll, pitch, yaw counts of M1..M4."""
 
 
@@ -163,7 +163,7 @@ def step(
 
     held = setpoint.hold_position > 0
     collective = jnp.where(held, thrust, COUNTS * setpoint.thrust)
-    tilt_deg = jnp.where(held, roll_pitch_deg, jnp.degrees(setpoint.roll_pitch) * _LEGACY[:2])
+    tilt_deg = jnp.where(held, roll_pitch_deg, jnp.degrees(setpoint.roll_pitch) * np.array(_LEGACY[:2]))
     wanted_deg = jnp.append(tilt_deg, jnp.degrees(setpoint.yaw))
     yaw_wraps = np.array([False, False, True])
     attitude_memory, wanted_rate_deg = update(
@@ -184,7 +184,7 @@ def mix(thrust: Float[Array, ""], torque: Float[Array, "3"], idle: Float[Array, 
     lowered alike, as in the firmware: attitude before height.
     """
     # The firmware turns the yaw output's sign before mixing.
-    counts = thrust + _MIXING @ (torque * np.array([1.0, 1.0, -1.0]))
+    counts = thrust + np.array(_MIXING) @ (torque * np.array([1.0, 1.0, -1.0]))
     counts = counts - jnp.maximum(jnp.max(counts) - COUNTS, 0.0)
     return jnp.clip(counts, idle, COUNTS) / COUNTS
 
@@ -199,8 +199,8 @@ def _signals(measurement: State):
     return (
         _heading_frame(measurement.position, yaw),
         _heading_frame(measurement.velocity, yaw),
-        jnp.degrees(angles) * _LEGACY,
-        jnp.degrees(measurement.body_rate) * _LEGACY,
+        jnp.degrees(angles) * np.array(_LEGACY),
+        jnp.degrees(measurement.body_rate) * np.array(_LEGACY),
     )
 
 
