@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array
 
+from cfb_mjx.control.closed_loop import rollout_closed_loop
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
-from cfb_mjx.envs.observation import Estimate
 from cfb_mjx.files import shipped
 from cfb_mjx.model import MjxBody, Quadrotor, rollout_final
 from cfb_mjx.model.acceleration import using
@@ -124,16 +124,8 @@ def rollout_policy(drones: int) -> Workload:
     commands = STEPS // 4
 
     def fly(model, state):
-        def estimate(at):
-            return Estimate(at.position, at.velocity, at.quaternion, at.body_rate)
-
-        def one(carry, _):
-            at, memory = carry
-            memory, u = controller.command(memory, estimate(at))
-            return (rollout_final(model, at, u[None], hold=2), memory), None
-
-        memory = controller.start(estimate(state), model.hover_command())
-        return jax.lax.scan(one, (state, memory), length=commands)[0][0]
+        flown = rollout_closed_loop(model, controller, state, commands, every=commands)
+        return jax.tree.map(lambda x: x[-1], flown.state)
 
     together = jax.vmap(fly, in_axes=(None, 0))
     return _compile("rollout_policy", "rigid", drones, 2 * commands, together, model, states)

@@ -1,5 +1,6 @@
 """Controllers: the firmware's PID and Mellinger, and neural policies. Pure functions over immutable pytrees."""
 
+from cfb_mjx.control.closed_loop import ClosedLoop, rollout_closed_loop
 from cfb_mjx.control.hold import PositionHold
 from cfb_mjx.control.mellinger import Mellinger
 from cfb_mjx.control.neural import Network, NeuralController
@@ -8,6 +9,7 @@ from cfb_mjx.control.pilot import MellingerPilot, PidPilot, Pilot, find_pilot
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
 
 __all__ = [
+    "ClosedLoop",
     "FirmwarePid",
     "Mellinger",
     "MellingerPilot",
@@ -23,6 +25,7 @@ __all__ = [
     "init",
     "load_policy",
     "resume",
+    "rollout_closed_loop",
     "save_policy",
     "step",
 ]

@@ -37,9 +37,19 @@ class Network(eqx.Module):
             x = act(x @ weight + bias)
         return x @ self.weights[-1] + self.biases[-1]
 
+    def columns(self, x: Float[Array, "inputs drones"]) -> Float[Array, "outputs drones"]:
+        """The same for many whose axis is the last one."""
+        act = ACTIVATIONS[self.activation]
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            x = act(weight.T @ x + bias[:, None])
+        return self.weights[-1].T @ x + self.biases[-1][:, None]
+
 
 class NeuralController(eqx.Module):
-    """A network that turns observations into commands u = (1 + tanh(output)) / 2."""
+    """A network that turns observations into commands u = (1 + tanh(output)) / 2.
+
+    `start` and `command` also take many drones whose axis is the last one of every array (`cfb_mjx.envs.observation`).
+    """
 
     network: Network
     layout: Layout = eqx.field(static=True, default_factory=Layout)
@@ -63,17 +73,18 @@ class NeuralController(eqx.Module):
         """Time between two commands, s."""
         return self.layout.control_dt_s
 
-    def act(self, shown: Float[Array, "size"]) -> Float[Array, "4"]:
+    def act(self, shown: Float[Array, "size *drones"]) -> Float[Array, "4 *drones"]:
         """Command in (0, 1) on an observation."""
-        return 0.5 * (1 + jnp.tanh(self.network(shown)))
+        network = self.network if shown.ndim == 1 else self.network.columns
+        return 0.5 * (1 + jnp.tanh(network(shown)))
 
-    def start(self, estimate: Estimate, command: Float[Array, "4"] | float = 0.55) -> Memory:
+    def start(self, estimate: Estimate, command: Float[Array, "4 *drones"] | float = 0.55) -> Memory:
         """Memory of a controller that takes over: it has commanded ``command`` on ``estimate`` for long."""
         return start(self.layout, estimate, command)
 
     def command(
-        self, memory: Memory, estimate: Estimate, setpoint: Float[Array, "setpoints"] | None = None
-    ) -> tuple[Memory, Float[Array, "4"]]:
+        self, memory: Memory, estimate: Estimate, setpoint: Float[Array, "setpoints *drones"] | None = None
+    ) -> tuple[Memory, Float[Array, "4 *drones"]]:
         """New memory and command; called every ``layout.control_dt_s``. Policies with set-points need them."""
         u = self.act(observation(self.layout, memory, estimate, setpoint))
         return remember(self.layout, memory, estimate, u), u

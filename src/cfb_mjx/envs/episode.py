@@ -18,7 +18,6 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cfb_mjx.envs import observation as seen
 from cfb_mjx.envs.observation import Estimate, Layout, Memory
-from cfb_mjx.errors import CfbError
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.rotors import steady_command
@@ -68,17 +67,8 @@ class Task:
         return round(self.episode_s / self.layout.control_dt_s)
 
     def hold(self, model: Quadrotor) -> int:
-        """Simulation steps per command.
-
-        Raises:
-            CfbError: the control step is no multiple of the simulation step.
-        """
-        steps = self.layout.control_dt_s / model.dt
-        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
-            raise CfbError(
-                f"control_dt_s = {self.layout.control_dt_s} is no multiple of the simulation step of {model.dt} s."
-            )
-        return round(steps)
+        """Simulation steps per command; raises as `Quadrotor.steps_per_command`."""
+        return model.steps_per_command(self.layout.control_dt_s)
 
     @property
     def largest_reward(self) -> float:

@@ -4,6 +4,9 @@ One contract for training, simulation and the exported C: `Layout` says what goe
 Order: newest frame, past frames (newest first), past commands (newest first), integral, set-points. A frame is the
 position relative to the target, velocity (world or body axes), the nine entries of the rotation matrix body to world by
 rows (the same for q and -q), and the body rate.
+
+All of it works on one drone, and on many whose axis is the last one of every array: then their numbers are put together
+row by row, where ``vmap`` would put them together drone by drone, which on a CPU takes longer than flying.
 """
 
 from __future__ import annotations
@@ -58,28 +61,28 @@ class Layout:
 class Estimate(eqx.Module):
     """What the state estimator reports."""
 
-    position: Float[Array, "3"]
+    position: Float[Array, "3 *drones"]
     """Position minus target, world, m."""
-    velocity: Float[Array, "3"]
+    velocity: Float[Array, "3 *drones"]
     """World, m/s."""
-    quaternion: Float[Array, "4"]
+    quaternion: Float[Array, "4 *drones"]
     """[w, x, y, z], body to world."""
-    body_rate: Float[Array, "3"]
+    body_rate: Float[Array, "3 *drones"]
     """Body, rad/s."""
 
 
 class Memory(eqx.Module):
     """What the controller keeps between two steps."""
 
-    frames: Float[Array, "estimates frame"]
+    frames: Float[Array, "estimates frame *drones"]
     """Of every control step, shown or not, newest first."""
-    commands: Float[Array, "commands 4"]
+    commands: Float[Array, "commands 4 *drones"]
     """As the observation shows them: 2 u - 1."""
-    integral: Float[Array, "3"]
+    integral: Float[Array, "3 *drones"]
     """Of the relative position, m s."""
 
 
-def rotation_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
+def rotation_matrix(q: Float[Array, "4 *drones"]) -> Float[Array, "3 3 *drones"]:
     """Rotation matrix of a unit quaternion, body to world."""
     w, x, y, z = q
     return jnp.stack(
@@ -91,31 +94,34 @@ def rotation_matrix(q: Float[Array, "4"]) -> Float[Array, "3 3"]:
     )
 
 
-def frame(layout: Layout, estimate: Estimate) -> Float[Array, "frame"]:
+def frame(layout: Layout, estimate: Estimate) -> Float[Array, "frame *drones"]:
     """The numbers of one estimate, scaled."""
-    turn = rotation_matrix(estimate.quaternion)
-    velocity = estimate.velocity @ turn if layout.body_velocity else estimate.velocity
-    parts = [velocity / layout.velocity_scale_mps, turn.reshape(9), estimate.body_rate / layout.rate_scale_radps]
+    turn, velocity = rotation_matrix(estimate.quaternion), estimate.velocity
+    if layout.body_velocity:
+        velocity = jnp.einsum("i...,ij...->j...", velocity, turn)
+    turn = turn.reshape(9, *velocity.shape[1:])
+    parts = [velocity / layout.velocity_scale_mps, turn, estimate.body_rate / layout.rate_scale_radps]
     if layout.position:
         p = estimate.position
         # The square root has no slope at zero; the small number keeps the gradient finite there.
-        distance = jnp.sqrt(jnp.sum(p * p) + 1e-12)
+        distance = jnp.sqrt(jnp.sum(p * p, axis=0) + 1e-12)
         p = p * jnp.minimum(1.0, layout.position_limit_m / distance)
         parts.insert(0, p / layout.position_scale_m)
     return jnp.concatenate(parts)
 
 
-def start(layout: Layout, estimate: Estimate, command: Float[Array, "4"] | float) -> Memory:
+def start(layout: Layout, estimate: Estimate, command: Float[Array, "4 *drones"] | float) -> Memory:
     """Memory of a controller that has seen ``estimate`` and commanded ``command`` [0 to 1] for long."""
     shown = frame(layout, estimate)
-    past = jnp.broadcast_to(2 * jnp.asarray(command, shown.dtype) - 1, (layout.past_commands, 4))
+    drones = shown.shape[1:]
+    past = jnp.broadcast_to(2 * jnp.asarray(command, shown.dtype) - 1, (layout.past_commands, 4, *drones))
     kept = layout.past_estimates * layout.estimate_stride
-    return Memory(jnp.broadcast_to(shown, (kept, layout.frame)), past, jnp.zeros(3, shown.dtype))
+    return Memory(jnp.broadcast_to(shown, (kept, layout.frame, *drones)), past, jnp.zeros((3, *drones), shown.dtype))
 
 
 def observation(
-    layout: Layout, memory: Memory, estimate: Estimate, setpoint: Float[Array, "setpoints"] | None = None
-) -> Float[Array, "size"]:
+    layout: Layout, memory: Memory, estimate: Estimate, setpoint: Float[Array, "setpoints *drones"] | None = None
+) -> Float[Array, "size *drones"]:
     """What the network is given, (``layout.size``,).
 
     Args:
@@ -125,15 +131,17 @@ def observation(
         setpoint: what is asked for, one number for each of ``layout.setpoint_scales``.
     """
     shown = memory.frames[layout.estimate_stride - 1 :: layout.estimate_stride]
-    parts = [frame(layout, estimate), shown.reshape(-1), memory.commands.reshape(-1)]
+    drones = estimate.position.shape[1:]
+    parts = [frame(layout, estimate), shown.reshape(-1, *drones), memory.commands.reshape(-1, *drones)]
     if layout.integral:
         parts.append(memory.integral / layout.integral_limit_ms)
     if layout.setpoint_scales:
-        parts.append(setpoint / jnp.asarray(layout.setpoint_scales, estimate.velocity.dtype))
+        scales = jnp.asarray(layout.setpoint_scales, estimate.velocity.dtype)
+        parts.append(setpoint / scales.reshape(-1, *(1 for _ in drones)))
     return jnp.concatenate(parts)
 
 
-def remember(layout: Layout, memory: Memory, estimate: Estimate, command: Float[Array, "4"]) -> Memory:
+def remember(layout: Layout, memory: Memory, estimate: Estimate, command: Float[Array, "4 *drones"]) -> Memory:
     """Memory after ``command`` [0 to 1] was given on ``estimate``; called once every ``layout.control_dt_s``."""
     frames, commands = memory.frames, memory.commands
     if layout.past_estimates:

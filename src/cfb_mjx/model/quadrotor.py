@@ -75,6 +75,17 @@ class Quadrotor(eqx.Module):
             parameters = effect.change(parameters)
         return parameters
 
+    def steps_per_command(self, control_dt_s: float) -> int:
+        """Simulation steps from one command of a controller to the next.
+
+        Raises:
+            CfbError: its control step is no multiple of the simulation step.
+        """
+        steps = control_dt_s / self.dt
+        if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
+            raise CfbError(f"control_dt_s = {control_dt_s} is no multiple of the simulation step of {self.dt} s.")
+        return round(steps)
+
     def hover_state(self, position=(0.0, 0.0, 1.0)) -> State:
         """Level and motionless at ``position`` [m], rotors carrying the weight (forces of effects not considered)."""
         return begin(self, State.at_rest(position, rotors.hover_rotor_speed(self.changed_parameters())))

@@ -46,14 +46,14 @@ def rollout(
     prepared = prepare(model)
 
     def plain(prepared, state, commands):
-        def fly(components, rows):
-            components = _fly(prepared, components, rows, hold)
+        def some(components, rows):
+            components = fly_rows(prepared, components, rows, hold)
             return components, components
 
         rows = jax.tree.map(lambda x: x.reshape(steps // every, every), Vec.unstack(commands))
-        return jax.lax.scan(fly, _carry(prepared, state, commands), rows)[1]
+        return jax.lax.scan(some, in_components(prepared, state, commands), rows)[1]
 
-    kept = acceleration.fly(plain, _carry, prepared, state, commands, hold=hold, every=every)
+    kept = acceleration.fly(plain, in_components, prepared, state, commands, hold=hold, every=every)
     return stack(kept, prepared.parameters.center_of_gravity)
 
 
@@ -62,10 +62,10 @@ def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 
     prepared = prepare(model)
 
     def plain(prepared, state, commands):
-        fly = fleet.fly if _in_groups(model, hold * commands.shape[0]) else _fly
-        return fly(prepared, _carry(prepared, state, commands), Vec.unstack(commands), hold)
+        fly = fleet.fly if _in_groups(model, hold * commands.shape[0]) else fly_rows
+        return fly(prepared, in_components(prepared, state, commands), Vec.unstack(commands), hold)
 
-    final = acceleration.fly(plain, _carry, prepared, state, commands, hold=hold)
+    final = acceleration.fly(plain, in_components, prepared, state, commands, hold=hold)
     return stack(final, prepared.parameters.center_of_gravity)
 
 
@@ -75,7 +75,8 @@ def _in_groups(model: Quadrotor, steps: int) -> bool:
     return jax.default_backend() == "cpu" and isinstance(model.body, RigidBody) and known and steps >= _MANY
 
 
-def _fly(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Components:
+def fly_rows(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Components:
+    """Advance by all ``rows`` of commands, four arrays (n,), each held for ``hold`` steps."""
     # Reverse mode keeps the state of every step and computes the rest of the step again: what it would keep otherwise
     # costs more to write and read than to compute, and there is twenty times as much of it.
     step = jax.checkpoint(lambda components, row: advance(prepared, components, row), prevent_cse=False)
@@ -91,7 +92,8 @@ def _fly(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Co
     return jax.lax.scan(one, components, rows)[0]
 
 
-def _carry(prepared: Prepared, state: State, commands: Array) -> Components:
+def in_components(prepared: Prepared, state: State, commands: Array) -> Components:
+    """The state in components, ready to be flown."""
     # One precision throughout, or the scan's carry would change type.
     dtype = jnp.result_type(prepared.parameters.mass, state.position, commands)
     components = unstack(begin(prepared.model, state), prepared.parameters.center_of_gravity)

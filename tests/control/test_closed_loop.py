@@ -1,0 +1,202 @@
+"""Closed loops flown together: beside the same loop written out drone by drone, and their derivatives."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cfb_mjx.control import NeuralController, closed_loop, find_pilot, rollout_closed_loop
+from cfb_mjx.envs.observation import Estimate, Layout
+from cfb_mjx.errors import CfbError
+from cfb_mjx.model import MjxBody, Quadrotor, begin
+from cfb_mjx.model.effects import effect_from_mapping
+from cfb_mjx.model.quadrotor import step
+from cfb_mjx.parameters import load_randomisation, sample_parameters
+
+MODEL = Quadrotor.from_file("cfb-guards")
+LAYOUTS = (
+    Layout(),
+    Layout(past_estimates=2, estimate_stride=2, past_commands=3, integral=True, body_velocity=True),
+    Layout(past_estimates=0, past_commands=0, position=False),
+)
+CLOSE = {"rtol": 1e-9, "atol": 1e-11}
+
+
+def controller(layout=LAYOUTS[0], seed=0) -> NeuralController:
+    """Random, with outputs that move."""
+    found = NeuralController.random(jax.random.key(seed), layout, (16, 16))
+    return eqx.tree_at(lambda c: c.network.weights[-1], found, replace_fn=lambda w: 30 * w)
+
+
+def starts(drones, model=MODEL):
+    keys = jax.random.split(jax.random.key(3), 3)
+    hover = model.hover_state((0.0, 0.0, 0.0))
+    states = jax.tree.map(lambda x: jnp.broadcast_to(x, (drones, *x.shape)), hover)
+    tilt = jnp.concatenate([jnp.ones((drones, 1)), 0.2 * jax.random.normal(keys[0], (drones, 3))], axis=1)
+    return eqx.tree_at(
+        lambda s: (s.position, s.velocity, s.quaternion),
+        states,
+        (
+            jax.random.normal(keys[1], (drones, 3)),
+            jax.random.normal(keys[2], (drones, 3)),
+            tilt / jnp.linalg.norm(tilt, axis=1, keepdims=True),
+        ),
+    )
+
+
+def written_out(model, pilot, state, commands, target=(0.0, 0.0, 0.0)):
+    """One drone, the public step after the public command."""
+    hold = round(pilot.control_dt_s / model.dt)
+
+    def seen(at):
+        return Estimate(at.position - jnp.asarray(target), at.velocity, at.quaternion, at.body_rate)
+
+    def one(carry, _):
+        state, memory = carry
+        memory, command = pilot.command(memory, seen(state))
+        for _ in range(hold):
+            state = step(model, state, command)
+        return (state, memory), (state, command)
+
+    state = begin(model, state)
+    return jax.lax.scan(one, (state, pilot.start(seen(state), model.hover_command())), length=commands)[1]
+
+
+def states_of(tree, drone):
+    return jax.tree.map(lambda x: x[drone], tree)
+
+
+def equal(a, b):
+    assert jax.tree.structure(a) == jax.tree.structure(b)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **CLOSE), a, b)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_many_are_each_as_written_out(layout):
+    pilot, states, targets = controller(layout), starts(3), jax.random.normal(jax.random.key(4), (3, 3))
+
+    def fly(state, target):
+        return rollout_closed_loop(MODEL, pilot, state, 6, target=target, every=2)[:2]
+
+    flown = jax.jit(jax.vmap(fly))(states, targets)
+    assert flown[1].shape == (3, 3, 4)
+    wanted = jax.jit(jax.vmap(lambda s, t: written_out(MODEL, pilot, s, 6, t)))(states, targets)
+    wanted = jax.tree.map(lambda x: x[:, 1::2], wanted)
+    equal(flown, wanted)
+    equal(fly(states_of(states, 0), targets[0]), states_of(wanted, 0))
+    # The commands are no constants.
+    assert np.std(flown[1]) > 0.01
+
+
+def drawn(count, model=MODEL):
+    keys, ranges = jax.random.split(jax.random.key(5), count), load_randomisation()
+    return jax.vmap(
+        lambda key: eqx.tree_at(lambda m: m.parameters, model, sample_parameters(key, model.parameters, ranges))
+    )(keys)
+
+
+def test_any_of_the_arguments_may_be_batched_and_batched_again():
+    pilot, states = controller(), starts(4)
+    models, pilots = (
+        drawn(4),
+        jax.vmap(lambda key: NeuralController.random(key, LAYOUTS[0], (8,)))(jax.random.split(jax.random.key(6), 4)),
+    )
+
+    def fly(model, pilot, state):
+        return rollout_closed_loop(model, pilot, state, 3)[:2]
+
+    def alone(model, pilot, state):
+        return written_out(model, pilot, state, 3)
+
+    for axes in ((0, None, 0), (None, 0, None), (0, None, None)):
+        arguments = [
+            batch if axis == 0 else single
+            for axis, batch, single in zip(
+                axes, (models, pilots, states), (MODEL, pilot, states_of(states, 0)), strict=True
+            )
+        ]
+        equal(*(jax.jit(jax.vmap(f, in_axes=axes))(*arguments) for f in (fly, alone)))
+    two = jax.tree.map(lambda x: x[:2], models)
+    pairs = [jax.jit(jax.vmap(jax.vmap(f, (None, None, 0)), (0, None, None)))(two, pilot, states) for f in (fly, alone)]
+    equal(*pairs)
+
+
+def test_more_than_a_group_at_a_time(monkeypatch):
+    pilot, states = controller(), starts(7)
+
+    def fly(state):
+        return rollout_closed_loop(MODEL, pilot, state, 3)
+
+    whole = jax.vmap(fly)(states)
+    monkeypatch.setattr(closed_loop, "AT_ONCE", 3)
+    equal(jax.vmap(fly)(states), whole)
+
+
+@pytest.mark.parametrize("name", ["pid", "mellinger", "target"])
+def test_every_pilot_flies_and_holds_the_target(name):
+    model = Quadrotor.from_file("cfb-guards", dt=0.002)
+    pilot = find_pilot(name, model)
+    commands = round(4.0 / pilot.control_dt_s)
+    target = jnp.array([0.5, 0.2, 1.3])
+    fly = jax.vmap(
+        lambda p: rollout_closed_loop(model, pilot, model.hover_state(p), commands, target=target, every=commands)
+    )
+    flown = jax.jit(fly)(jnp.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]))
+    distance = np.linalg.norm(flown.state.position[:, -1] - target, axis=-1)
+    assert distance.max() < 0.12
+
+
+EFFECTS = (
+    {"name": "command_delay", "parameters": {"delay": 0.006}},
+    {"name": "payload_swing", "parameters": {"mass": 0.004, "length": 0.1}},
+)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"body": MjxBody()}, {"effects": tuple(effect_from_mapping(item, "test") for item in EFFECTS)}]
+)
+def test_other_bodies_and_effects_with_a_memory(changes):
+    model = replace(MODEL, **changes)
+    pilot, states = controller(), starts(2, model)
+    flown = jax.jit(jax.vmap(lambda s: rollout_closed_loop(model, pilot, s, 3)))(states)
+    equal(flown[:2], jax.jit(jax.vmap(lambda s: written_out(model, pilot, s, 3)))(states))
+
+
+def test_going_on_with_the_memory_is_the_same_flight():
+    pilot, state = controller(), states_of(starts(1), 0)
+    whole = rollout_closed_loop(MODEL, pilot, state, 6)
+    first = rollout_closed_loop(MODEL, pilot, state, 2)
+    rest = rollout_closed_loop(MODEL, pilot, jax.tree.map(lambda x: x[-1], first.state), 4, memory=first.memory)
+    equal(jax.tree.map(lambda x: x[2:], whole[:2]), rest[:2])
+    equal(whole.memory, rest.memory)
+
+
+def test_derivatives_are_those_of_differences_in_both_modes():
+    pilot, states = controller(), starts(2)
+
+    def loss(mass, weight):
+        model = eqx.tree_at(lambda m: m.parameters.mass, MODEL, mass)
+        flown = eqx.tree_at(lambda c: c.network.weights[0], pilot, weight * pilot.network.weights[0])
+        end = jax.vmap(lambda s: rollout_closed_loop(model, flown, s, 8, every=8).state.position[-1])(states)
+        return jnp.sum(end**2)
+
+    at, step = (MODEL.parameters.mass, jnp.array(1.0)), 1e-5
+    reverse = jax.grad(loss, argnums=(0, 1))(*at)
+    forward = jax.jacfwd(loss, argnums=(0, 1))(*at)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
+    for i in (0, 1):
+        up, down = (loss(*(x * (1 + s * step) if j == i else x for j, x in enumerate(at))) for s in (1, -1))
+        np.testing.assert_allclose(reverse[i], (up - down) / (2 * step * at[i]), rtol=1e-5)
+
+
+def test_what_cannot_be_flown_is_refused():
+    state = MODEL.hover_state()
+    with pytest.raises(CfbError, match="no multiple of the simulation step"):
+        rollout_closed_loop(MODEL, find_pilot("pid", MODEL), state, 3)
+    with pytest.raises(ValueError, match="cannot be kept every 2"):
+        rollout_closed_loop(MODEL, controller(), state, 3, every=2)
+    with pytest.raises(ValueError, match="set-points"):
+        rollout_closed_loop(MODEL, controller(Layout(setpoint_scales=(1.0,))), state, 3)
