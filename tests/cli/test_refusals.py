@@ -11,6 +11,8 @@ import numpy as np
 import pyarrow.csv
 import pytest
 
+from cfb_mjx.cli.interrupts import held_back
+
 CFB = str(Path(sys.executable).with_name("cfb"))
 
 
@@ -153,6 +155,19 @@ def test_a_full_disk_costs_nothing(files, tmp_path):
 def test_a_folder_without_permission(cfb, files, tmp_path):
     tmp_path.chmod(0o500)
     refused(cfb("import", files / "flight.csv", "-o", tmp_path / "out.mcap"), "out.mcap")
+
+
+def test_ctrl_c_waits_until_jaxlib_is_loaded():
+    after = []
+
+    def load():
+        with held_back():
+            signal.raise_signal(signal.SIGINT)
+            after.append("loaded")
+
+    pytest.raises(KeyboardInterrupt, load)
+    assert after == ["loaded"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_ctrl_c_leaves_earlier_results(files, tmp_path):

@@ -9,6 +9,8 @@ from datetime import date
 from importlib import metadata
 from pathlib import Path
 
+from cfb_mjx.cli.interrupts import held_back
+
 XLA_CPU_FLAGS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
 """On CPU a time step then becomes a few kernels that share what they compute, instead of some thirty that repeat it:
 up to 4 times faster; nothing changes elsewhere. XLA reads it when jax starts its first backend, so the commands set it
@@ -29,7 +31,8 @@ def configure_jax(x64: bool, devices: int = 1) -> None:
     set_up_xla()
     if devices > 1 and _CPU_DEVICES not in os.environ["XLA_FLAGS"]:
         os.environ["XLA_FLAGS"] += f" --{_CPU_DEVICES}={devices}"
-    import jax
+    with held_back():
+        import jax
 
     jax.config.update("jax_enable_x64", x64)
     # Tensor-core formats round inputs to 10 bits: enough to change a trained policy.
