@@ -165,7 +165,8 @@ def test_ctrl_c_waits_until_jaxlib_is_loaded():
             signal.raise_signal(signal.SIGINT)
             after.append("loaded")
 
-    pytest.raises(KeyboardInterrupt, load)
+    with pytest.raises(KeyboardInterrupt):
+        load()
     assert after == ["loaded"]
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 

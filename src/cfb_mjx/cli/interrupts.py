@@ -37,7 +37,7 @@ def heard() -> Iterator[None]:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Let a Ctrl-C wait for the end of this block, which should be short: while jaxlib is loaded it would be a crash."""
+    """Let a Ctrl-C wait for the end of this block, which should be short: while jaxlib loads it would crash."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
