@@ -21,7 +21,7 @@ from cfb_mjx.model.acceleration import using
 from cfb_mjx.model.effects.formula import ResidualFormula
 from cfb_mjx.model.kernel import Tuning
 from cfb_mjx.model.quadrotor import prepare
-from cfb_mjx.model.rollout import _carry, _fly
+from cfb_mjx.model.rollout import fly_rows, in_components
 from cfb_mjx.model.state import stack
 from cfb_mjx.model.vector import Vec
 
@@ -261,7 +261,7 @@ def test_what_the_kernel_cannot_do_stays_plain(model, flight, monkeypatch):
 
 def _begun(model, state, commands):
     prepared = prepare(model)
-    return prepared, jax.eval_shape(_carry, prepared, state, commands)
+    return prepared, jax.eval_shape(in_components, prepared, state, commands)
 
 
 def test_nothing_changes_on_a_cpu(model, flight):
@@ -269,18 +269,18 @@ def test_nothing_changes_on_a_cpu(model, flight):
 
     def before(model, state, commands):
         prepared = prepare(model)
-        final = fleet.fly(prepared, _carry(prepared, state, commands), Vec.unstack(commands), 2)
+        final = fleet.fly(model, in_components(prepared, state, commands), Vec.unstack(commands), 2)
         return stack(final, prepared.parameters.center_of_gravity)
 
     def before_kept(model, state, commands):
         prepared = prepare(model)
 
         def fly(components, rows):
-            components = _fly(prepared, components, rows, 2)
+            components = fly_rows(prepared, components, rows, 2)
             return components, components
 
         rows = jax.tree.map(lambda x: x.reshape(3, 4), Vec.unstack(commands))
-        _, kept = jax.lax.scan(fly, _carry(prepared, state, commands), rows)
+        _, kept = jax.lax.scan(fly, in_components(prepared, state, commands), rows)
         return stack(kept, prepared.parameters.center_of_gravity)
 
     now = functools.partial(rollout_final, hold=2), functools.partial(rollout, hold=2, every=4)

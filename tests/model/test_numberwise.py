@@ -24,8 +24,9 @@ def _moves(a, b):
     stacked = jnp.stack([a[0], b], axis=1)
     joined = jnp.concatenate([a.reshape(-1), b, c])[1::2]
     turned = jax.lax.optimization_barrier((a.T, b))
+    sums = [jnp.sum(a), jnp.sum(a, axis=0), jnp.sum(a[:, None] * a, axis=(0, 2))]
     chosen = jax.jit(lambda x: jax.jit(jnp.clip)(x, 0.0, 2.0))(turned[0])
-    return [stacked, joined, chosen + turned[1][:, None], jnp.squeeze(a[:1], 0), jnp.float32(7.0) + 0 * b[0]]
+    return [stacked, joined, chosen + turned[1][:, None], jnp.squeeze(a[:1], 0), jnp.float32(7.0) + 0 * b[0], *sums]
 
 
 def test_arrays_taken_apart_give_the_same():
@@ -45,6 +46,13 @@ def test_a_number_may_stand_for_many():
     columns[:] = [a[:, 0], a[:, 1]]
     ((result,),) = (x.reshape(1) for x in program(columns, _apart(np.float32(2.0))))
     np.testing.assert_array_equal(result, 2 * a[:, 0] + a[:, 1])
+
+
+def test_what_depends_on_what():
+    program = numberwise.trace(lambda a, b, c: [a + b, jnp.sin(c), jnp.float32(1.0)], *[jnp.float32(2.0)] * 3)
+    assert numberwise.changed_by(program, [1]) == [True, False, False]
+    assert numberwise.changed_by(program, [0, 2]) == [True, True, False]
+    assert numberwise.used(lambda x: [x[0] * x[2], jnp.cos(x[1])][:1], [1.0, 2.0, 3.0]) == [True, False, True]
 
 
 @pytest.mark.parametrize("function", [jnp.sort, jnp.cumsum, lambda x: jax.jit(jnp.sort)(x)])

@@ -37,19 +37,31 @@ def _slice(array: np.ndarray, start_indices, limit_indices, strides) -> np.ndarr
     return array[tuple(slice(*which) for which in zip(start_indices, limit_indices, strides, strict=True))]
 
 
+def _sum(array: np.ndarray, axes, **_) -> np.ndarray:
+    first = np.moveaxis(array, axes, range(len(axes)))
+    kept = first.shape[len(axes) :]
+    # One row stays a row: NumPy would take the sum of all numbers out of its array.
+    rows = first.reshape(-1, 1, *kept)
+    total = rows[0]
+    for row in rows[1:]:
+        total = total + row
+    return total.reshape(kept)
+
+
 MOVES: dict[str, Callable[..., np.ndarray]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda *arrays, dimension: np.concatenate(arrays, axis=dimension),
     "copy": lambda array: array,
     # Barriers keep XLA from computing things twice; a kernel's compiler finds common parts by itself.
     "optimization_barrier": lambda *arrays: arrays,
+    "reduce_sum": _sum,
     "reshape": lambda array, new_sizes, **_: array.reshape(new_sizes),
     "slice": _slice,
     "squeeze": lambda array, dimensions: array.squeeze(dimensions),
     "stack": lambda *arrays, axis: np.stack(arrays, axis=axis),
     "transpose": lambda array, permutation: array.transpose(permutation),
 }
-"""Operations that only move numbers about, on arrays of objects."""
+"""Operations that move numbers about, or add them up, on arrays of objects."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +89,23 @@ def trace(function: Callable, *examples) -> Program | None:
         return None
     needed = _needed(traced.jaxpr)[1]
     return Program(traced, tuple(v in needed for v in traced.jaxpr.invars))
+
+
+def changed_by(program: Program, moved: Sequence[int]) -> list[bool]:
+    """Which results may change with these arguments."""
+    jaxpr = program.traced.jaxpr
+    touched = {jaxpr.invars[i] for i in moved}
+    for equation in jaxpr.eqns:
+        if any(v in touched for v in equation.invars if not isinstance(v, Literal)):
+            touched.update(equation.outvars)
+    return [not isinstance(v, Literal) and v in touched for v in jaxpr.outvars]
+
+
+def used(function: Callable, arguments: Sequence) -> list[bool]:
+    """Which of a list of arrays a function of that list depends on."""
+    jaxpr = jax.make_jaxpr(lambda *arguments: function(list(arguments)))(*arguments).jaxpr
+    needed = _needed(jaxpr)[1]
+    return [v in needed for v in jaxpr.invars]
 
 
 def _inner(equation) -> ClosedJaxpr:

@@ -62,8 +62,10 @@ def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 
     prepared = prepare(model)
 
     def plain(prepared, state, commands):
-        fly = fleet.fly if _in_groups(model, hold * commands.shape[0]) else fly_rows
-        return fly(prepared, in_components(prepared, state, commands), Vec.unstack(commands), hold)
+        start, rows = in_components(prepared, state, commands), Vec.unstack(commands)
+        if _in_groups(model, hold * commands.shape[0]):
+            return fleet.fly(prepared.model, start, rows, hold)
+        return fly_rows(prepared, start, rows, hold)
 
     final = acceleration.fly(plain, in_components, prepared, state, commands, hold=hold)
     return stack(final, prepared.parameters.center_of_gravity)
