@@ -10,8 +10,11 @@ from pathlib import Path
 import jax
 
 from cfb_mjx.cli import workloads
-from cfb_mjx.cli.runtime import environment
+from cfb_mjx.cli.first_call import first_call
+from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.cli.scaling import scaling
 from cfb_mjx.cli.timed_process import TimedProcess
+from cfb_mjx.devices import Devices
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json, write_text
 from cfb_mjx.model.acceleration import kernel_is_chosen
@@ -60,25 +63,32 @@ def run_bench(
     if not drones or min(drones) < 1:
         raise CfbError("--drones must be whole numbers from 1.")
     require_folder(json, markdown)
+    # A CPU shows itself as one device per core, where the backend has not started yet.
+    configure_jax(x64=False, devices=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
     # A program from the cache would make compile time look like nothing.
     jax.config.update("jax_enable_compilation_cache", False)
     repetitions = 2 if quick else 7
     rows, peers = [], []
-    print(f"{'what':<20}{'body':<12}{'drones':>7}{'steps/s':>12}{'compile s':>11}{'memory MB':>11}")
+    print(f"{'what':<20}{'body':<18}{'drones':>7}{'steps/s':>12}{'compile s':>11}{'memory MB':>11}")
     for count in drones:
         group = [workloads.rollout(count), workloads.rollout_randomised(count)]
         group += [workloads.rollout(count, "rigid-plain")] if kernel_is_chosen() else []
         peer = Peer(peer_python, count) if peer_python is not None else None
         group += [peer] if peer else []
+        over = Devices.take(jax.local_device_count())
+        several = over.several and count >= 64 and count % over.count == 0
+        group += [workloads.rollout(count, over=over)] if several else []
         times = _alternate(group, repetitions)
         if not quick:
             slow = [workloads.rollout(count, "mjx"), workloads.rollout(count, "mjx-floor"), workloads.stock_mjx(count)]
             slow.append(workloads.rollout_policy(count))
+            slow += [workloads.rollout_policy(count, over)] if several else []
             if peer:
                 with tempfile.TemporaryDirectory() as folder:
                     slow.append(Peer(peer_python, count, workloads.network_file(Path(folder))))
             if count <= 8192:
                 slow += [workloads.rollout_gradient(count), workloads.rollout_ten(count)]
+                slow.append(workloads.rollout_hundred(count))
             times += _alternate(slow, 5)
             group += slow
         for item, seconds in zip(group, times, strict=True):
@@ -88,7 +98,7 @@ def run_bench(
                     | {"steps_per_s": count * item.steps / seconds, "compile_s": item.compile_s}
                 )
                 print(
-                    f"{item.what:<20}{item.name:<12}{count:>7}{peers[-1]['steps_per_s']:>12.3g}{item.compile_s:>11.2f}"
+                    f"{item.what:<20}{item.name:<18}{count:>7}{peers[-1]['steps_per_s']:>12.3g}{item.compile_s:>11.2f}"
                 )
                 item.close()
                 continue
@@ -96,11 +106,12 @@ def run_bench(
             row |= {"compile_s": item.compile_s, "peak_mb": item.peak_mb}
             rows.append(row)
             print(
-                f"{item.what:<20}{item.body:<12}{count:>7}{row['steps_per_s']:>12.3g}"
+                f"{item.what:<20}{item.body:<18}{count:>7}{row['steps_per_s']:>12.3g}"
                 f"{item.compile_s:>11.2f}{item.peak_mb:>11.1f}",
                 flush=True,
             )
     result = {"rows": rows, "peers": peers, "environment": environment()}
+    result |= {"first_call": first_call()} | ({} if quick else {"scaling": scaling()})
     if roofline:
         from cfb_mjx.cli.roofline import roofline as measure
         from cfb_mjx.cli.roofline import section
@@ -131,6 +142,15 @@ def _speed(result: dict, what: str, body: str, drones: int) -> float | None:
     return None
 
 
+def _on_devices(result: dict, what: str, drones: int) -> list[tuple[int, float]]:
+    """Number of devices and speed of every row that was measured on several."""
+    return [
+        (int(row["body"].split()[1]), row["steps_per_s"])
+        for row in result["rows"]
+        if (row["what"], row["drones"]) == (what, drones) and row["body"].startswith("rigid, ")
+    ]
+
+
 def ratios(result: dict) -> list[str]:
     """Side-by-side sentences for every batch size."""
     lines = []
@@ -140,9 +160,13 @@ def ratios(result: dict) -> list[str]:
             if peer["drones"] == drones:
                 speed = _speed(result, peer["what"], "rigid", drones) / peer["steps_per_s"]
                 what = "closed form" if peer["what"] == "rollout" else "the same network in the loop"
-                lines.append(f"{drones} drones: {what} {speed:.1f} x {peer['name']} {peer['version']}")
+                line = f"{drones} drones: {what} {speed:.1f} x {peer['name']} {peer['version']}"
+                for n, several in _on_devices(result, peer["what"], drones):
+                    line += f"; on {n} devices {several / peer['steps_per_s']:.1f} x"
+                lines.append(line)
         if ten := _speed(result, "rollout_ten", "rigid", drones):
-            lines.append(f"{drones} drones: a gradient by ten parameters costs {ours / ten:.1f} x the rollout")
+            forward = _speed(result, "rollout_hundred", "rigid", drones)
+            lines.append(f"{drones} drones: a gradient by ten parameters costs {forward / ten:.1f} x the same rollout")
         if plain := _speed(result, "rollout", "rigid-plain", drones):
             lines.append(f"{drones} drones: the kernel {ours / plain:.2f} x the plain program")
         free, floor, stock = (_speed(result, "rollout", b, drones) for b in ("mjx", "mjx-floor", "mjx-stock"))
@@ -179,18 +203,53 @@ Written by `make bench` (`cfb bench --peer-python ... --markdown docs/performanc
 Steps per second of all drones together, float32; the best of several runs that take turns with the peer's.
 `rollout`: open loop, {workloads.STEPS} steps of 4 ms (MJX fewer), one command held per drone, final state only.
 `rollout_randomised`: the same, every drone with its own parameters. `rollout_gradient`: reverse-mode gradient of a
-100-step rollout with respect to all parameters, `rollout_ten` with respect to ten. `rollout_policy`: the shipped policy
-`target` in the loop, a command every 8 ms. Bodies: `rigid` closed form; `mjx` MuJoCo XLA without contact;
+100-step rollout with respect to all parameters, `rollout_ten` with respect to ten, `rollout_hundred` that rollout
+alone. `rollout_policy`: the shipped policy `target` in the loop (`rollout_closed_loop`), a command every 8 ms. Bodies:
+`rigid` closed form, on one JAX device (which is one core) or several; `mjx` MuJoCo XLA without contact;
 `mjx-floor` with floor contact; `mjx-stock` plain `mjx.step` on the same MJCF without contact. crazyflow runs
 first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`, and with the same network in its loop
-at 250 Hz, a command every 8 ms, in a process with XLA's default options; ours runs with the option the `cfb` command
-sets for itself on CPU ([model.md](model.md#speed)): `XLA_FLAGS={os.environ.get("XLA_FLAGS", "")}`.
-Memory is the compiled program's
-arguments, results and temporaries.
+at 250 Hz, a command every 8 ms, in a process with XLA's default options and on the one device it uses; ours runs with
+the option the `cfb` command sets for itself on CPU ([model.md](model.md#speed)): `XLA_FLAGS={os.environ.get("XLA_FLAGS", "")}`.
+Memory is the compiled program's arguments, results and temporaries.
 
 {comparison}
 
 {gpu}
 {chr(10).join(table)}
 
+{first_call_section(result["first_call"])}
+{scaling_section(result.get("scaling"))}
 {section(result["roofline"]) if "roofline" in result else ""}"""
+
+
+def first_call_section(rows: list[dict]) -> str:
+    """Markdown."""
+    lines = "\n".join(f"| {row['cache']} | {row['import_s']:.1f} | {row['call_s']:.1f} |" for row in rows)
+    return f"""## The first call
+
+A new process flies 4096 drones for half a second, as the `cfb` command would: loading the library, and from there to
+the result. The cache of compiled programs is on by default, in the user's cache folder.
+
+| cache | loading, s | first call, s |
+|---|---:|---:|
+{lines}
+"""
+
+
+def scaling_section(rows: list[dict] | None) -> str:
+    """Markdown; nothing where it was not measured."""
+    if not rows:
+        return ""
+    lines = "\n".join(
+        f"| {row['what']} | {row['drones']} | {row['devices']} | {row['steps_per_s']:.3g} | {row['ratio']:.2f} |"
+        for row in rows
+    )
+    return f"""## From one core to two
+
+One device in a process bound to one core, and two devices in one bound to two; the runs take turns, the best counts.
+`ppo`: one update with the shipped configuration.
+
+| what | drones | devices | steps/s | times one |
+|---|---:|---:|---:|---:|
+{lines}
+"""

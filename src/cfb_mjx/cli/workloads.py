@@ -17,6 +17,7 @@ from jaxtyping import Array
 
 from cfb_mjx.control.closed_loop import rollout_closed_loop
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.devices import Devices
 from cfb_mjx.files import shipped
 from cfb_mjx.model import MjxBody, Quadrotor, rollout_final
 from cfb_mjx.model.acceleration import using
@@ -50,7 +51,14 @@ class Workload:
         return time.perf_counter() - begin
 
 
-def _compile(what: str, body: str, drones: int, steps: int, function, *arguments) -> Workload:
+def _compile(
+    what: str, body: str, drones: int, steps: int, function, *arguments, over: Devices | None = None
+) -> Workload:
+    """With ``over``, what comes after the first argument is divided over these devices."""
+    if over is not None:
+        function = over.divided(function, (None, *[0] * (len(arguments) - 1)), 0)
+        arguments = (over.whole(arguments[0]), *over.along(arguments[1:]))
+        body = f"{body}, {over.count} devices"
     begin = time.perf_counter()
     compiled = jax.jit(function).lower(*arguments).compile()
     compile_s = time.perf_counter() - begin
@@ -72,8 +80,11 @@ def _start(model: Quadrotor, drones: int):
     return states, commands
 
 
-def rollout(drones: int, body: str = "rigid") -> Workload:
-    """Open loop, one command held per drone, final state only: what crazyflow's ``sim.step(n)`` does."""
+def rollout(drones: int, body: str = "rigid", over: Devices | None = None) -> Workload:
+    """Open loop, one command held per drone, final state only: what crazyflow's ``sim.step(n)`` does.
+
+    With ``over`` the drones are divided over several devices.
+    """
     mjx_floor = {"mjx": False, "mjx-floor": True}
     choices = {"body": MjxBody(floor=mjx_floor[body])} if body in mjx_floor else {}
     model = Quadrotor.from_file("cfb-guards", **choices)
@@ -82,7 +93,7 @@ def rollout(drones: int, body: str = "rigid") -> Workload:
     fly = jax.vmap(lambda m, s, u: rollout_final(m, s, u, hold=steps), in_axes=(None, 0, 0))
     # Beside the kernel that a GPU gets, the program it would have got without.
     with using("plain") if body == "rigid-plain" else contextlib.nullcontext():
-        return _compile("rollout", body, drones, steps, fly, model, states, commands)
+        return _compile("rollout", body, drones, steps, fly, model, states, commands, over=over)
 
 
 def rollout_randomised(drones: int) -> Workload:
@@ -114,8 +125,11 @@ def _distance(model: Quadrotor, states: State, commands: Array) -> Array:
     return jnp.mean(jnp.sum(final.position**2, axis=-1))
 
 
-def rollout_policy(drones: int) -> Workload:
-    """Closed loop: the shipped policy `target` commands every 8 ms on the true state, two steps of 4 ms each."""
+def rollout_policy(drones: int, over: Devices | None = None) -> Workload:
+    """Closed loop: the shipped policy `target` commands every 8 ms on the true state, two steps of 4 ms each.
+
+    With ``over`` the drones are divided over several devices.
+    """
     model = Quadrotor.from_file("cfb-guards")
     controller = load_policy(shipped_policies()["target"]).controller
     states, _ = _start(model, drones)
@@ -128,7 +142,7 @@ def rollout_policy(drones: int) -> Workload:
         return jax.tree.map(lambda x: x[-1], flown.state)
 
     together = jax.vmap(fly, in_axes=(None, 0))
-    return _compile("rollout_policy", "rigid", drones, 2 * commands, together, model, states)
+    return _compile("rollout_policy", "rigid", drones, 2 * commands, together, model, states, over=over)
 
 
 def network_file(folder: Path) -> Path:
@@ -142,8 +156,19 @@ def network_file(folder: Path) -> Path:
 
 def rollout_ten(drones: int) -> Workload:
     """As `rollout_gradient`, with respect to ten parameters only."""
+    states, commands, loss = _of_ten_parameters(drones)
+    return _compile("rollout_ten", "rigid", drones, 100, jax.grad(loss), jnp.ones(10), states, commands)
+
+
+def rollout_hundred(drones: int) -> Workload:
+    """The loss that `rollout_ten` differentiates, alone."""
+    states, commands, loss = _of_ten_parameters(drones)
+    return _compile("rollout_hundred", "rigid", drones, 100, loss, jnp.ones(10), states, commands)
+
+
+def _of_ten_parameters(drones: int):
+    """States, commands, and the loss as a function of ten factors of parameters and of them."""
     model = Quadrotor.from_file("cfb-guards")
-    states, commands = _start(model, drones)
     names = ("mass", "inertia", "rotor_inertia", "motor_time_constant", "motor_gain", "thrust_scale", "torque_scale")
 
     def changed(x):
@@ -154,8 +179,7 @@ def rollout_ten(drones: int) -> Workload:
         spacing = parameters.rotor_spacing * x[9]
         return eqx.tree_at(lambda m: m.parameters, model, eqx.tree_at(lambda p: p.rotor_spacing, parameters, spacing))
 
-    gradient = jax.grad(lambda x, s, u: _distance(changed(x), s, u))
-    return _compile("rollout_ten", "rigid", drones, 100, gradient, jnp.ones(10), states, commands)
+    return *_start(model, drones), lambda x, s, u: _distance(changed(x), s, u)
 
 
 def fit_jacobian() -> Workload:

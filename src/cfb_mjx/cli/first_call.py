@@ -1,0 +1,52 @@
+"""How long a user waits for the first rollout of a new process, with nothing compiled before and with everything."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from typing import Any
+
+DRONES = 4096
+
+
+def first_call() -> list[dict[str, Any]]:
+    """Rows with ``cache`` (empty, or filled by the row before), ``import_s`` and ``call_s``.
+
+    Each is a process of its own, its compile cache in a temporary folder.
+    """
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for cache in ("empty", "filled"):
+            done = subprocess.run(
+                [sys.executable, "-m", "cfb_mjx.cli.first_call", folder], capture_output=True, text=True, check=True
+            )
+            import_s, call_s = map(float, done.stdout.split())
+            rows.append({"cache": cache, "import_s": import_s, "call_s": call_s})
+    return rows
+
+
+def _measure(cache: str) -> None:
+    begin = time.perf_counter()
+    import os
+
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
+    from cfb_mjx.cli.runtime import configure_jax
+
+    configure_jax(x64=False)
+    import jax
+    import jax.numpy as jnp
+
+    from cfb_mjx.model import Quadrotor, rollout_final
+
+    imported = time.perf_counter()
+    model = Quadrotor.from_file("cfb-guards")
+    commands = model.hover_command() * jnp.linspace(0.99, 1.01, DRONES)[:, None, None] * jnp.ones((125, 1))
+    fly = jax.jit(jax.vmap(rollout_final, in_axes=(None, None, 0)))
+    jax.block_until_ready(fly(model, model.hover_state(), commands))
+    print(imported - begin, time.perf_counter() - imported)
+
+
+if __name__ == "__main__":
+    _measure(sys.argv[1])
