@@ -209,7 +209,8 @@ alone. `rollout_policy`: the shipped policy `target` in the loop (`rollout_close
 `mjx-floor` with floor contact; `mjx-stock` plain `mjx.step` on the same MJCF without contact. crazyflow runs
 first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`, and with the same network in its loop
 at 250 Hz, a command every 8 ms, in a process with XLA's default options and on the one device it uses; ours runs with
-the option the `cfb` command sets for itself on CPU ([model.md](model.md#speed)): `XLA_FLAGS={os.environ.get("XLA_FLAGS", "")}`.
+the option the `cfb` command sets for itself on CPU ([model.md](model.md#speed)):
+`XLA_FLAGS={os.environ.get("XLA_FLAGS", "")}`.
 Memory is the compiled program's arguments, results and temporaries.
 
 {comparison}
