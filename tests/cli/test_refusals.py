@@ -157,7 +157,15 @@ def test_a_folder_without_permission(cfb, files, tmp_path):
     refused(cfb("import", files / "flight.csv", "-o", tmp_path / "out.mcap"), "out.mcap")
 
 
-def test_ctrl_c_waits_until_jaxlib_is_loaded():
+@pytest.fixture
+def ctrl_c():
+    """Heard, also where the tests themselves were started with it ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_waits_until_jaxlib_is_loaded(ctrl_c):
     after = []
 
     def load():

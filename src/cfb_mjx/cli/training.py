@@ -38,52 +38,39 @@ def run_train(
     require_no_file(output)
     goes_on = f"what was saved in {output} is intact: start every process again with --resume to go on from there."
     with joined(hosts, goes_on):
-        _train(task, config, output, changes, choices, start, resume, force, devices)
+        configure_jax(x64=False, devices=devices)
+        from cfb_mjx.hosts import first
+        from cfb_mjx.train.config import load_config, with_changes
+        from cfb_mjx.train.run import POLICY, Training, train
+        from cfb_mjx.view.learning import learning_figure
 
-
-def _train(
-    task: str,
-    config: str | None,
-    output: Path,
-    changes: tuple[str, ...],
-    choices: dict,
-    start: Path | None,
-    resume: bool,
-    force: bool,
-    devices: int,
-) -> None:
-    configure_jax(x64=False, devices=devices)
-    from cfb_mjx.hosts import first
-    from cfb_mjx.train.config import load_config, with_changes
-    from cfb_mjx.train.run import POLICY, Training, train
-    from cfb_mjx.view.learning import learning_figure
-
-    settings = with_changes(load_config(config or task, changes), **choices)
-    if settings.task != task:
-        raise CfbError(f"--config {config}: trains {settings.task}, not {task}.")
-    if settings.body == "mjx" and settings.algorithm == "analytic":
-        differentiate_mjx()
-    facts = environment()
-    versions = {name: facts[name] for name in ("cfb_mjx", "jax", "jaxlib", "python")}
-    training = Training.prepare(settings, versions, start, force)
-    if first():
-        say(f"{settings.algorithm} on {training.described.name}, randomisation x {settings.randomisation.magnitude:g}")
-    bar = Progress("training")
-
-    def advanced(done: int, total: int, rate: float, left: float) -> None:
+        settings = with_changes(load_config(config or task, changes), **choices)
+        if settings.task != task:
+            raise CfbError(f"--config {config}: trains {settings.task}, not {task}.")
+        if settings.body == "mjx" and settings.algorithm == "analytic":
+            differentiate_mjx()
+        facts = environment()
+        versions = {name: facts[name] for name in ("cfb_mjx", "jax", "jaxlib", "python")}
+        training = Training.prepare(settings, versions, start, force)
         if first():
-            bar(done, total, f"{rate / 1e3:.0f} k commands/s, {_clock(left)} left")
+            where = f"{training.described.name}, randomisation x {settings.randomisation.magnitude:g}"
+            say(f"{settings.algorithm} on {where}")
+        bar = Progress("training")
 
-    def reported(row: dict) -> None:
-        judged = "".join(f", {label} {row[key]:.3g}{unit}" for key, label, unit in _JUDGED if key in row)
-        say(f"{_clock(row['seconds'])}: {row['commands'] / 1e6:.3g} M commands, loss {row['loss']:.3g}{judged}")
+        def advanced(done: int, total: int, rate: float, left: float) -> None:
+            if first():
+                bar(done, total, f"{rate / 1e3:.0f} k commands/s, {_clock(left)} left")
 
-    rows = train(training, output, resume, advanced, reported, devices=devices)
-    if not first():
-        return
-    learning_figure(rows, output / "curve.png", f"{settings.algorithm}, {training.described.name}")
-    write_json(output / NEWEST, {"environment": facts, "last": rows[-1]})
-    print(f"policy: {output / POLICY}\nlearning curve: {output / 'curve.csv'}, {output / 'curve.png'}")
+        def reported(row: dict) -> None:
+            judged = "".join(f", {label} {row[key]:.3g}{unit}" for key, label, unit in _JUDGED if key in row)
+            say(f"{_clock(row['seconds'])}: {row['commands'] / 1e6:.3g} M commands, loss {row['loss']:.3g}{judged}")
+
+        rows = train(training, output, resume, advanced, reported, devices=devices)
+        if not first():
+            return
+        learning_figure(rows, output / "curve.png", f"{settings.algorithm}, {training.described.name}")
+        write_json(output / NEWEST, {"environment": facts, "last": rows[-1]})
+        print(f"policy: {output / POLICY}\nlearning curve: {output / 'curve.csv'}, {output / 'curve.png'}")
 
 
 def _clock(seconds: float) -> str:
