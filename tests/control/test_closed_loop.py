@@ -1,8 +1,10 @@
 """Closed loops flown together: beside the same loop written out drone by drone, and their derivatives."""
 
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
+import helpers
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +19,7 @@ from cfb_mjx.model.quadrotor import step
 from cfb_mjx.parameters import load_randomisation, sample_parameters
 
 MODEL = Quadrotor.from_file("cfb-guards")
+quick = partial(jax.jit, compiler_options=helpers.QUICK_COMPILE)
 LAYOUTS = (
     Layout(),
     Layout(past_estimates=2, estimate_stride=2, past_commands=3, integral=True, body_velocity=True),
@@ -81,9 +84,9 @@ def test_many_are_each_as_written_out(layout):
     def fly(state, target):
         return rollout_closed_loop(MODEL, pilot, state, 6, target=target, every=2)[:2]
 
-    flown = jax.jit(jax.vmap(fly))(states, targets)
+    flown = quick(jax.vmap(fly))(states, targets)
     assert flown[1].shape == (3, 3, 4)
-    wanted = jax.jit(jax.vmap(lambda s, t: written_out(MODEL, pilot, s, 6, t)))(states, targets)
+    wanted = quick(jax.vmap(lambda s, t: written_out(MODEL, pilot, s, 6, t)))(states, targets)
     wanted = jax.tree.map(lambda x: x[:, 1::2], wanted)
     equal(flown, wanted)
     equal(fly(states_of(states, 0), targets[0]), states_of(wanted, 0))
@@ -118,9 +121,9 @@ def test_any_of_the_arguments_may_be_batched_and_batched_again():
                 axes, (models, pilots, states), (MODEL, pilot, states_of(states, 0)), strict=True
             )
         ]
-        equal(*(jax.jit(jax.vmap(f, in_axes=axes))(*arguments) for f in (fly, alone)))
+        equal(*(quick(jax.vmap(f, in_axes=axes))(*arguments) for f in (fly, alone)))
     two = jax.tree.map(lambda x: x[:2], models)
-    pairs = [jax.jit(jax.vmap(jax.vmap(f, (None, None, 0)), (0, None, None)))(two, pilot, states) for f in (fly, alone)]
+    pairs = [quick(jax.vmap(jax.vmap(f, (None, None, 0)), (0, None, None)))(two, pilot, states) for f in (fly, alone)]
     equal(*pairs)
 
 
@@ -130,9 +133,10 @@ def test_more_than_a_group_at_a_time(monkeypatch):
     def fly(state):
         return rollout_closed_loop(MODEL, pilot, state, 3)
 
-    whole = jax.vmap(fly)(states)
+    whole = quick(jax.vmap(fly))(states)
     monkeypatch.setattr(closed_loop, "AT_ONCE", 3)
-    equal(jax.vmap(fly)(states), whole)
+    # A function of its own: the one above would come from the cache of traces.
+    equal(quick(jax.vmap(lambda state: fly(state)))(states), whole)
 
 
 @pytest.mark.parametrize("name", ["pid", "mellinger", "target"])
@@ -144,7 +148,7 @@ def test_every_pilot_flies_and_holds_the_target(name):
     fly = jax.vmap(
         lambda p: rollout_closed_loop(model, pilot, model.hover_state(p), commands, target=target, every=commands)
     )
-    flown = jax.jit(fly)(jnp.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]))
+    flown = quick(fly)(jnp.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]))
     distance = np.linalg.norm(flown.state.position[:, -1] - target, axis=-1)
     assert distance.max() < 0.12
 
@@ -161,8 +165,8 @@ EFFECTS = (
 def test_other_bodies_and_effects_with_a_memory(changes):
     model = replace(MODEL, **changes)
     pilot, states = controller(), starts(2, model)
-    flown = jax.jit(jax.vmap(lambda s: rollout_closed_loop(model, pilot, s, 3)))(states)
-    equal(flown[:2], jax.jit(jax.vmap(lambda s: written_out(model, pilot, s, 3)))(states))
+    flown = quick(jax.vmap(lambda s: rollout_closed_loop(model, pilot, s, 3)))(states)
+    equal(flown[:2], quick(jax.vmap(lambda s: written_out(model, pilot, s, 3)))(states))
 
 
 def test_going_on_with_the_memory_is_the_same_flight():
@@ -184,8 +188,9 @@ def test_derivatives_are_those_of_differences_in_both_modes():
         return jnp.sum(end**2)
 
     at, step = (MODEL.parameters.mass, jnp.array(1.0)), 1e-5
-    reverse = jax.grad(loss, argnums=(0, 1))(*at)
-    forward = jax.jacfwd(loss, argnums=(0, 1))(*at)
+    reverse = quick(jax.grad(loss, argnums=(0, 1)))(*at)
+    forward = quick(jax.jacfwd(loss, argnums=(0, 1)))(*at)
+    loss = quick(loss)
     np.testing.assert_allclose(reverse, forward, rtol=1e-9)
     for i in (0, 1):
         up, down = (loss(*(x * (1 + s * step) if j == i else x for j, x in enumerate(at))) for s in (1, -1))
