@@ -67,7 +67,7 @@ def run_bench(
     configure_jax(x64=False, devices=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
     # A program from the cache would make compile time look like nothing.
     jax.config.update("jax_enable_compilation_cache", False)
-    repetitions = 2 if quick else 7
+    repetitions, over = 2 if quick else 7, Devices.take(jax.local_device_count())
     rows, peers = [], []
     print(f"{'what':<20}{'body':<18}{'drones':>7}{'steps/s':>12}{'compile s':>11}{'memory MB':>11}")
     for count in drones:
@@ -75,7 +75,6 @@ def run_bench(
         group += [workloads.rollout(count, "rigid-plain")] if kernel_is_chosen() else []
         peer = Peer(peer_python, count) if peer_python is not None else None
         group += [peer] if peer else []
-        over = Devices.take(jax.local_device_count())
         several = over.several and count >= 64 and count % over.count == 0
         group += [workloads.rollout(count, over=over)] if several else []
         times = _alternate(group, repetitions)

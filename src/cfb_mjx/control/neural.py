@@ -32,17 +32,17 @@ class Network(eqx.Module):
         return cls(tuple(weights), tuple(jnp.zeros(n) for n in sizes[1:]), activation)
 
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
-        act = ACTIVATIONS[self.activation]
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = act(x @ weight + bias)
-        return x @ self.weights[-1] + self.biases[-1]
+        return self._through(lambda weight, bias, x: x @ weight + bias, x)
 
     def columns(self, x: Float[Array, "inputs drones"]) -> Float[Array, "outputs drones"]:
         """The same for many whose axis is the last one."""
-        act = ACTIVATIONS[self.activation]
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            x = act(weight.T @ x + bias[:, None])
-        return self.weights[-1].T @ x + self.biases[-1][:, None]
+        return self._through(lambda weight, bias, x: weight.T @ x + bias[:, None], x)
+
+    def _through(self, layer: Callable, x: Array) -> Array:
+        *hidden, last = zip(self.weights, self.biases, strict=True)
+        for weight, bias in hidden:
+            x = ACTIVATIONS[self.activation](layer(weight, bias, x))
+        return layer(*last, x)
 
 
 class NeuralController(eqx.Module):

@@ -51,7 +51,8 @@ class _Drones:
         self.state = jnp.stack([jnp.broadcast_to(x, (lanes,)) for x in arrays[:count]])
         self.rows, self.row_axis = arrays[count], -1 if batched[count] else None
         own = batched[count + 1 : flight.arrays]
-        self.model = [_taken_apart(x, b) for x, b in zip(arrays[count + 1 : flight.arrays], own, strict=True)]
+        given = zip(arrays[count + 1 : flight.arrays], own, strict=True)
+        self.model = [numberwise.apart(x, x.shape[:-1] if b else x.shape) for x, b in given]
         structure = []
 
         def prepared(*model):
@@ -107,15 +108,6 @@ class _Drones:
         """All drones after a step."""
         how = partial(self.step, wrench_once=True)
         return jnp.stack(self.each(how, state, row))
-
-
-def _taken_apart(array: Array, own: bool) -> np.ndarray:
-    """The array of one drone, of numbers; where every drone has its own, a number is an array (lanes,)."""
-    shape = array.shape[:-1] if own else array.shape
-    numbers = np.empty(shape, object)
-    for index in np.ndindex(shape):
-        numbers[index] = array[index]
-    return numbers
 
 
 def _put_together(numbers: np.ndarray, dtype) -> Array:

@@ -91,6 +91,14 @@ def trace(function: Callable, *examples) -> Program | None:
     return Program(traced, tuple(v in needed for v in traced.jaxpr.invars))
 
 
+def apart(array, shape: tuple[int, ...]) -> np.ndarray:
+    """``array`` taken apart along its first axes, which have this ``shape``: an array of its entries."""
+    numbers = np.empty(shape, object)
+    for index in np.ndindex(shape):
+        numbers[index] = array[index]
+    return numbers
+
+
 def changed_by(program: Program, moved: Sequence[int]) -> list[bool]:
     """Which results may change with these arguments."""
     jaxpr = program.traced.jaxpr
@@ -157,10 +165,7 @@ def _run(jaxpr, constants, arguments) -> list[np.ndarray]:
 def _numbers(array) -> np.ndarray:
     """An array of NumPy numbers: such a number is written into a kernel, where an array could not be."""
     array = np.asarray(array)
-    numbers = np.empty(array.shape, object)
-    for index in np.ndindex(array.shape):
-        numbers[index] = array[index]
-    return numbers
+    return apart(array, array.shape)
 
 
 def _each(equation, inputs: Sequence[np.ndarray]) -> np.ndarray:
