@@ -176,7 +176,8 @@ def pulled(flight, batched, moving, lanes, *operands):
     def of_one_model(of_some, model):
 
         def some_from(moved_model):
-            made = drones.prepared_from(list(map(_shaped, _replaced(model, moved, moved_model), drones.model)))
+            whole = zip(drones.model, _replaced(model, moved, moved_model), strict=True)
+            made = drones.prepared_from([numberwise.shaped(like.shape, numbers) for like, numbers in whole])
             return [made[i] for i in which]
 
         return jax.vjp(some_from, [model[i] for i in moved])[1](of_some)[0]
@@ -222,13 +223,6 @@ def _replaced(items: list, which: Sequence[int], others: list) -> list:
     for i, x in zip(which, others, strict=True):
         items[i] = x
     return items
-
-
-def _shaped(numbers: list, like: np.ndarray) -> np.ndarray:
-    shaped = np.empty(like.shape, object)
-    for index, number in zip(np.ndindex(like.shape), numbers, strict=True):
-        shaped[index] = number
-    return shaped
 
 
 def _each(x: Array, batched: bool, lanes: int) -> Array:

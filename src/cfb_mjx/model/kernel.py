@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.numberwise import Program
+from cfb_mjx.model.numberwise import Program, shaped
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def fly(
             """Arrays of numbers, whose lines follow each other."""
             for i in which:
                 shape = constants[i].shape[1:] if own[i] else constants[i].shape
-                yield i, _array(shape, (number(next(lines)) for _ in range(math.prod(shape))))
+                yield i, shaped(shape, (number(next(lines)) for _ in range(math.prod(shape))))
 
         known = dict(taken(private, map(np.int32, itertools.count()), functools.partial(read, "private")))
         known |= dict(taken(common, map(np.int32, itertools.count()), lambda line: refs["common"][line]))
@@ -100,10 +100,10 @@ def fly(
         def obey(row, state):
             lines = (row * np.int32(4) + np.int32(motor) for motor in range(4))
             shared = commands.ndim == 2
-            command = _array((4,), (refs["commands"][x] if shared else read("commands", x) for x in lines))
+            command = shaped((4,), (refs["commands"][x] if shared else read("commands", x) for x in lines))
 
             def one(_, state):
-                after = step(*arguments, *(_array((), [x]) for x in state), command)
+                after = step(*arguments, *(shaped((), [x]) for x in state), command)
                 return tuple(jnp.broadcast_to(x[()], (block,)) for x in after)
 
             return _repeat(hold, one, state)
@@ -133,10 +133,3 @@ def _repeat(count: int, function: Callable, state: tuple) -> tuple:
     if count == 1:
         return function(np.int32(0), state)
     return jax.lax.fori_loop(np.int32(0), np.int32(count), function, state)
-
-
-def _array(shape: tuple[int, ...], numbers: Iterable) -> np.ndarray:
-    array = np.empty(shape, object)
-    for index, number in zip(np.ndindex(shape), numbers, strict=True):
-        array[index] = number
-    return array

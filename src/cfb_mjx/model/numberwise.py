@@ -8,7 +8,7 @@ block of drones. So the code that flies one drone in plain JAX serves inside a k
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -91,12 +91,17 @@ def trace(function: Callable, *examples) -> Program | None:
     return Program(traced, tuple(v in needed for v in traced.jaxpr.invars))
 
 
+def shaped(shape: tuple[int, ...], numbers: Iterable) -> np.ndarray:
+    """An array of these numbers, as they are: NumPy's own constructors would look into them."""
+    array = np.empty(shape, object)
+    for index, number in zip(np.ndindex(shape), numbers, strict=True):
+        array[index] = number
+    return array
+
+
 def apart(array, shape: tuple[int, ...]) -> np.ndarray:
     """``array`` taken apart along its first axes, which have this ``shape``: an array of its entries."""
-    numbers = np.empty(shape, object)
-    for index in np.ndindex(shape):
-        numbers[index] = array[index]
-    return numbers
+    return shaped(shape, (array[index] for index in np.ndindex(shape)))
 
 
 def changed_by(program: Program, moved: Sequence[int]) -> list[bool]:
