@@ -77,8 +77,15 @@ def equal(a, b):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **CLOSE), a, b)
 
 
+@pytest.fixture(params=["in one function", "with a matrix library"])
+def way(request, monkeypatch):
+    """How drones are flown together: these tests have few, which would all go one way."""
+    if request.param == "with a matrix library":
+        monkeypatch.setattr(closed_loop, "FEW", 0)
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_many_are_each_as_written_out(layout):
+def test_many_are_each_as_written_out(layout, way):
     pilot, states, targets = controller(layout), starts(3), jax.random.normal(jax.random.key(4), (3, 3))
 
     def fly(state, target):
@@ -101,7 +108,7 @@ def drawn(count, model=MODEL):
     )(keys)
 
 
-def test_any_of_the_arguments_may_be_batched_and_batched_again():
+def test_any_of_the_arguments_may_be_batched_and_batched_again(way):
     pilot, states = controller(), starts(4)
     models, pilots = (
         drawn(4),
@@ -133,6 +140,7 @@ def test_more_than_a_group_at_a_time(monkeypatch):
     def fly(state):
         return rollout_closed_loop(MODEL, pilot, state, 3)
 
+    monkeypatch.setattr(closed_loop, "FEW", 0)
     whole = quick(jax.vmap(fly))(states)
     monkeypatch.setattr(closed_loop, "AT_ONCE", 3)
     # A function of its own: the one above would come from the cache of traces.
@@ -159,10 +167,12 @@ EFFECTS = (
 )
 
 
-@pytest.mark.parametrize(
-    "changes", [{"body": MjxBody()}, {"effects": tuple(effect_from_mapping(item, "test") for item in EFFECTS)}]
-)
-def test_other_bodies_and_effects_with_a_memory(changes):
+WITH_MEMORY = {"effects": tuple(effect_from_mapping(item, "test") for item in EFFECTS)}
+
+
+@pytest.mark.parametrize(("changes", "few"), [({"body": MjxBody()}, 8), (WITH_MEMORY, 8), (WITH_MEMORY, 0)])
+def test_other_bodies_and_effects_with_a_memory(changes, few, monkeypatch):
+    monkeypatch.setattr(closed_loop, "FEW", few)
     model = replace(MODEL, **changes)
     pilot, states = controller(), starts(2, model)
     flown = quick(jax.vmap(lambda s: rollout_closed_loop(model, pilot, s, 3)))(states)
@@ -195,6 +205,15 @@ def test_derivatives_are_those_of_differences_in_both_modes():
     for i in (0, 1):
         up, down = (loss(*(x * (1 + s * step) if j == i else x for j, x in enumerate(at))) for s in (1, -1))
         np.testing.assert_allclose(reverse[i], (up - down) / (2 * step * at[i]), rtol=1e-5)
+
+
+def test_a_controller_alone_in_another_precision_than_the_drone():
+    pilot, state = controller(), states_of(starts(1), 0)
+    coarse = jax.tree.map(lambda x: x.astype(jnp.float32), pilot)
+    flown = rollout_closed_loop(MODEL, coarse, state, 6)[:2]
+    jax.tree.map(
+        lambda x, y: np.testing.assert_allclose(x, y, atol=1e-4), flown, rollout_closed_loop(MODEL, pilot, state, 6)[:2]
+    )
 
 
 def test_what_cannot_be_flown_is_refused():

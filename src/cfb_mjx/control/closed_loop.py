@@ -5,22 +5,28 @@ Training and evaluation (`cfb_mjx.envs`, `cfb_mjx.train.flying`) add late estima
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.pilot import Pilot
 from cfb_mjx.envs.observation import Estimate
+from cfb_mjx.model.grouped import grouped
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
-from cfb_mjx.model.rollout import fly_rows, in_components
+from cfb_mjx.model.rollout import fits_one_kernel, fly_rows, in_components
 from cfb_mjx.model.state import State, stack
 from cfb_mjx.model.transformable import axes, differentiated_as, examples, one_of_many
 from cfb_mjx.model.vector import Vec
 
+FEW = 8
+"""Up to so many drones are flown in one compiled function on a CPU, written-out products included: calling one for
+every layer and sum of every command takes longer than the numbers of so few. With more, a matrix library is faster."""
 AT_ONCE = 2048
 """Drones whose numbers stay in a CPU core's second cache; more are flown one such group after the other."""
 
@@ -79,23 +85,34 @@ def rollout_closed_loop(
         return leaves
 
     def plainly(*leaves):
-        return loop(_Drones(None, False), jax.tree.unflatten(structure, leaves))
+        return loop(_Drones(None, False, False), jax.tree.unflatten(structure, leaves))
 
     def together(own, *leaves):
+        size = examples(own, leaves)
         parts, own_parts = jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, own)
+        if size == 1:
+            # All drones there are share the model and the network.
+            alone = jax.tree.map(lambda x, mine: x[0] if mine else x, parts[:2], own_parts[:2])
+            parts, own_parts = (*alone, *parts[2:]), (*jax.tree.map(lambda _: False, own_parts[:2]), *own_parts[2:])
+            leaves, own = jax.tree.leaves(parts), tuple(jax.tree.leaves(own_parts))
         own_models, own_pilots = (any(jax.tree.leaves(x)) for x in own_parts[:2])
         if not isinstance(pilot, NeuralController) or own_pilots:
             return jax.vmap(plainly, in_axes=axes(own))(*leaves)
-        size = examples(own, leaves)
         if size > AT_ONCE and jax.default_backend() == "cpu":
             return in_groups(own, leaves)
-        drones = _Drones(size, own_models)
+        few = size <= FEW and fits_one_kernel(model) and len({x.dtype for x in leaves}) == 1
+        drones = _Drones(size, own_models, few)
 
-        def lifted(which: int):
-            return jax.tree.map(drones.last, parts[which], own_parts[which])
+        def flown(*leaves):
+            model, pilot, *rest = jax.tree.unflatten(structure, leaves)
+            if own_models:
+                model = jax.tree.map(drones.given, model, own_parts[0])
+            rest = (jax.tree.map(drones.given, x, mine) for x, mine in zip(rest, own_parts[2:], strict=True))
+            return loop(drones, (model, pilot.written_out() if few else pilot, *rest))
 
-        model = lifted(0) if own_models else parts[0]
-        return [jnp.moveaxis(x, -1, 0) for x in loop(drones, (model, parts[1], *map(lifted, (2, 3, 4))))]
+        leaves = [jnp.moveaxis(x, 0, -1) if mine else x for x, mine in zip(leaves, own, strict=True)]
+        found = grouped(flown, leaves, own, size) if few else flown(*leaves)
+        return [jnp.moveaxis(x, -1, 0) for x in found]
 
     def in_groups(own, leaves):
         def one(own_leaves):
@@ -115,6 +132,8 @@ class _Drones(NamedTuple):
     """None: there is one drone, and no axis."""
     own_models: bool
     """Whether the model has the axis too."""
+    few: bool
+    """Whether the whole loop is to be one compiled function."""
 
     def each(self, function: Callable, *arguments) -> Any:
         """``function(model, ...)`` of one drone, for each; what comes after the model has the axis."""
@@ -123,9 +142,9 @@ class _Drones(NamedTuple):
         axes = (-1 if self.own_models else None, *(-1 for _ in arguments[1:]))
         return jax.vmap(function, in_axes=axes, out_axes=-1, axis_size=self.count)(*arguments)
 
-    def last(self, x: Array, own: bool) -> Array:
-        """With the axis last instead of first, or given one."""
-        return jnp.moveaxis(x, 0, -1) if own else jnp.broadcast_to(x[..., None], (*x.shape, self.count))
+    def given(self, x: Array, own: bool) -> Array:
+        """Given the axis, if it does not have it."""
+        return x if own else jnp.broadcast_to(x[..., None], (*x.shape, self.count))
 
 
 def _loop(drones: _Drones, model, pilot, state, target, memory, hold: int, commands: int, every: int) -> ClosedLoop:
@@ -149,16 +168,37 @@ def _loop(drones: _Drones, model, pilot, state, target, memory, hold: int, comma
     if memory is None:
         memory = pilot.start(drones.each(seen, prepared, at, target), command)
 
+    def kept_of(at, command):
+        return drones.each(whole, prepared, at), command
+
     def one(carry, _):
         at, memory, before = carry
         memory, command = pilot.command(memory, drones.each(seen, prepared, at, target))
         command = command.astype(before.dtype)
         return (drones.each(moved, prepared, at, command), memory, command), None
 
+    pack, unpack = _packing(jax.eval_shape(kept_of, at, command)) if drones.few else (lambda x: x, lambda x: x)
+
     def some(carry, _):
         carry = jax.lax.scan(one, carry, length=every)[0]
         at, _, command = carry
-        return carry, (drones.each(whole, prepared, at), command)
+        return carry, pack(kept_of(at, command))
 
     (_, memory, _), kept = jax.lax.scan(some, (at, memory, command), length=commands // every)
-    return ClosedLoop(*kept, memory)
+    return ClosedLoop(*unpack(kept), memory)
+
+
+def _packing(example: Any) -> tuple[Callable, Callable]:
+    """What makes one array of a tree of arrays (..., drones), as `one_kernel` wants what a loop keeps, and what makes a
+    tree of many such."""
+    leaves, structure = jax.tree.flatten(example)
+    ends = np.cumsum([math.prod(x.shape[:-1]) for x in leaves])
+
+    def pack(tree):
+        return jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in jax.tree.leaves(tree)])
+
+    def unpack(packed):
+        pieces = zip(jnp.split(packed, ends[:-1], axis=-2), leaves, strict=True)
+        return jax.tree.unflatten(structure, [x.reshape(-1, *like.shape) for x, like in pieces])
+
+    return pack, unpack

@@ -45,6 +45,16 @@ class Network(eqx.Module):
         return layer(*last, x)
 
 
+class WrittenOut(Network):
+    """The same with its products written as sums: for within one compiled function, where XLA has no matrix library."""
+
+    def columns(self, x: Float[Array, "inputs drones"]) -> Float[Array, "outputs drones"]:
+        def layer(weight, bias, x):
+            return jnp.sum(weight[:, :, None] * x[:, None, :], axis=0) + bias[:, None]
+
+        return self._through(layer, x)
+
+
 class NeuralController(eqx.Module):
     """A network that turns observations into commands u = (1 + tanh(output)) / 2.
 
@@ -77,6 +87,11 @@ class NeuralController(eqx.Module):
         """Command in (0, 1) on an observation."""
         network = self.network if shown.ndim == 1 else self.network.columns
         return 0.5 * (1 + jnp.tanh(network(shown)))
+
+    def written_out(self) -> NeuralController:
+        """The same for within one compiled function (`WrittenOut`)."""
+        network = self.network
+        return NeuralController(WrittenOut(network.weights, network.biases, network.activation), self.layout)
 
     def start(self, estimate: Estimate, command: Float[Array, "4 *drones"] | float = 0.55) -> Memory:
         """Memory of a controller that takes over: it has commanded ``command`` on ``estimate`` for long."""

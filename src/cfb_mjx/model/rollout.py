@@ -63,7 +63,7 @@ def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 
 
     def plain(prepared, state, commands):
         start, rows = in_components(prepared, state, commands), Vec.unstack(commands)
-        if _in_groups(model, hold * commands.shape[0]):
+        if hold * commands.shape[0] >= _MANY and fits_one_kernel(model):
             return fleet.fly(prepared.model, start, rows, hold)
         return fly_rows(prepared, start, rows, hold)
 
@@ -71,10 +71,11 @@ def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 
     return stack(final, prepared.parameters.center_of_gravity)
 
 
-def _in_groups(model: Quadrotor, steps: int) -> bool:
+def fits_one_kernel(model: Quadrotor) -> bool:
+    """Whether this backend computes many steps of the model in one function (`cfb_mjx.model.one_kernel`)."""
     # An effect of the user's own may do what XLA cannot put into one function: a matrix product, say.
     known = all(type(effect) in CATALOGUE.values() for effect in model.effects)
-    return jax.default_backend() == "cpu" and isinstance(model.body, RigidBody) and known and steps >= _MANY
+    return jax.default_backend() == "cpu" and isinstance(model.body, RigidBody) and known
 
 
 def fly_rows(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Components:
