@@ -41,14 +41,15 @@ class Flight(NamedTuple):
 class _Drones:
     """The drones of one flight and what they are flown with; their axis is the last one of whatever has it.
 
-    The state is one array (numbers, lanes), not one per number: what is kept of every step is then written in place.
-    What steps need of the model (`prepare`) is computed once, number by number (`cfb_mjx.model.numberwise`): so a
-    number has the axis only where it depends on something that has it, and derivatives by numbers stay among numbers.
+    The state is one array per number: put together as one, XLA would copy it in every step. What steps need of the
+    model (`prepare`) is computed once, number by number (`cfb_mjx.model.numberwise`): so a number has the axis only
+    where it depends on something that has it, and derivatives by numbers stay among numbers.
     """
 
     def __init__(self, flight: Flight, batched: Sequence[bool], lanes: int, arrays: Sequence[Array]):
         self.flight, self.lanes, count = flight, lanes, flight.state
-        self.state = jnp.stack([jnp.broadcast_to(x, (lanes,)) for x in arrays[:count]])
+        self.state = [jnp.broadcast_to(x, (lanes,)) for x in arrays[:count]]
+        dtype = self.state[0].dtype
         self.rows, self.row_axis = arrays[count], -1 if batched[count] else None
         own = batched[count + 1 : flight.arrays]
         given = zip(arrays[count + 1 : flight.arrays], own, strict=True)
@@ -59,9 +60,9 @@ class _Drones:
             # What steps need of the parameters has been prepared; effects bring their own.
             made = eqx.tree_at(lambda p: p.model.parameters, prepare(self._whole([None] * count, model)[-1]), None)
             leaves, *structure[:] = jax.tree.flatten(made)
-            return [jnp.asarray(x, self.state.dtype) for x in leaves]
+            return [jnp.asarray(x, dtype) for x in leaves]
 
-        examples = [jax.ShapeDtypeStruct(x.shape, self.state.dtype) for x in self.model]
+        examples = [jax.ShapeDtypeStruct(x.shape, dtype) for x in self.model]
         self.prepare = numberwise.trace(prepared, *examples)
         (self.structure,) = structure
         self.prepared = self.prepared_from(self.model)
@@ -75,7 +76,7 @@ class _Drones:
 
     def prepared_from(self, model: Sequence[np.ndarray]) -> list[Array]:
         """What steps need, from the model's numbers."""
-        return [_put_together(x, self.state.dtype) for x in self.prepare(*model)]
+        return [_put_together(x, self.state[0].dtype) for x in self.prepare(*model)]
 
     def step(self, numbers: list[Array], row: Array, prepared: list[Array], wrench_once: bool) -> list[Array]:
         """One step of one drone."""
@@ -87,15 +88,14 @@ class _Drones:
         """Which of what is prepared a step depends on."""
         row = self.rows[0] if self.row_axis is None else self.rows[0, :, 0]
         prepared = [x if a is None else x[..., 0] for x, a in zip(self.prepared, self.prepared_axes, strict=True)]
-        return numberwise.used(lambda prepared: self.step(_numbers(self.state[:, 0]), row, prepared, False), prepared)
+        return numberwise.used(lambda prepared: self.step([x[0] for x in self.state], row, prepared, False), prepared)
 
-    def each(self, function: Callable, state: Array, row: Array, *own: list[Array]) -> Any:
+    def each(self, function: Callable, state: list[Array], row: Array, *own: list[Array]) -> Any:
         """``function(numbers, row, prepared, *own)`` of every drone; its own arrays have the axis."""
         axes = (-1, self.row_axis, self.prepared_axes, *(-1 for _ in own))
-        arguments = (_numbers(state), row, self.prepared, *own)
-        return jax.vmap(function, axes, -1, axis_size=self.lanes)(*arguments)
+        return jax.vmap(function, axes, -1, axis_size=self.lanes)(state, row, self.prepared, *own)
 
-    def along(self, advanced: Callable[[Array, Array], tuple[Array, Any]]) -> tuple[Array, Any]:
+    def along(self, advanced: Callable[[list[Array], Array], tuple[list[Array], Any]]) -> tuple[list[Array], Any]:
         """From the first state through all steps; ``advanced(state, row)`` also returns what to keep of a step."""
         hold = self.flight.hold
 
@@ -104,10 +104,9 @@ class _Drones:
 
         return jax.lax.scan(one, self.state, self.rows)
 
-    def forward(self, state: Array, row: Array) -> Array:
+    def forward(self, state: list[Array], row: Array) -> list[Array]:
         """All drones after a step."""
-        how = partial(self.step, wrench_once=True)
-        return jnp.stack(self.each(how, state, row))
+        return self.each(partial(self.step, wrench_once=True), state, row)
 
 
 def _put_together(numbers: np.ndarray, dtype) -> Array:
@@ -126,7 +125,7 @@ def _numbers(packed: Array) -> list[Array]:
 
 def flown(flight, batched, moving, lanes, *arrays):
     drones = _Drones(flight, batched, lanes, arrays)
-    return _numbers(drones.along(lambda state, row: (drones.forward(state, row), None))[0])
+    return drones.along(lambda state, row: (drones.forward(state, row), None))[0]
 
 
 def pushed(flight, batched, moving, lanes, *operands):
@@ -151,7 +150,9 @@ def pulled(flight, batched, moving, lanes, *operands):
     The states of all steps are kept, the rest of a step is computed again: to store that costs more.
     """
     drones, count = _Drones(flight, batched, lanes, operands[: flight.arrays]), flight.state
-    kept = drones.along(lambda state, row: (drones.forward(state, row), state))[1]
+    dtype = drones.state[0].dtype
+    # What is kept is one array, so that it is written in place.
+    kept = drones.along(lambda state, row: (drones.forward(state, row), jnp.stack(state)))[1]
     rows_move, moved = count in moving, [i - count - 1 for i in moving if i > count]
     model = [list(x.flat) for x in drones.model]
     axes = jax.tree.map(lambda x: -1 if jnp.ndim(x) else None, model)
@@ -191,24 +192,24 @@ def pulled(flight, batched, moving, lanes, *operands):
 
         def one(carry, state):
             cotangents, of_row, total = carry
-            cotangents, now_row, now = drones.each(before, state, row, _numbers(cotangents))
+            cotangents, now_row, now = drones.each(before, _numbers(state), row, cotangents)
             now = of_model(now) if early else now
-            return (jnp.stack(cotangents), of_row + now_row, jax.tree.map(jnp.add, total, now)), None
+            return (cotangents, of_row + now_row, jax.tree.map(jnp.add, total, now)), None
 
         cotangents, total = carry
-        nothing = jnp.zeros((4 if rows_move else 0, lanes), cotangents.dtype)
+        nothing = jnp.zeros((4 if rows_move else 0, lanes), dtype)
         (cotangents, of_row, total), _ = jax.lax.scan(one, (cotangents, nothing, total), states, reverse=True)
         return (cotangents, total), of_row
 
     given = zip(operands[flight.arrays :], batched[flight.arrays :], strict=True)
-    last = jnp.stack([_each(x, b, lanes) for x, b in given])
+    last = [_each(x, b, lanes) for x, b in given]
     if early:
         shapes = [[()] * len(model[i]) for i in moved]
     else:
         shapes = [drones.prepare.traced.out_avals[i].shape for i in which]
-    zeros = jax.tree.map(lambda s: jnp.zeros((*s, lanes), last.dtype), shapes, is_leaf=lambda s: isinstance(s, tuple))
+    zeros = jax.tree.map(lambda s: jnp.zeros((*s, lanes), dtype), shapes, is_leaf=lambda s: isinstance(s, tuple))
     (first, total), of_rows = jax.lax.scan(backward, (last, zeros), (kept, drones.rows), reverse=True)
-    found = dict(enumerate(_numbers(first))) | {count: of_rows}
+    found = dict(enumerate(first)) | {count: of_rows}
     for i, numbers in zip(moved, total if early else of_model(total), strict=True):
         found[i + count + 1] = jnp.stack(numbers).reshape(*drones.model[i].shape, lanes)
     return [found[i] for i in moving]
