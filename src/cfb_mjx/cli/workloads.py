@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array
 
-from cfb_mjx.control.closed_loop import rollout_closed_loop
+from cfb_mjx.control.closed_loop import AT_ONCE, rollout_closed_loop
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.devices import Devices
 from cfb_mjx.files import shipped
@@ -41,6 +41,7 @@ class Workload:
     run: Callable[[], None]
     compile_s: float
     peak_mb: float
+    devices: int
     trace: tuple[Callable, tuple]
     """The function and its arguments, before compiling."""
 
@@ -58,7 +59,6 @@ def _compile(
     if over is not None:
         function = over.divided(function, (None, *[0] * (len(arguments) - 1)), 0)
         arguments = (over.whole(arguments[0]), *over.along(arguments[1:]))
-        body = f"{body}, {over.count} devices"
     begin = time.perf_counter()
     compiled = jax.jit(function).lower(*arguments).compile()
     compile_s = time.perf_counter() - begin
@@ -69,7 +69,8 @@ def _compile(
     def run():
         jax.block_until_ready(compiled(*arguments))
 
-    return Workload(what, body, drones, steps, run, compile_s, peak / 2**20, (function, arguments))
+    devices = 1 if over is None else over.count
+    return Workload(what, body, drones, steps, run, compile_s, peak / 2**20, devices, (function, arguments))
 
 
 def _start(model: Quadrotor, drones: int):
@@ -143,6 +144,22 @@ def rollout_policy(drones: int, over: Devices | None = None) -> Workload:
 
     together = jax.vmap(fly, in_axes=(None, 0))
     return _compile("rollout_policy", "rigid", drones, 2 * commands, together, model, states, over=over)
+
+
+def network_alone(drones: int) -> Workload:
+    """The network of `rollout_policy` as often as there, with nothing to fly: no simulator can be faster with it."""
+    controller = load_policy(shipped_policies()["target"]).controller
+    commands, groups = STEPS // 4, -(-drones // AT_ONCE)
+
+    def one(shown, _):
+        # Every command is seen by the next one; nothing could be left out.
+        return shown.at[:4].set(controller.act(shown)), None
+
+    def act(shown):
+        return jax.lax.map(lambda shown: jax.lax.scan(one, shown, length=commands)[0], shown)
+
+    shown = jax.random.normal(jax.random.key(3), (groups, controller.layout.size, -(-drones // groups)))
+    return _compile("network_alone", "none", drones, 2 * commands, act, shown)
 
 
 def network_file(folder: Path) -> Path:

@@ -1,0 +1,146 @@
+"""What ``cfb bench`` measured, as sentences and as a Markdown page."""
+
+from __future__ import annotations
+
+import jax
+
+from cfb_mjx.cli import workloads
+
+
+def body(row: dict) -> str:
+    """The body of a row; of a peer with its version and cores."""
+    if "version" not in row:
+        return row["body"]
+    return f"{row['body']} {row['version']}" + (f", {_cores(row['cores'])}" if row["cores"] else "")
+
+
+def _cores(count: int) -> str:
+    return f"{count} core{'s' if count > 1 else ''}"
+
+
+def ratios(result: dict) -> list[str]:
+    """Side-by-side sentences for every batch size."""
+    lines = []
+    for drones in sorted({row["drones"] for row in result["rows"]}):
+        rows = [row for row in result["rows"] if row["drones"] == drones]
+
+        def speed(what, body="rigid", rows=rows, **wanted):
+            wanted = {"what": what, "body": body} | ({"devices": 1} | wanted if body == "rigid" else wanted)
+            fitting = (row["steps_per_s"] for row in rows if all(row.get(k) == v for k, v in wanted.items()))
+            return next(fitting, None)
+
+        found = _beside_peers(rows, speed)
+        if ten := speed("rollout_ten"):
+            found.append(f"a gradient by ten parameters costs {speed('rollout_hundred') / ten:.1f} x the same rollout")
+        if plain := speed("rollout", "rigid-plain"):
+            found.append(f"the kernel {speed('rollout') / plain:.2f} x the plain program")
+        free, floor, stock = (speed("rollout", name) for name in ("mjx", "mjx-floor", "mjx-stock"))
+        if free and floor and stock:
+            found.append(f"MJX without floor {free / stock:.2f} x stock mjx.step")
+            found.append(f"MJX without floor {free / floor:.1f} x MJX with floor")
+        lines += [f"{drones} drone{'s' if drones > 1 else ''}: {line}" for line in found]
+    return lines
+
+
+def _beside_peers(rows: list[dict], speed) -> list[str]:
+    lines = []
+    for what, title in (("rollout", "closed form"), ("rollout_policy", "the same network in the loop")):
+        parts = []
+        for peer in (row for row in rows if "version" in row and row["what"] == what):
+            # As many devices of ours as it has cores, where that was measured; else the one.
+            ours = speed(what, devices=peer["cores"]) if peer["cores"] else None
+            on = f"{_cores(peer['cores'])} each" if ours else "one device of ours"
+            parts.append(f"{(ours or speed(what)) / peer['steps_per_s']:.1f} x ({on})")
+            name = f"{peer['body']} {peer['version']}"
+        if parts:
+            lines.append(f"{title} {', '.join(parts)} {name}")
+    alone, one = speed("network_alone"), speed("rollout_policy", "crazyflow", cores=1)
+    if alone and one:
+        lines.append(f"the network alone, nothing flown, {alone / one:.1f} x crazyflow in the loop (1 core each)")
+    return lines
+
+
+def page(result: dict, flags: str) -> str:
+    """The results as a Markdown page.
+
+    Args:
+        result: what was measured.
+        flags: of XLA, in that process.
+    """
+    facts = ", ".join(f"{name} {value}" for name, value in result["environment"].items())
+    table = [
+        "| what | body | drones | devices | steps/s | compile, s | memory, MB |",
+        "|---|---|---:|---:|---:|---:|---:|",
+    ]
+    for row in result["rows"]:
+        memory = f"{row['peak_mb']:.1f}" if "peak_mb" in row else ""
+        table.append(
+            f"| {row['what']} | {body(row)} | {row['drones']} | {row['devices']} | {row['steps_per_s']:.3g} "
+            f"| {row['compile_s']:.2f} | {memory} |"
+        )
+    from cfb_mjx.cli.roofline import section
+
+    gpu = "" if jax.default_backend() != "cpu" else "GPU: not measured (none on this machine).\n"
+    comparison = "\n".join(f"- {line}" for line in ratios(result))
+    return f"""# Performance
+
+Written by `make bench` (`cfb bench --peer-python ... --markdown docs/performance.md`); do not edit.
+
+{facts}
+
+Steps per second of all drones together, float32; the best of several runs that take turns with the peer's.
+`rollout`: open loop, {workloads.STEPS} steps of 4 ms (MJX fewer), one command held per drone, final state only.
+`rollout_randomised`: the same, every drone with its own parameters. `rollout_gradient`: reverse-mode gradient of a
+100-step rollout with respect to all parameters, `rollout_ten` with respect to ten, `rollout_hundred` that rollout
+alone. `rollout_policy`: the shipped policy `target` in the loop (`rollout_closed_loop`), a command every 8 ms;
+`network_alone`: its network evaluated as often, with nothing to fly or to observe. Bodies: `rigid` closed form; `mjx`
+MuJoCo XLA without contact; `mjx-floor` with floor contact; `mjx-stock` plain `mjx.step` on the same MJCF without
+contact. One JAX device of a CPU is one core of it.
+
+crazyflow runs first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`, and with the same
+network in its loop at 250 Hz, a command every 8 ms, in a process with XLA's default options, on the one device it uses:
+once free to use all cores, as XLA's library for matrix products does, and once bound to one. Ours runs with the option
+the `cfb` command sets for itself on CPU ([model.md](model.md#speed)): `XLA_FLAGS={flags}`.
+Memory is the compiled program's arguments, results and temporaries.
+
+{comparison}
+
+{gpu}
+{chr(10).join(table)}
+
+{first_call_section(result["first_call"])}
+{scaling_section(result.get("scaling"))}
+{section(result["roofline"]) if "roofline" in result else ""}"""
+
+
+def first_call_section(rows: list[dict]) -> str:
+    """Markdown."""
+    lines = "\n".join(f"| {row['cache']} | {row['import_s']:.1f} | {row['call_s']:.1f} |" for row in rows)
+    return f"""## The first call
+
+A new process flies 4096 drones for half a second, as the `cfb` command would: loading the library, and from there to
+the result. The cache of compiled programs is on by default, in the user's cache folder.
+
+| cache | loading, s | first call, s |
+|---|---:|---:|
+{lines}
+"""
+
+
+def scaling_section(rows: list[dict] | None) -> str:
+    """Markdown; nothing where it was not measured."""
+    if not rows:
+        return ""
+    lines = "\n".join(
+        f"| {row['what']} | {row['drones']} | {row['devices']} | {row['steps_per_s']:.3g} | {row['ratio']:.2f} |"
+        for row in rows
+    )
+    return f"""## From one core to two
+
+One device in a process bound to one core, and two devices in one bound to two; the runs take turns, the best counts.
+`ppo`: one update with the shipped configuration.
+
+| what | drones | devices | steps/s | times one |
+|---|---:|---:|---:|---:|
+{lines}
+"""
