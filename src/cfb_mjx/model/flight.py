@@ -86,9 +86,14 @@ class _Drones:
 
     def used(self) -> list[bool]:
         """Which of what is prepared a step depends on."""
+        numbers, row, prepared = self.first()
+        return numberwise.used(lambda prepared: self.step(numbers, row, prepared, False), prepared)
+
+    def first(self) -> tuple[list[Array], Array, list[Array]]:
+        """Numbers, row and what is prepared of one drone at its first step."""
         row = self.rows[0] if self.row_axis is None else self.rows[0, :, 0]
         prepared = [x if a is None else x[..., 0] for x, a in zip(self.prepared, self.prepared_axes, strict=True)]
-        return numberwise.used(lambda prepared: self.step([x[0] for x in self.state], row, prepared, False), prepared)
+        return [x[0] for x in self.state], row, prepared
 
     def each(self, function: Callable, state: list[Array], row: Array, *own: list[Array]) -> Any:
         """``function(numbers, row, prepared, *own)`` of every drone; its own arrays have the axis."""
@@ -151,8 +156,6 @@ def pulled(flight, batched, moving, lanes, *operands):
     """
     drones, count = _Drones(flight, batched, lanes, operands[: flight.arrays]), flight.state
     dtype = drones.state[0].dtype
-    # What is kept is one array, so that it is written in place.
-    kept = drones.along(lambda state, row: (drones.forward(state, row), jnp.stack(state)))[1]
     rows_move, moved = count in moving, [i - count - 1 for i in moving if i > count]
     model = [list(x.flat) for x in drones.model]
     axes = jax.tree.map(lambda x: -1 if jnp.ndim(x) else None, model)
@@ -169,6 +172,15 @@ def pulled(flight, batched, moving, lanes, *operands):
             return jax.vjp(after, numbers, row, some)[1](cotangents)
         of_numbers, of_some = jax.vjp(lambda numbers, some: after(numbers, row, some), numbers, some)[1](cotangents)
         return of_numbers, jnp.zeros(0, row.dtype), of_some
+
+    # Positions, for instance, are needed only by what depends on them. What is kept is one array, so that it is written
+    # in place.
+    numbers, row, prepared = drones.first()
+    cotangents = [jnp.zeros_like(x) for x in numbers]
+    used = numberwise.used(lambda numbers: before(numbers, row, prepared, cotangents), numbers)
+    needed = [i for i, u in enumerate(used) if u]
+    kept = drones.along(lambda state, row: (drones.forward(state, row), jnp.stack([state[i] for i in needed])))[1]
+    nowhere = [jnp.zeros(lanes, dtype)] * count
 
     def of_model(of_some):
         """Cotangents of the model's own numbers from those of what is prepared."""
@@ -192,7 +204,8 @@ def pulled(flight, batched, moving, lanes, *operands):
 
         def one(carry, state):
             cotangents, of_row, total = carry
-            cotangents, now_row, now = drones.each(before, _numbers(state), row, cotangents)
+            state = _replaced(nowhere, needed, _numbers(state))
+            cotangents, now_row, now = drones.each(before, state, row, cotangents)
             now = of_model(now) if early else now
             return (cotangents, of_row + now_row, jax.tree.map(jnp.add, total, now)), None
 
