@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfb_mjx.model import ParasiticDrag, Quadrotor, begin, rollout_final, step
+from cfb_mjx.model import ParasiticDrag, Quadrotor, begin, rollout, rollout_final, step
 from cfb_mjx.model.effects.catalogue import CATALOGUE
 from cfb_mjx.model.grouped import LANES, grouped
 from cfb_mjx.model.vector import Vec
@@ -55,9 +56,20 @@ def _fly(model, state, commands):
     return rollout_final(model, state, commands, hold=HOLD)
 
 
+def _fly_keeping(model, state, commands):
+    return rollout(model, state, commands, hold=HOLD, every=2)
+
+
+def _after_every_step(model, state, commands):
+    def one(state, row):
+        state = step(model, state, row)
+        return state, state
+
+    return jax.lax.scan(one, begin(model, state), jnp.repeat(commands, HOLD, axis=0))[1]
+
+
 def _by_steps(model, state, commands):
-    begun = begin(model, state)
-    return jax.lax.scan(lambda s, row: (step(model, s, row), None), begun, jnp.repeat(commands, HOLD, axis=0))[0]
+    return jax.tree.map(lambda x: x[-1], _after_every_step(model, state, commands))
 
 
 quick_steps = jax.jit(_by_steps, compiler_options=helpers.QUICK_COMPILE)
@@ -75,7 +87,9 @@ def _is_together(function, *arguments) -> bool:
 def test_few_steps_are_flown_apart(model):
     state, commands = model.hover_state(), _commands(1)[0]
     assert _is_together(_fly, model, state, commands)
-    assert not _is_together(lambda *a: rollout_final(*a, hold=1), model, state, commands)
+    assert _is_together(_fly_keeping, model, state, commands)
+    for short in (rollout, rollout_final):
+        assert not _is_together(functools.partial(short, hold=1), model, state, commands)
 
 
 class _Products(ParasiticDrag):
@@ -104,6 +118,20 @@ def test_every_drone_flies_as_it_would_alone(drones, model):
         alone = jax.tree.map(lambda x, i=i: x[i], (models, states, commands))
         _close(jax.tree.map(lambda x, i=i: x[i], flown), quick_steps(*alone))
         _close(_fly(*alone), quick_steps(*alone))
+
+
+@pytest.mark.parametrize("every", [1, 2])
+@pytest.mark.parametrize("drones", [1, LANES + 3])
+def test_states_on_the_way_are_those_of_the_steps(drones, every, model):
+    models, states, commands = _models(model, drones), _states(model, drones), _commands(drones)
+    fly = functools.partial(rollout, hold=HOLD, every=every)
+    flown = jax.jit(jax.vmap(fly))(models, states, commands)
+    steps = jax.jit(_after_every_step, compiler_options=helpers.QUICK_COMPILE)
+    for i in {0, drones - 1}:
+        alone = jax.tree.map(lambda x, i=i: x[i], (models, states, commands))
+        expected = jax.tree.map(lambda x: x[HOLD * every - 1 :: HOLD * every], steps(*alone))
+        _close(jax.tree.map(lambda x, i=i: x[i], flown), expected)
+        _close(fly(*alone), expected)
 
 
 @pytest.mark.parametrize("axes", [(0, None, None), (None, 0, None), (None, None, 0)], ids=["models", "states", "rows"])
@@ -158,7 +186,16 @@ def _few_of_each(model, states, commands):
     return jax.vmap(jax.grad(_few_loss), (0, None, 0, 0))(few, model, states, commands)
 
 
+def _loss_on_the_way(model, state, commands):
+    """Every kept state weighs differently."""
+    kept = _fly_keeping(model, state, commands)
+    weights = 1 + jnp.arange(ROWS // 2)
+    return jnp.sum(weights[:, None] * (kept.position**2 + kept.body_rate)) + 1e-3 * jnp.sum(kept.rotor_speed[0])
+
+
 DERIVATIVES = {
+    "on the way": lambda m, s, u: jax.vmap(jax.grad(_loss_on_the_way, argnums=(0, 1, 2)), (None, 0, 0))(m, s, u),
+    "on the way, forward": lambda m, s, u: jax.jacfwd(lambda u: jax.vmap(_fly_keeping, (None, 0, 0))(m, s, u))(u),
     "few of each": _few_of_each,
     "grad of vmap": lambda m, s, u: jax.grad(_together_loss, argnums=(0, 1, 2))(m, s, u),
     "vmap of grad": lambda m, s, u: jax.vmap(jax.grad(_loss, argnums=(0, 1, 2)), (None, 0, 0))(m, s, u),

@@ -21,7 +21,7 @@ from cfb_mjx.model.acceleration import using
 from cfb_mjx.model.effects.formula import ResidualFormula
 from cfb_mjx.model.kernel import Tuning
 from cfb_mjx.model.quadrotor import prepare
-from cfb_mjx.model.rollout import fly_rows, in_components
+from cfb_mjx.model.rollout import in_components
 from cfb_mjx.model.state import stack
 from cfb_mjx.model.vector import Vec
 
@@ -274,13 +274,7 @@ def test_nothing_changes_on_a_cpu(model, flight):
 
     def before_kept(model, state, commands):
         prepared = prepare(model)
-
-        def fly(components, rows):
-            components = fly_rows(prepared, components, rows, 2)
-            return components, components
-
-        rows = jax.tree.map(lambda x: x.reshape(3, 4), Vec.unstack(commands))
-        _, kept = jax.lax.scan(fly, in_components(prepared, state, commands), rows)
+        kept = fleet.fly(model, in_components(prepared, state, commands), Vec.unstack(commands), 2, every=4)
         return stack(kept, prepared.parameters.center_of_gravity)
 
     now = functools.partial(rollout_final, hold=2), functools.partial(rollout, hold=2, every=4)

@@ -124,7 +124,7 @@ def run_bench(
 
 def _open_loop(count: int, several: Devices | None, python: Path | None) -> list:
     """What is measured in turns with crazyflow's own rollout."""
-    found = [workloads.rollout(count), workloads.rollout_randomised(count)]
+    found = [workloads.rollout(count), workloads.rollout_kept(count), workloads.rollout_randomised(count)]
     found += [workloads.rollout(count, "rigid-plain")] if kernel_is_chosen() else []
     found += [workloads.rollout(count, over=several)] if several else []
     return found + _peers(python, count, None)

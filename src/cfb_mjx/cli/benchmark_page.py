@@ -90,7 +90,8 @@ Written by `make bench` (`cfb bench --peer-python ... --markdown docs/performanc
 
 Steps per second of all drones together, float32; the best of several runs that take turns with the peer's.
 `rollout`: open loop, {workloads.STEPS} steps of 4 ms (MJX fewer), one command held per drone, final state only.
-`rollout_randomised`: the same, every drone with its own parameters. `rollout_gradient`: reverse-mode gradient of a
+`rollout_kept`: with a command per step, and every state returned. `rollout_randomised`: as `rollout`, every drone with
+its own parameters. `rollout_gradient`: reverse-mode gradient of a
 100-step rollout with respect to all parameters, `rollout_ten` with respect to ten, `rollout_hundred` that rollout
 alone. `rollout_policy`: the shipped policy `target` in the loop (`rollout_closed_loop`), a command every 8 ms;
 `network_alone`: its network evaluated as often, with nothing to fly or to observe. Bodies: `rigid` closed form; `mjx`

@@ -20,6 +20,7 @@ from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.devices import Devices
 from cfb_mjx.files import shipped
 from cfb_mjx.model import MjxBody, Quadrotor, rollout_final
+from cfb_mjx.model import rollout as every_state
 from cfb_mjx.model.acceleration import using
 from cfb_mjx.model.mjx_body import mjx
 from cfb_mjx.model.state import State
@@ -28,6 +29,9 @@ from cfb_mjx.parameters import load_randomisation, sample_parameters
 STEPS = 500
 MJX_WORK = 200_000
 """Steps of all drones together in one MJX measurement; MJX is some hundred times slower than the closed form."""
+
+KEPT = 1_000_000
+"""States of all drones together in one measurement that keeps them: 70 MB."""
 
 
 @dataclass
@@ -95,6 +99,15 @@ def rollout(drones: int, body: str = "rigid", over: Devices | None = None) -> Wo
     # Beside the kernel that a GPU gets, the program it would have got without.
     with using("plain") if body == "rigid-plain" else contextlib.nullcontext():
         return _compile("rollout", body, drones, steps, fly, model, states, commands, over=over)
+
+
+def rollout_kept(drones: int) -> Workload:
+    """As `rollout` (closed form), every state kept; fewer steps of many drones."""
+    model, steps = Quadrotor.from_file("cfb-guards"), max(10, min(STEPS, KEPT // drones))
+    states, commands = _start(model, drones)
+    commands = jnp.repeat(commands, steps, axis=1)
+    fly = jax.vmap(every_state, in_axes=(None, 0, 0))
+    return _compile("rollout_kept", "rigid", drones, steps, fly, model, states, commands)
 
 
 def rollout_randomised(drones: int) -> Workload:

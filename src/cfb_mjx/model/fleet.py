@@ -22,28 +22,33 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 from cfb_mjx.model.flight import Flight, flown, pulled, pushed
-from cfb_mjx.model.grouped import grouped
+from cfb_mjx.model.grouped import LANES, grouped
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import Components
 from cfb_mjx.model.vector import Vec
 
 
-def fly(model: Quadrotor, state: Components, rows: Vec, hold: int) -> Components:
-    """Advance ``state`` by all ``rows`` of commands, each held for ``hold`` steps; return the last state.
+def fly(model: Quadrotor, state: Components, rows: Vec, hold: int, every: int | None = None) -> Components:
+    """Advance ``state`` by all ``rows`` of commands, each held for ``hold`` steps.
 
     Args:
         model: the drone, without batch axes; its body must be `RigidBody`.
         state: where it starts; every component a scalar.
         rows: four arrays (n,).
         hold: steps per row.
+        every: rows per state that is returned; must divide n.
+
+    Returns:
+        The states after every ``every`` rows, (n // every,); without it, the last one.
     """
     leaves, structure = jax.tree.flatten((state, rows.stack(), model))
     dynamic = [isinstance(x, jax.Array | np.ndarray | np.generic) for x in leaves]
     arrays = [jnp.asarray(x, leaves[0].dtype) for x, d in zip(leaves, dynamic, strict=True) if d]
     static = tuple(None if d else x for x, d in zip(leaves, dynamic, strict=True))
-    flight = Flight(structure, static, len(jax.tree.leaves(state)), hold)
-    last = _FLY.bind(*arrays, flight=flight, drones=None, batched=(False,) * len(arrays), moving=())
-    return jax.tree.unflatten(jax.tree.structure(state), last)
+    count = len(jax.tree.leaves(state))
+    flight = Flight(structure, static, count, hold, every or rows[0].shape[0])
+    kept = _FLY.bind(*arrays, flight=flight, drones=None, batched=(False,) * len(arrays), moving=())
+    return jax.tree.unflatten(jax.tree.structure(state), [x[0] for x in kept] if every is None else kept)
 
 
 OPERATIONS = {"fly": flown, "fly_push": pushed, "fly_pull": pulled}
@@ -58,8 +63,9 @@ def _evaluated(what, *operands, flight, drones, batched, moving, in_groups):
 
     def some(*operands):
         lanes = next(x.shape[-1] for x, b in zip(operands, batched, strict=True) if b)
-        return what(flight, batched, moving, lanes, *operands)
+        return what(flight, batched, moving, lanes, in_groups, *operands)
 
+    in_groups = in_groups and (size <= LANES or operands[flight.state].shape[0] == flight.every)
     found = grouped(some, operands, batched, size) if in_groups else some(*operands)
     return [x[..., 0] for x in found] if drones is None else list(found)
 
@@ -78,7 +84,7 @@ def _primitive(name: str) -> Primitive:
 
     @primitive.def_abstract_eval
     def _(*operands, flight, drones, batched, moving):
-        shapes = [()] * flight.state
+        shapes = [(operands[flight.state].shape[0] // flight.every,)] * flight.state
         if what is pulled:
             shapes = [operands[i].shape[:-1] if batched[i] else operands[i].shape for i in moving]
         axis = () if drones is None else (drones,)

@@ -31,6 +31,9 @@ class Flight(NamedTuple):
     state: int
     """How many of the arrays are the state's, the first ones; the rows come next."""
     hold: int
+    """Steps for which a row of commands is held."""
+    every: int
+    """Rows from one state that is kept to the next."""
 
     @property
     def arrays(self) -> int:
@@ -50,7 +53,8 @@ class _Drones:
         self.flight, self.lanes, count = flight, lanes, flight.state
         self.state = [jnp.broadcast_to(x, (lanes,)) for x in arrays[:count]]
         dtype = self.state[0].dtype
-        self.rows, self.row_axis = arrays[count], -1 if batched[count] else None
+        self.rows = arrays[count].reshape(-1, flight.every, *arrays[count].shape[1:])
+        self.row_axis = -1 if batched[count] else None
         own = batched[count + 1 : flight.arrays]
         given = zip(arrays[count + 1 : flight.arrays], own, strict=True)
         self.model = [numberwise.apart(x, x.shape[:-1] if b else x.shape) for x, b in given]
@@ -91,7 +95,7 @@ class _Drones:
 
     def first(self) -> tuple[list[Array], Array, list[Array]]:
         """Numbers, row and what is prepared of one drone at its first step."""
-        row = self.rows[0] if self.row_axis is None else self.rows[0, :, 0]
+        row = self.rows[0, 0] if self.row_axis is None else self.rows[0, 0, :, 0]
         prepared = [x if a is None else x[..., 0] for x, a in zip(self.prepared, self.prepared_axes, strict=True)]
         return [x[0] for x in self.state], row, prepared
 
@@ -100,14 +104,25 @@ class _Drones:
         axes = (-1, self.row_axis, self.prepared_axes, *(-1 for _ in own))
         return jax.vmap(function, axes, -1, axis_size=self.lanes)(state, row, self.prepared, *own)
 
-    def along(self, advanced: Callable[[list[Array], Array], tuple[list[Array], Any]]) -> tuple[list[Array], Any]:
-        """From the first state through all steps; ``advanced(state, row)`` also returns what to keep of a step."""
-        hold = self.flight.hold
+    def along(self, advanced: Callable, kept: Callable = lambda state: None) -> tuple[Any, Any]:
+        """From the first state through all steps.
+
+        Args:
+            advanced: of a state and a row of commands, returns the next state and what to keep of the step.
+            kept: what to keep of a state that is kept.
+
+        Returns:
+            What is kept of states, (kept, ...), and of steps, (kept, every, hold, ...).
+        """
 
         def one(state, row):
-            return jax.lax.scan(lambda state, _: advanced(state, row), state, length=hold)
+            return jax.lax.scan(lambda state, _: advanced(state, row), state, length=self.flight.hold)
 
-        return jax.lax.scan(one, self.state, self.rows)
+        def some(state, rows):
+            state, steps = jax.lax.scan(one, state, rows)
+            return state, (kept(state), steps)
+
+        return jax.lax.scan(some, self.state, self.rows)[1]
 
     def forward(self, state: list[Array], row: Array) -> list[Array]:
         """All drones after a step."""
@@ -123,18 +138,29 @@ def _put_together(numbers: np.ndarray, dtype) -> Array:
     return jnp.stack(alike).reshape(*numbers.shape, *block)
 
 
-def _numbers(packed: Array) -> list[Array]:
+def _entries(packed: Array, axis: int = 0) -> list[Array]:
     # split, not indexing: its transpose is one concatenation, and not a sum of arrays that are mostly zero.
-    return [x.reshape(x.shape[1:]) for x in jax.lax.split(packed, (1,) * packed.shape[0])]
+    return [jnp.squeeze(x, axis) for x in jax.lax.split(packed, (1,) * packed.shape[axis], axis)]
 
 
-def flown(flight, batched, moving, lanes, *arrays):
+PACKING = {True: (jnp.stack, _entries), False: (list, lambda numbers, axis=0: numbers)}
+"""What makes one array of arrays and takes it apart again, and what leaves them as they are."""
+
+
+def flown(flight, batched, moving, lanes, packed, *arrays):
+    """The states that are kept: their numbers, (kept, lanes) each.
+
+    Where ``packed``, here and below, what a loop keeps is one array, which `one_kernel` writes in place; elsewhere XLA
+    leaves out what nobody needs.
+    """
     drones = _Drones(flight, batched, lanes, arrays)
-    return drones.along(lambda state, row: (drones.forward(state, row), None))[0]
+    pack, unpack = PACKING[packed]
+    kept = drones.along(lambda state, row: (drones.forward(state, row), None), pack)[0]
+    return unpack(kept, axis=1)
 
 
-def pushed(flight, batched, moving, lanes, *operands):
-    """Tangents of the last state; operands are the flight's arrays and the tangents of those that are ``moving``."""
+def pushed(flight, batched, moving, lanes, packed, *operands):
+    """Tangents of the kept states; operands are the flight's arrays and the tangents of those that are ``moving``."""
     arrays, own = list(operands[: flight.arrays]), list(batched[: flight.arrays])
     moved = [_each(arrays[i], own[i], lanes) for i in moving]
     for i in moving:
@@ -143,14 +169,14 @@ def pushed(flight, batched, moving, lanes, *operands):
     def function(*moved):
         for i, x in zip(moving, moved, strict=True):
             arrays[i] = x
-        return flown(flight, own, (), lanes, *arrays)
+        return flown(flight, own, (), lanes, packed, *arrays)
 
     given = zip(operands[flight.arrays :], batched[flight.arrays :], strict=True)
     return jax.jvp(function, moved, [_each(x, b, lanes) for x, b in given])[1]
 
 
-def pulled(flight, batched, moving, lanes, *operands):
-    """Cotangents, drone by drone, of the ``moving`` arrays; operands are the arrays and the last state's cotangents.
+def pulled(flight, batched, moving, lanes, packed, *operands):
+    """Cotangents, drone by drone, of the ``moving`` arrays; operands are the arrays and the kept states' cotangents.
 
     The states of all steps are kept, the rest of a step is computed again: to store that costs more.
     """
@@ -173,13 +199,13 @@ def pulled(flight, batched, moving, lanes, *operands):
         of_numbers, of_some = jax.vjp(lambda numbers, some: after(numbers, row, some), numbers, some)[1](cotangents)
         return of_numbers, jnp.zeros(0, row.dtype), of_some
 
-    # Positions, for instance, are needed only by what depends on them. What is kept is one array, so that it is written
-    # in place.
+    # Positions, for instance, are needed only by what depends on them.
     numbers, row, prepared = drones.first()
     cotangents = [jnp.zeros_like(x) for x in numbers]
     used = numberwise.used(lambda numbers: before(numbers, row, prepared, cotangents), numbers)
     needed = [i for i, u in enumerate(used) if u]
-    kept = drones.along(lambda state, row: (drones.forward(state, row), jnp.stack([state[i] for i in needed])))[1]
+    pack, unpack = PACKING[packed]
+    kept = drones.along(lambda state, row: (drones.forward(state, row), pack([state[i] for i in needed])))[1]
     nowhere = [jnp.zeros(lanes, dtype)] * count
 
     def of_model(of_some):
@@ -199,12 +225,12 @@ def pulled(flight, batched, moving, lanes, *operands):
     # prepared from them, each step's cotangents become theirs first.
     early = 2 * sum(len(model[i]) for i in moved) < len(which)
 
-    def backward(carry, states_and_row):
+    def over_row(carry, states_and_row):
         states, row = states_and_row
 
         def one(carry, state):
             cotangents, of_row, total = carry
-            state = _replaced(nowhere, needed, _numbers(state))
+            state = _replaced(nowhere, needed, unpack(state))
             cotangents, now_row, now = drones.each(before, state, row, cotangents)
             now = of_model(now) if early else now
             return (cotangents, of_row + now_row, jax.tree.map(jnp.add, total, now)), None
@@ -214,14 +240,21 @@ def pulled(flight, batched, moving, lanes, *operands):
         (cotangents, of_row, total), _ = jax.lax.scan(one, (cotangents, nothing, total), states, reverse=True)
         return (cotangents, total), of_row
 
-    given = zip(operands[flight.arrays :], batched[flight.arrays :], strict=True)
-    last = [_each(x, b, lanes) for x, b in given]
+    def backward(carry, given):
+        of_kept, *states_and_rows = given
+        cotangents, total = carry
+        cotangents = [x + y for x, y in zip(cotangents, of_kept, strict=True)]
+        return jax.lax.scan(over_row, (cotangents, total), states_and_rows, reverse=True)
+
     if early:
         shapes = [[()] * len(model[i]) for i in moved]
     else:
         shapes = [drones.prepare.traced.out_avals[i].shape for i in which]
     zeros = jax.tree.map(lambda s: jnp.zeros((*s, lanes), dtype), shapes, is_leaf=lambda s: isinstance(s, tuple))
-    (first, total), of_rows = jax.lax.scan(backward, (last, zeros), (kept, drones.rows), reverse=True)
+    of_kept = zip(operands[flight.arrays :], batched[flight.arrays :], strict=True)
+    given = [_each(x, b, lanes) for x, b in of_kept], kept, drones.rows
+    (first, total), of_rows = jax.lax.scan(backward, (nowhere, zeros), given, reverse=True)
+    of_rows = of_rows.reshape(operands[count].shape[0], *of_rows.shape[2:])
     found = dict(enumerate(first)) | {count: of_rows}
     for i, numbers in zip(moved, total if early else of_model(total), strict=True):
         found[i + count + 1] = jnp.stack(numbers).reshape(*drones.model[i].shape, lanes)

@@ -46,12 +46,16 @@ def rollout(
     prepared = prepare(model)
 
     def plain(prepared, state, commands):
+        start, rows = in_components(prepared, state, commands), Vec.unstack(commands)
+        if hold * steps >= _MANY and fits_one_kernel(model):
+            return fleet.fly(prepared.model, start, rows, hold, every)
+
         def some(components, rows):
             components = fly_rows(prepared, components, rows, hold)
             return components, components
 
-        rows = jax.tree.map(lambda x: x.reshape(steps // every, every), Vec.unstack(commands))
-        return jax.lax.scan(some, in_components(prepared, state, commands), rows)[1]
+        rows = jax.tree.map(lambda x: x.reshape(steps // every, every), rows)
+        return jax.lax.scan(some, start, rows)[1]
 
     kept = acceleration.fly(plain, in_components, prepared, state, commands, hold=hold, every=every)
     return stack(kept, prepared.parameters.center_of_gravity)
