@@ -134,6 +134,23 @@ def test_states_on_the_way_are_those_of_the_steps(drones, every, model):
         _close(fly(*alone), expected)
 
 
+def test_long_flights_compile(model):
+    """XLA divides operations that write much between threads, and jaxlib aborts where it does so within a kernel."""
+    states, commands = _states(model, LANES), jnp.full((LANES, 700, 4), 0.55)
+    together = functools.partial(jax.vmap, in_axes=(None, 0, 0))
+    kept = jax.jit(together(rollout))(model, states, commands)
+    last = jax.jit(together(rollout_final))(model, states, commands)
+    _close(jax.tree.map(lambda x: x[:, -1], kept), last)
+
+    def loss(commands):
+        return jnp.sum(together(rollout_final)(model, states, commands).position)
+
+    slopes = jax.jit(jax.grad(loss))(commands)
+    # The last command reaches no position any more: the rotors turn up within its step, and push in the next one.
+    assert np.all(np.isfinite(slopes))
+    assert np.any(slopes[:, :-1] != 0, axis=-1).all()
+
+
 @pytest.mark.parametrize("axes", [(0, None, None), (None, 0, None), (None, None, 0)], ids=["models", "states", "rows"])
 def test_what_is_shared_may_be_anything(axes, model):
     given = (_models(model, 3), _states(model, 3), _commands(3))

@@ -21,7 +21,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from cfb_mjx.model.flight import Flight, flown, pulled, pushed
+from cfb_mjx.model.flight import PACKING, Flight, flown, pulled, pushed
 from cfb_mjx.model.grouped import LANES, grouped
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import Components
@@ -67,6 +67,8 @@ def _evaluated(what, *operands, flight, drones, batched, moving, in_groups):
 
     in_groups = in_groups and (size <= LANES or operands[flight.state].shape[0] == flight.every)
     found = grouped(some, operands, batched, size) if in_groups else some(*operands)
+    if in_groups and what is not pulled:
+        found = PACKING[True][1](found[0], axis=1)
     return [x[..., 0] for x in found] if drones is None else list(found)
 
 

@@ -150,13 +150,12 @@ PACKING = {True: (jnp.stack, _entries), False: (list, lambda numbers, axis=0: nu
 def flown(flight, batched, moving, lanes, packed, *arrays):
     """The states that are kept: their numbers, (kept, lanes) each.
 
-    Where ``packed``, here and below, what a loop keeps is one array, which `one_kernel` writes in place; elsewhere XLA
-    leaves out what nobody needs.
+    Where ``packed``, here and below, what a loop keeps is one array, which `one_kernel` writes in place, and the result
+    is (kept, numbers, lanes); elsewhere XLA leaves out what nobody needs.
     """
     drones = _Drones(flight, batched, lanes, arrays)
-    pack, unpack = PACKING[packed]
-    kept = drones.along(lambda state, row: (drones.forward(state, row), None), pack)[0]
-    return unpack(kept, axis=1)
+    kept = drones.along(lambda state, row: (drones.forward(state, row), None), PACKING[packed][0])[0]
+    return [kept] if packed else kept
 
 
 def pushed(flight, batched, moving, lanes, packed, *operands):

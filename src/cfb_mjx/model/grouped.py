@@ -15,6 +15,10 @@ LANES = 128
 """Examples in a group. A derivative's numbers of one step must fit into the nearest cache, and the start of a kernel be
 little beside its work: from 64 to 256 speed is within a fifth."""
 
+SMALL = 256
+"""Numbers of an example in a result that is packed with others. An operation that writes 512 kB is divided between
+threads by XLA, and jaxlib 0.10.1 cannot do so within a kernel: what is large is returned as the loop wrote it."""
+
 
 def grouped(
     function: Callable[..., Sequence[Array]], arrays: Sequence[Array], batched: Sequence[bool], size: int
@@ -36,8 +40,9 @@ def grouped(
     lanes = size if groups == 1 else 8 * -(-size // (8 * groups))
     shapes = [x.shape[:-1] if b else x.shape for x, b in zip(arrays, batched, strict=True)]
     results: list[tuple[int, ...]] = []
+    small: list[bool] = []
 
-    def one(own: Array, *rest: Array) -> Array:
+    def one(own: Array, *rest: Array) -> list[Array]:
         shared = rest[0] if rest else jnp.zeros(0, own.dtype)
         given, at = [], {True: 0, False: 0}
         for shape, b in zip(shapes, batched, strict=True):
@@ -46,11 +51,13 @@ def grouped(
             at[b] = rows.stop
         found = function(*given)
         results[:] = [x.shape[:-1] for x in found]
+        small[:] = [math.prod(shape) <= SMALL for shape in results]
         # The last row is for `one_kernel`: whatever the function ignores, the kernel does not.
         used = own[:1] + (shared[0] if shared.size else 0)
-        return jnp.concatenate([*(x.reshape(-1, lanes) for x in found), used])
+        packed = jnp.concatenate([*(x.reshape(-1, lanes) for x, s in zip(found, small, strict=True) if s), used])
+        return [packed, *(x.reshape(-1, lanes) for x, s in zip(found, small, strict=True) if not s)]
 
-    # Two arrays in and one out: what a kernel is given and gives is little work for whoever calls it.
+    # Two arrays in and one out, but for what is large: what a kernel is given and gives is little work for its caller.
     own = jnp.concatenate([x.reshape(-1, size) for x, b in zip(arrays, batched, strict=True) if b])
     shared = [x.reshape(-1) for x, b in zip(arrays, batched, strict=True) if not b]
     shared = [jnp.concatenate(shared)] if shared else []
@@ -61,9 +68,10 @@ def grouped(
         own = jnp.pad(own, ((0, 0), (0, groups * lanes - size)), mode="edge")
         own = jnp.moveaxis(own.reshape(-1, lanes, groups), -1, 0)
         found = jax.lax.map(lambda rows: one_kernel(one, rows, *shared), own)
-        found = jnp.moveaxis(found, 0, -1).reshape(found.shape[1], -1)[:, :size]
-    pieces, start = [], 0
-    for shape in results:
-        pieces.append(found[start : start + math.prod(shape)].reshape(*shape, size))
-        start += math.prod(shape)
+        found = [jnp.moveaxis(x, 0, -1).reshape(x.shape[1], -1)[:, :size] for x in found]
+    (packed, *large), pieces, start = found, [], 0
+    for shape, s in zip(results, small, strict=True):
+        rows = packed[start : start + math.prod(shape)] if s else large.pop(0)
+        pieces.append(rows.reshape(*shape, size))
+        start += math.prod(shape) * s
     return pieces

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array
 
 
-def one_kernel(function: Callable[..., Array], *arrays: Array) -> Array:
+def one_kernel(function: Callable[..., Any], *arrays: Array) -> Any:
     """``function(*arrays)``, for CPU: compiled as one function with its loops inside.
 
     XLA's CPU runtime otherwise calls every fused operation of every turn of a loop on its own: a time step of a hundred
