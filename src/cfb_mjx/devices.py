@@ -7,6 +7,7 @@ whole batch is left to the compiler only where it is little more than matrix pro
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,6 +21,11 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from cfb_mjx.errors import CfbError
 
 AXIS = "devices"
+
+
+def cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def test_bench_writes_its_rows(cfb, tmp_path):
     done = cfb("bench", "--drones", "8", "--quick", "--json", tmp_path / "b.json", "--markdown", tmp_path / "b.md")
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "b.json").read_text())["rows"]
-    assert {row["what"] for row in rows} == {"rollout", "rollout_randomised"}
+    assert {row["what"] for row in rows} == {"rollout", "rollout_kept", "rollout_randomised"}
     for row in rows:
         assert row["drones"] == 8
         assert row["steps_per_s"] > 0

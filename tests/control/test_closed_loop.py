@@ -142,7 +142,7 @@ def test_more_than_a_group_at_a_time(monkeypatch):
 
     monkeypatch.setattr(closed_loop, "FEW", 0)
     whole = quick(jax.vmap(fly))(states)
-    monkeypatch.setattr(closed_loop, "AT_ONCE", 3)
+    monkeypatch.setattr(closed_loop, "at_once", lambda: 3)
     # A function of its own: the one above would come from the cache of traces.
     equal(quick(jax.vmap(lambda state: fly(state)))(states), whole)
 

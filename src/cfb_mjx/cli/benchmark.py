@@ -16,7 +16,7 @@ from cfb_mjx.cli.first_call import first_call
 from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.cli.scaling import scaling
 from cfb_mjx.cli.timed_process import TimedProcess
-from cfb_mjx.devices import Devices
+from cfb_mjx.devices import Devices, cores
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json, write_text
 from cfb_mjx.model.acceleration import kernel_is_chosen
@@ -52,11 +52,7 @@ class Peer(TimedProcess):
             raise CfbError(f"--peer-python {python}: crazyflow does not run there ({last}).")
         self.version, self.compile_s, self.steps, self.drones = answer[1], float(answer[2]), int(answer[3]), drones
         self.what = "rollout" if network is None else "rollout_policy"
-        self.cores = (_cores() if core is None else 1) if jax.default_backend() == "cpu" else None
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+        self.cores = (cores() if core is None else 1) if jax.default_backend() == "cpu" else None
 
 
 @contextlib.contextmanager
@@ -90,7 +86,7 @@ def run_bench(
         raise CfbError("--drones must be whole numbers from 1.")
     require_folder(json, markdown)
     # A CPU shows itself as one device per core, where the backend has not started yet.
-    configure_jax(x64=False, devices=_cores())
+    configure_jax(x64=False, devices=cores())
     # A program from the cache would make compile time look like nothing.
     jax.config.update("jax_enable_compilation_cache", False)
     over, rows = Devices.take(jax.local_device_count()), []
@@ -141,9 +137,9 @@ def _peers(python: Path | None, count: int, network: Path | None) -> list[Peer]:
     """crazyflow as its users run it, and on one core, as one device of ours."""
     if python is None:
         return []
-    apart = jax.default_backend() == "cpu" and _cores() > 1
-    cores = [None, min(os.sched_getaffinity(0))] if apart else [None]
-    return [Peer(python, count, network, core) for core in cores]
+    apart = jax.default_backend() == "cpu" and cores() > 1 and hasattr(os, "sched_getaffinity")
+    bound_to = [None, min(os.sched_getaffinity(0))] if apart else [None]
+    return [Peer(python, count, network, core) for core in bound_to]
 
 
 def _others(count: int) -> list:

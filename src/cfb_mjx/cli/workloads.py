@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array
 
-from cfb_mjx.control.closed_loop import AT_ONCE, rollout_closed_loop
+from cfb_mjx.control.closed_loop import at_once, rollout_closed_loop
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.devices import Devices
 from cfb_mjx.files import shipped
@@ -162,7 +162,7 @@ def rollout_policy(drones: int, over: Devices | None = None) -> Workload:
 def network_alone(drones: int) -> Workload:
     """The network of `rollout_policy` as often as there, with nothing to fly: no simulator can be faster with it."""
     controller = load_policy(shipped_policies()["target"]).controller
-    commands, groups = STEPS // 4, -(-drones // AT_ONCE)
+    commands, groups = STEPS // 4, -(-drones // at_once())
 
     def one(shown, _):
         # Every command is seen by the next one; nothing could be left out.

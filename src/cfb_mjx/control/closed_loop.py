@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.pilot import Pilot
+from cfb_mjx.devices import cores
 from cfb_mjx.envs.observation import Estimate
 from cfb_mjx.model.grouped import grouped
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
@@ -28,7 +29,16 @@ FEW = 8
 """Up to so many drones are flown in one compiled function on a CPU, written-out products included: calling one for
 every layer and sum of every command takes longer than the numbers of so few. With more, a matrix library is faster."""
 AT_ONCE = 2048
-"""Drones whose numbers stay in a CPU core's second cache; more are flown one such group after the other."""
+"""Drones whose numbers stay in the second cache of a CPU core."""
+
+
+def at_once() -> int:
+    """More drones under one network than this are flown one such group after the other on a CPU.
+
+    Where a device has several cores, XLA divides what a group computes between them: large groups well, small ones not.
+    """
+    share = cores() // jax.local_device_count()
+    return AT_ONCE if share < 2 else 2 * AT_ONCE * share
 
 
 class ClosedLoop(NamedTuple):
@@ -98,7 +108,7 @@ def rollout_closed_loop(
         own_models, own_pilots = (any(jax.tree.leaves(x)) for x in own_parts[:2])
         if not isinstance(pilot, NeuralController) or own_pilots:
             return jax.vmap(plainly, in_axes=axes(own))(*leaves)
-        if size > AT_ONCE and jax.default_backend() == "cpu":
+        if size > at_once() and jax.default_backend() == "cpu":
             return in_groups(own, leaves)
         few = size <= FEW and fits_one_kernel(model) and len({x.dtype for x in leaves}) == 1
         drones = _Drones(size, own_models, few)
@@ -119,7 +129,7 @@ def rollout_closed_loop(
             mine = iter(own_leaves)
             return one_of_many(together)(*(next(mine) if m else x for x, m in zip(leaves, own, strict=True)))
 
-        return jax.lax.map(one, [x for x, m in zip(leaves, own, strict=True) if m], batch_size=AT_ONCE)
+        return jax.lax.map(one, [x for x, m in zip(leaves, own, strict=True) if m], batch_size=at_once())
 
     flown = differentiated_as(one_of_many(together), plainly)(*leaves)
     return jax.tree.unflatten(results[0], flown)
