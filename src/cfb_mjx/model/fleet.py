@@ -65,6 +65,7 @@ def _evaluated(what, *operands, flight, drones, batched, moving, in_groups):
         lanes = next(x.shape[-1] for x, b in zip(operands, batched, strict=True) if b)
         return what(flight, batched, moving, lanes, in_groups, *operands)
 
+    # Of more drones than a group, states on the way take longer to move than to compute.
     in_groups = in_groups and (size <= LANES or operands[flight.state].shape[0] == flight.every)
     found = grouped(some, operands, batched, size) if in_groups else some(*operands)
     if in_groups and what is not pulled:

@@ -15,9 +15,9 @@ LANES = 128
 """Examples in a group. A derivative's numbers of one step must fit into the nearest cache, and the start of a kernel be
 little beside its work: from 64 to 256 speed is within a fifth."""
 
-SMALL = 256
-"""Numbers of an example in a result that is packed with others. An operation that writes 512 kB is divided between
-threads by XLA, and jaxlib 0.10.1 cannot do so within a kernel: what is large is returned as the loop wrote it."""
+PACKED_BYTES = 2**17
+"""Most of what is put together as one array within a kernel. An operation that reads and writes 512 kB is divided
+between threads by XLA, which jaxlib 0.10.1 cannot do there."""
 
 
 def grouped(
@@ -40,7 +40,7 @@ def grouped(
     lanes = size if groups == 1 else 8 * -(-size // (8 * groups))
     shapes = [x.shape[:-1] if b else x.shape for x, b in zip(arrays, batched, strict=True)]
     results: list[tuple[int, ...]] = []
-    small: list[bool] = []
+    packs: list[list[int]] = []
 
     def one(own: Array, *rest: Array) -> list[Array]:
         shared = rest[0] if rest else jnp.zeros(0, own.dtype)
@@ -51,13 +51,14 @@ def grouped(
             at[b] = rows.stop
         found = function(*given)
         results[:] = [x.shape[:-1] for x in found]
-        small[:] = [math.prod(shape) <= SMALL for shape in results]
-        # The last row is for `one_kernel`: whatever the function ignores, the kernel does not.
+        packs[:] = _packs([x.nbytes for x in found])
+        # For `one_kernel`: whatever the function ignores, the kernel does not.
         used = own[:1] + (shared[0] if shared.size else 0)
-        packed = jnp.concatenate([*(x.reshape(-1, lanes) for x, s in zip(found, small, strict=True) if s), used])
-        return [packed, *(x.reshape(-1, lanes) for x, s in zip(found, small, strict=True) if not s)]
+        rows = [x.reshape(-1, lanes) for x in found]
+        # What is alone may be large: it is returned as a loop wrote it.
+        return [rows[p[0]] if len(p) == 1 else jnp.concatenate([rows[i] for i in p]) for p in packs] + [used]
 
-    # Two arrays in and one out, but for what is large: what a kernel is given and gives is little work for its caller.
+    # Few arrays in and out: what a kernel is given and gives is work for its caller.
     own = jnp.concatenate([x.reshape(-1, size) for x, b in zip(arrays, batched, strict=True) if b])
     shared = [x.reshape(-1) for x, b in zip(arrays, batched, strict=True) if not b]
     shared = [jnp.concatenate(shared)] if shared else []
@@ -69,9 +70,23 @@ def grouped(
         own = jnp.moveaxis(own.reshape(-1, lanes, groups), -1, 0)
         found = jax.lax.map(lambda rows: one_kernel(one, rows, *shared), own)
         found = [jnp.moveaxis(x, 0, -1).reshape(x.shape[1], -1)[:, :size] for x in found]
-    (packed, *large), pieces, start = found, [], 0
-    for shape, s in zip(results, small, strict=True):
-        rows = packed[start : start + math.prod(shape)] if s else large.pop(0)
-        pieces.append(rows.reshape(*shape, size))
-        start += math.prod(shape) * s
+    pieces = []
+    for pack, rows in zip(packs, found[:-1], strict=True):
+        start = 0
+        for shape in (results[i] for i in pack):
+            pieces.append(rows[start : start + math.prod(shape)].reshape(*shape, size))
+            start += math.prod(shape)
     return pieces
+
+
+def _packs(sizes: Sequence[int]) -> list[list[int]]:
+    """Neighbours among things of these sizes, as many together as `PACKED_BYTES` allow."""
+    packs: list[list[int]] = []
+    total = 0
+    for i, size in enumerate(sizes):
+        if not packs or total + size > PACKED_BYTES:
+            packs.append([])
+            total = 0
+        packs[-1].append(i)
+        total += size
+    return packs
