@@ -77,11 +77,13 @@ def equal(a, b):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **CLOSE), a, b)
 
 
-@pytest.fixture(params=["in one function", "with a matrix library"])
+@pytest.fixture(params=["in one function", "in one per command", "drones by operation"])
 def way(request, monkeypatch):
     """How drones are flown together: these tests have few, which would all go one way."""
-    if request.param == "with a matrix library":
+    if request.param != "in one function":
         monkeypatch.setattr(closed_loop, "FEW", 0)
+    if request.param == "drones by operation":
+        monkeypatch.setattr(closed_loop, "LANES", 0)
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -143,7 +145,9 @@ def test_more_than_a_group_at_a_time(monkeypatch):
     monkeypatch.setattr(closed_loop, "FEW", 0)
     whole = quick(jax.vmap(fly))(states)
     monkeypatch.setattr(closed_loop, "at_once", lambda: 3)
-    # A function of its own: the one above would come from the cache of traces.
+    # Functions of their own: the one above would come from the cache of traces.
+    equal(quick(jax.vmap(lambda state: fly(state)))(states), whole)
+    monkeypatch.setattr(closed_loop, "LANES", 0)
     equal(quick(jax.vmap(lambda state: fly(state)))(states), whole)
 
 

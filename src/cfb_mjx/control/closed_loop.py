@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,8 +18,9 @@ from jaxtyping import Array, Float
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.pilot import Pilot
 from cfb_mjx.devices import cores
-from cfb_mjx.envs.observation import Estimate
-from cfb_mjx.model.grouped import grouped
+from cfb_mjx.envs.observation import Estimate, observation, remember
+from cfb_mjx.model.grouped import LANES, PACKED_BYTES, grouped
+from cfb_mjx.model.one_kernel import one_kernel
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.rollout import fits_one_kernel, fly_rows, in_components
 from cfb_mjx.model.state import State, stack
@@ -110,8 +112,9 @@ def rollout_closed_loop(
             return jax.vmap(plainly, in_axes=axes(own))(*leaves)
         if size > at_once() and jax.default_backend() == "cpu":
             return in_groups(own, leaves)
-        few = size <= FEW and fits_one_kernel(model) and len({x.dtype for x in leaves}) == 1
-        drones = _Drones(size, own_models, few)
+        fits = fits_one_kernel(model) and len({x.dtype for x in leaves}) == 1
+        few = fits and size <= FEW
+        drones = _Drones(size, own_models, few, between=fits and FEW < size <= LANES)
 
         def flown(*leaves):
             model, pilot, *rest = jax.tree.unflatten(structure, leaves)
@@ -144,6 +147,8 @@ class _Drones(NamedTuple):
     """Whether the model has the axis too."""
     few: bool
     """Whether the whole loop is to be one compiled function."""
+    between: bool = False
+    """Whether all that happens between two evaluations of the network is to be one."""
 
     def each(self, function: Callable, *arguments) -> Any:
         """``function(model, ...)`` of one drone, for each; what comes after the model has the axis."""
@@ -187,6 +192,16 @@ def _loop(drones: _Drones, model, pilot, state, target, memory, hold: int, comma
         command = command.astype(before.dtype)
         return (drones.each(moved, prepared, at, command), memory, command), None
 
+    def after(prepared, target, at, memory, command):
+        """What a network's ``command`` leads to: state, memory and the next observation."""
+        memory = remember(pilot.layout, memory, drones.each(seen, prepared, at, target), command)
+        at = drones.each(moved, prepared, at, command)
+        return at, memory, observation(pilot.layout, memory, drones.each(seen, prepared, at, target))
+
+    if drones.between:
+        shown = observation(pilot.layout, memory, drones.each(seen, prepared, at, target))
+        if sum(x.nbytes for x in jax.tree.leaves((at, memory, shown))) <= PACKED_BYTES:
+            return _by_kernel(drones, pilot, after, kept_of, prepared, target, (at, memory, shown), commands, every)
     pack, unpack = _packing(jax.eval_shape(kept_of, at, command)) if drones.few else (lambda x: x, lambda x: x)
 
     def some(carry, _):
@@ -198,9 +213,43 @@ def _loop(drones: _Drones, model, pilot, state, target, memory, hold: int, comma
     return ClosedLoop(*unpack(kept), memory)
 
 
+def _by_kernel(drones, pilot, after, kept_of, prepared, target, first, commands: int, every: int) -> ClosedLoop:
+    """The loop of a network with one kernel per command: one array of all that changes, one of what each drone has of
+    its own, one of what they share."""
+    leaves, static = eqx.partition(prepared, eqx.is_array)
+    shared, own = ((), (leaves, target)) if drones.own_models else (leaves, target)
+    (pack, unpack), (pack_own, unpack_own) = _packing(first), _packing(own)
+    numbers, structure = jax.tree.flatten(shared)
+    ends = np.cumsum([x.size for x in numbers])[:-1]
+
+    def kernel(packed, command, own, *shared):
+        pieces = zip(jnp.split(shared[0], ends), numbers, strict=True) if shared else ()
+        leaves = jax.tree.unflatten(structure, [x.reshape(like.shape) for x, like in pieces])
+        leaves, target = unpack_own(own) if drones.own_models else (leaves, unpack_own(own))
+        changed = pack(after(eqx.combine(leaves, static), target, *unpack(packed)[:2], command))
+        # The last row is for `one_kernel`: whatever the function ignores, the kernel does not.
+        return jnp.concatenate([changed, sum(x[:1] for x in (packed, command, own, *shared))])
+
+    own, shared = pack_own(own), [jnp.concatenate([x.reshape(-1) for x in numbers])] if numbers else []
+
+    def one(carry, _):
+        packed, before = carry
+        command = pilot.act(packed[-pilot.layout.size :]).astype(before.dtype)
+        return (one_kernel(kernel, packed, command, own, *shared)[:-1], command), None
+
+    def some(carry, _):
+        carry = jax.lax.scan(one, carry, length=every)[0]
+        return carry, carry
+
+    start = pack(first), jnp.zeros((4, drones.count), own.dtype)
+    (packed, _), kept = jax.lax.scan(some, start, length=commands // every)
+    state, command = jax.vmap(lambda packed, command: kept_of(unpack(packed)[0], command))(*kept)
+    return ClosedLoop(state, command, unpack(packed)[1])
+
+
 def _packing(example: Any) -> tuple[Callable, Callable]:
     """What makes one array of a tree of arrays (..., drones), as `one_kernel` wants what a loop keeps, and what makes a
-    tree of many such."""
+    tree of one such, or of many."""
     leaves, structure = jax.tree.flatten(example)
     ends = np.cumsum([math.prod(x.shape[:-1]) for x in leaves])
 
@@ -209,6 +258,6 @@ def _packing(example: Any) -> tuple[Callable, Callable]:
 
     def unpack(packed):
         pieces = zip(jnp.split(packed, ends[:-1], axis=-2), leaves, strict=True)
-        return jax.tree.unflatten(structure, [x.reshape(-1, *like.shape) for x, like in pieces])
+        return jax.tree.unflatten(structure, [x.reshape(*packed.shape[:-2], *like.shape) for x, like in pieces])
 
     return pack, unpack
