@@ -13,6 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from cfb_mjx.control.neural import NeuralController
@@ -219,18 +220,15 @@ def _by_kernel(drones, pilot, after, kept_of, prepared, target, first, commands:
     leaves, static = eqx.partition(prepared, eqx.is_array)
     shared, own = ((), (leaves, target)) if drones.own_models else (leaves, target)
     (pack, unpack), (pack_own, unpack_own) = _packing(first), _packing(own)
-    numbers, structure = jax.tree.flatten(shared)
-    ends = np.cumsum([x.size for x in numbers])[:-1]
+    flat, whole = ravel_pytree(shared)
 
     def kernel(packed, command, own, *shared):
-        pieces = zip(jnp.split(shared[0], ends), numbers, strict=True) if shared else ()
-        leaves = jax.tree.unflatten(structure, [x.reshape(like.shape) for x, like in pieces])
-        leaves, target = unpack_own(own) if drones.own_models else (leaves, unpack_own(own))
+        leaves, target = unpack_own(own) if drones.own_models else (whole(*shared), unpack_own(own))
         changed = pack(after(eqx.combine(leaves, static), target, *unpack(packed)[:2], command))
         # The last row is for `one_kernel`: whatever the function ignores, the kernel does not.
         return jnp.concatenate([changed, sum(x[:1] for x in (packed, command, own, *shared))])
 
-    own, shared = pack_own(own), [jnp.concatenate([x.reshape(-1) for x in numbers])] if numbers else []
+    own, shared = pack_own(own), () if drones.own_models else (flat,)
 
     def one(carry, _):
         packed, before = carry
