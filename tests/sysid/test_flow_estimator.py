@@ -82,5 +82,7 @@ def test_what_is_too_short_is_refused():
     log = flown(1.0, 0.0, seconds=2.0)
     with pytest.raises(CfbError, match=rf"{log.name}: too little flight"):
         fit_flow_estimator([log])
+    with pytest.raises(CfbError, match=rf"{log.name}: too little flight"):
+        fit_flow_estimator([log.rows(slice(0, 2))])
     with pytest.raises(CfbError, match="no logs"):
         fit_flow_estimator([])

@@ -103,7 +103,7 @@ def fit_flow_estimator(logs: Sequence[FlightLog], scale: float = 1.0, ignored: f
     Raises:
         CfbError: too little flight without a gap.
     """
-    seen = [one for one in map(_seen, logs) if len(one.begins)]
+    seen = [one for one in (_seen(log) for log in logs if log.duration > 2 * SPAN) if len(one.begins)]
     if sum(len(one.begins) for one in seen) < LEAST_SPANS:
         names = ", ".join(log.name for log in logs) or "no logs"
         raise CfbError(f"{names}: too little flight without a gap to compare the attitude with the gyro.")
