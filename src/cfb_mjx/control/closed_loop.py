@@ -31,8 +31,8 @@ from cfb_mjx.model.vector import Vec
 FEW = 8
 """Up to so many drones are flown in one compiled function on a CPU, written-out products included: calling one for
 every layer and sum of every command takes longer than the numbers of so few. With more, a matrix library is faster."""
-AT_ONCE = 2048
-"""Drones whose numbers stay in the second cache of a CPU core."""
+AT_ONCE = 1024
+"""Drones whose numbers stay in the second cache of a CPU core, with room for what else is kept there."""
 
 
 def at_once() -> int:
@@ -41,7 +41,7 @@ def at_once() -> int:
     Where a device has several cores, XLA divides what a group computes between them: large groups well, small ones not.
     """
     share = cores() // jax.local_device_count()
-    return AT_ONCE if share < 2 else 2 * AT_ONCE * share
+    return AT_ONCE if share < 2 else 4 * AT_ONCE * share
 
 
 class ClosedLoop(NamedTuple):
@@ -151,6 +151,11 @@ class _Drones(NamedTuple):
     between: bool = False
     """Whether all that happens between two evaluations of the network is to be one."""
 
+    @property
+    def many(self) -> bool:
+        """Whether moving numbers costs more than calling functions."""
+        return self.count is not None and self.count > LANES
+
     def each(self, function: Callable, *arguments) -> Any:
         """``function(model, ...)`` of one drone, for each; what comes after the model has the axis."""
         if self.count is None:
@@ -205,8 +210,11 @@ def _loop(drones: _Drones, model, pilot, state, target, memory, hold: int, comma
             return _by_kernel(drones, pilot, after, kept_of, prepared, target, (at, memory, shown), commands, every)
     pack, unpack = _packing(jax.eval_shape(kept_of, at, command)) if drones.few else (lambda x: x, lambda x: x)
 
+    # What every turn moves on by one place, the memory, is then copied in every second only.
+    turns = 2 if drones.many and every > 1 else 1
+
     def some(carry, _):
-        carry = jax.lax.scan(one, carry, length=every)[0]
+        carry = jax.lax.scan(one, carry, length=every, unroll=turns)[0]
         at, _, command = carry
         return carry, pack(kept_of(at, command))
 

@@ -36,6 +36,8 @@ class Network(eqx.Module):
 
     def columns(self, x: Float[Array, "inputs drones"]) -> Float[Array, "outputs drones"]:
         """The same for many whose axis is the last one."""
+        # Of an x that was just put together, XLA would otherwise make a product per part, and add those up.
+        x = jax.lax.optimization_barrier(x)
         return self._through(lambda weight, bias, x: weight.T @ x + bias[:, None], x)
 
     def _through(self, layer: Callable, x: Array) -> Array:
