@@ -35,6 +35,7 @@ from cfb_mjx.model.effects import (
     Payload,
     PayloadSwing,
     Reading,
+    RoomCirculation,
     RotorDrag,
     ThrustScale,
     ThrustTilt,
@@ -62,6 +63,7 @@ AIR = {
     "parasitic_drag": ParasiticDrag(0.0, 0.01),
     "blade_flapping": BladeFlapping(8e-4, 0.3, 0.2),
     "wind": Wind([2.0, -1.0, 0.5], 0.03),
+    "room_circulation": RoomCirculation([4e-4, -3e-4], [0.01, 0.02]),
 }
 
 
@@ -97,6 +99,13 @@ def _wrench(constants, y, on):
         torque += 8e-4 * speed.mean() / 1594 * np.exp(0.3 * v[2]) * np.array([-0.8 * v[1], 1.2 * v[0], 0.0])
     if "wind" in on:
         force += matrix.T @ (0.03 * np.array([2.0, -1.0, 0.5]))
+    if "room_circulation" in on:
+        # As blade flapping and rotor drag of an airspeed that grows with the distance from the middle.
+        place = y[:3] + matrix @ constants.center_of_gravity
+        along_x, along_y = matrix.T @ [place[0], 0.0, 0.0], matrix.T @ [0.0, place[1], 0.0]
+        ratio, airspeed = speed.mean() / 1594, 4e-4 * along_x - 3e-4 * along_y
+        torque += ratio * np.cross([0.0, 0.0, 1.0], airspeed)
+        force -= ratio * (0.01 * along_x + 0.02 * along_y)
     return force, torque
 
 
@@ -123,7 +132,7 @@ def _truth(constants, y, commands, on):
 @pytest.fixture(scope="module")
 def low_flight():
     y, commands = helpers.aggressive_manoeuvre(0.08, seed=2)
-    y[2] = 0.2
+    y[:3] = 0.6, -0.4, 0.2
     return y, commands
 
 

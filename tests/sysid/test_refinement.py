@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.labelled_plants import Case, fly_campaigns
+from cfb_mjx.labelled_plants import EFFECTS, Case, fly_campaigns
+from cfb_mjx.labelled_plants.effects import put
 from cfb_mjx.logs import read_log
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import Inertia, RotorDrag
@@ -50,6 +51,28 @@ def test_drag_comes_back_and_flights_not_fitted_are_predicted_better(campaign, r
     key = "velocity_rmse_mps@0.5s"
     before = evaluate(Quadrotor(GUARDS()), campaign.held_out).metrics("commands_in")[key]
     assert evaluate(refined.model, campaign.held_out).metrics("commands_in")[key] < 0.5 * before
+
+
+def test_air_drawn_to_the_middle_of_a_room_is_told_by_moment_and_drag_alike(monkeypatch):
+    """Flown closed loop through air that converges; drag and hub moments of the plant saturate, as in the other tests.
+
+    Both gradients over their coefficients are the air's convergence, and without the effect the flights not fitted to
+    are predicted worse.
+    """
+    convergence = 0.4
+    monkeypatch.setitem(EFFECTS, "circulating_room", lambda rng, drone, strength: put(drone, convergence=convergence))
+    strengths = (("rotor_drag", 1.0), ("blade_flapping", 1.0), ("circulating_room", 1.0))
+    flown = fly_campaigns([Case("room", 9010, strengths)], duration_scale=0.35)[0]
+    beside = ("rotor_drag", "blade_flapping")
+    found = refine(Quadrotor(GUARDS()), flown.fit, plausible_numbers(GUARDS(), (*beside, "room_circulation")))
+    value = dict(zip([n.name for n in found.numbers], found.values, strict=True))
+    for field, per_speed in (("moment_gradient", "blade_flapping"), ("drag_gradient", "rotor_drag")):
+        told = [value[f"room_circulation.{field}[{i}]"] / value[f"{per_speed}.coefficient"] for i in range(2)]
+        np.testing.assert_allclose(told, convergence, rtol=0.2)
+    still = refine(Quadrotor(GUARDS()), flown.fit, plausible_numbers(GUARDS(), beside))
+    errors = [evaluate(one.model, flown.held_out).metrics("commands_in") for one in (found, still)]
+    for key in ("attitude_mean_deg@0.5s", "velocity_mean_mps@0.5s"):
+        assert errors[0][key] < 0.3 * errors[1][key]
 
 
 def test_trims_of_healthy_flights_are_small_and_have_no_mean(refined):

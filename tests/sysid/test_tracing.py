@@ -223,6 +223,17 @@ def test_named_effects_are_fitted_to_innovations(campaigns, base):
         fit_given(campaign.fit, base.parameters(), ("warp",))
 
 
+def test_what_no_search_looks_for_takes_part_where_it_is_named_or_declared(campaigns, base):
+    def names(*given):
+        return Search.start(campaigns["clean"].fit[:1], base.parameters(), 0.008, sensors, *given).names
+
+    sensors = check_sensors(campaigns["clean"].fit, 0.008)
+    assert "room_circulation" not in names()
+    assert len(names()) == len(CATALOGUE) - 1
+    assert "room_circulation" in names((), ["room_circulation"])
+    assert "room_circulation" in names((CATALOGUE["room_circulation"].neutral(),))
+
+
 def test_nothing_is_reported_on_a_clean_drone(campaigns, base):
     found = trace(campaigns["clean"].fit, base.parameters())
     assert found.found == []

@@ -67,6 +67,8 @@ def derivative(p: SimpleNamespace, x: np.ndarray, command: np.ndarray, held: Sim
     q, w, speed = x[Q], x[W], x[SPEED]
     rotation = rotation_of(q)
     body_velocity = turn_back(rotation, x[V])
+    if "convergence" in p.on:  # what the drone feels is its velocity through the air
+        body_velocity = body_velocity + turn_back(rotation, p.convergence * x[P] * np.array([[1.0], [1.0], [0.0]]))
     extra = len(x) > PLAIN_ROWS
     speed_rate, esc_rate, lag_rate = motor_rates(
         p, held.gain, command, speed, x[ESC] if extra else None, x[LAGGED] if extra else None

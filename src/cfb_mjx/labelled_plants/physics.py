@@ -25,6 +25,7 @@ NOMINAL: dict[str, object] = {
     "wind": (0.0, 0.0),  # N, horizontal, world, at 1 m height
     "gust": 0.0,  # N rms
     "shear": 0.15,  # exponent of the wind's profile
+    "convergence": 0.0,  # 1/s: share of its way to the middle of the room the air moves in a second
     "inflow": 0.0,
     "ground": 0.0,  # m^2: square of the effective radius over 16
     "ground_core": 0.06,  # m of height below which the effect levels off

@@ -63,7 +63,8 @@ class Effect(eqx.Module):
 
     Every subclass sets ``name`` (DESIGN names), ``units`` (per field), ``source``, ``prior`` (per field, the plausible
     range as low and high) and has a ``neutral()`` at which it vanishes. For tracing it says which fields measure its
-    strength (``strengths``; the others describe its shape) and at which values it is looked for first (``probes``).
+    strength (``strengths``; the others describe its shape), at which values it is looked for first (``probes``) and
+    whether a search looks for it at all or only who names it gets it fitted (``searched``).
     """
 
     name: ClassVar[str]
@@ -72,6 +73,7 @@ class Effect(eqx.Module):
     prior: ClassVar[dict[str, tuple[float, float]]]
     strengths: ClassVar[tuple[str, ...]]
     probes: ClassVar[tuple[dict[str, float], ...]] = ({},)
+    searched: ClassVar[bool] = True
 
     @classmethod
     def neutral(cls) -> Effect:

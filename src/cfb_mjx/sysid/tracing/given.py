@@ -57,7 +57,7 @@ def fit_given(
     progress("comparing the sensors with each other")
     sensors = check_sensors(list(logs), delay)
     sensors = replace(sensors, faults=HEALTHY) if as_logged else sensors
-    search = Search.start(list(logs), parameters, delay, sensors, declared)
+    search = Search.start(list(logs), parameters, delay, sensors, declared, names)
     progress("replaying the declared model")
     hypothesis = search.settled(replace(search.learned(search.nothing()), present=tuple(names)))
     for number in range(1, ROUNDS):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
@@ -135,11 +136,17 @@ class Search:
         delay: float,
         sensors: SensorCheck,
         declared: tuple[Effect, ...] = (),
+        named: Sequence[str] = (),
     ) -> Search:
-        """Prepare flights, with what is known of their sensors taken out, for a search over the whole catalogue."""
+        """Prepare flights, with what is known of their sensors taken out, for a search over the catalogue.
+
+        Effects that no search looks for (`Effect.searched`) take part if they are declared or ``named``.
+        """
         logs = [sensors.corrected(log) for log in logs]
         noise = sensor_noise(logs, FILTERED_GYRO if sensors.faults.gyro_lag else 1e-3)
-        return cls(parameters, logs, delay, noise, tuple(CATALOGUE), declared)
+        asked_for = {*named, *(type(effect).name for effect in declared)}
+        looked_for = tuple(name for name, kind in CATALOGUE.items() if kind.searched or name in asked_for)
+        return cls(parameters, logs, delay, noise, looked_for, declared)
 
     def flights(self, hypothesis: Hypothesis) -> list[Flight]:
         """The flights as a hypothesis reads them."""
