@@ -63,7 +63,7 @@ AIR = {
     "parasitic_drag": ParasiticDrag(0.0, 0.01),
     "blade_flapping": BladeFlapping(8e-4, 0.3, 0.2),
     "wind": Wind([2.0, -1.0, 0.5], 0.03),
-    "room_circulation": RoomCirculation([4e-4, -3e-4], [0.01, 0.02]),
+    "room_circulation": RoomCirculation([4e-4, -3e-4]),
 }
 
 
@@ -100,12 +100,10 @@ def _wrench(constants, y, on):
     if "wind" in on:
         force += matrix.T @ (0.03 * np.array([2.0, -1.0, 0.5]))
     if "room_circulation" in on:
-        # As blade flapping and rotor drag of an airspeed that grows with the distance from the middle.
+        # As blade flapping of an airspeed that grows with the distance from the middle.
         place = y[:3] + matrix @ constants.center_of_gravity
-        along_x, along_y = matrix.T @ [place[0], 0.0, 0.0], matrix.T @ [0.0, place[1], 0.0]
-        ratio, airspeed = speed.mean() / 1594, 4e-4 * along_x - 3e-4 * along_y
-        torque += ratio * np.cross([0.0, 0.0, 1.0], airspeed)
-        force -= ratio * (0.01 * along_x + 0.02 * along_y)
+        airspeed = matrix.T @ [4e-4 * place[0], -3e-4 * place[1], 0.0]
+        torque += speed.mean() / 1594 * np.cross([0.0, 0.0, 1.0], airspeed)
     return force, torque
 
 
