@@ -43,7 +43,7 @@ BESIDE = ("blade_flapping", "thrust_scale", "inertia")
 """Fitted with the motors, so that these do not have to stand in for them."""
 BODY = (
     *("blade_flapping", "inflow_thrust", "rotor_drag", "thrust_scale"),
-    *("inertia", "cog_offset", "torque_scale", "thrust_tilt", "room_circulation"),
+    *("inertia", "cog_offset", "torque_scale", "thrust_tilt", "position_moment"),
 )
 GENTLE = 7
 """Gentle flights among those fitted: the square counts as much as all of them, for the two are judged side by side."""
@@ -148,36 +148,31 @@ def _in_step(parts: list[tuple[np.ndarray, np.ndarray]], step: float) -> float:
     return float(np.linalg.lstsq(np.stack([one, beside], axis=1), other)[0][0])
 
 
-def by_place(logs: list[FlightLog]) -> dict[str, list[tuple[float, float]]]:
-    """What moves per distance from the middle, 1/s, along x and y, the mean of the flights and its standard deviation:
-    what the velocity column takes off, beside a scale and an age of its own; and the air, by the drag that the
-    accelerometer feels beside that of the motion (thrust that leans and a lag of the drag are fitted too)."""
+def by_place(logs: list[FlightLog]) -> dict[str, dict[str, list[float]]]:
+    """What moves per distance from the middle, 1/s, along x and y, by flight: what the velocity column takes off, its
+    scale and age apart; and the air, by the drag that the accelerometer feels beside that of the motion, thrust that
+    leans and a lag of the drag apart."""
     step, edge = 0.01, 150
     sos = butter(2, SLOW, fs=1 / step, output="sos")
-    found: dict[str, list] = {"column": [], "drag": []}
+    found = {}
     for log in logs:
         grid = np.arange(log.time[0], log.time[-1], step)
-        across = np.array([1.0, 1.0, 0.0])
-        in_body = [to_body(log.quaternion, x) for x in (log.velocity, log.position * across)]
+        in_body = [to_body(log.quaternion, x) for x in (log.velocity, log.position * [1.0, 1.0, 0.0])]
         raw = (log.position, log.velocity, log.specific_force, *in_body)
         place, speed, force, own_speed, own_place = (
             sosfiltfilt(sos, interpolate(log.time, x, grid), axis=0) for x in raw
         )
         slope, turn = (np.gradient(x, step, axis=0) for x in (place, own_speed))
         one = np.ones(len(grid))
-        fits: dict[str, list] = {name: [] for name in found}
+        column, drag = [], []
         for i in range(2):
             beside = np.stack([place[:, i], slope[:, i], np.gradient(slope[:, i], step), one], axis=1)[edge:-edge]
-            fits["column"].append(-np.linalg.lstsq(beside, speed[edge:-edge, i])[0][0])
+            column.append(float(-np.linalg.lstsq(beside, speed[edge:-edge, i])[0][0]))
             felt = np.stack([own_place[:, i], own_speed[:, i], turn[:, i], force[:, 2], one], axis=1)[edge:-edge]
-            pull, drag = np.linalg.lstsq(felt, force[edge:-edge, i])[0][:2]
-            fits["drag"].append(pull / drag)
-        for name, pair in fits.items():
-            found[name].append(pair)
-    return {
-        name: list(zip(np.mean(x, axis=0).tolist(), (np.std(x, axis=0, ddof=1) / len(x) ** 0.5).tolist(), strict=True))
-        for name, x in found.items()
-    }
+            pull, per_speed = np.linalg.lstsq(felt, force[edge:-edge, i])[0][:2]
+            drag.append(float(pull / per_speed))
+        found[log.name] = {"column": column, "drag": drag}
+    return found
 
 
 def without_each(plant: ModelFile, fit: list[FlightLog], judged: list[FlightLog]) -> dict:

@@ -81,9 +81,9 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "|---|---|---:|---|",
             *_effects(models["plant"], results),
             "",
-            "## The room",
+            "## The position",
             "",
-            *_room(models["plant"], results["place"], results["slow"]),
+            *_position(models["plant"], results["place"], results["slow"]),
             "",
             "## The velocity column",
             "",
@@ -157,26 +157,39 @@ def _story(results: dict) -> list[str]:
     return text
 
 
-def _room(plant: ModelFile, told: dict[str, list], slow: float) -> list[str]:
+def _position(plant: ModelFile, told: dict[str, dict], slow: float) -> list[str]:
     effects = {e["name"]: e for e in plant.effects}
-    room, flapping = effects["room_circulation"], effects["blade_flapping"]["parameters"]
+    moment, flapping = effects["position_moment"], effects["blade_flapping"]["parameters"]
+    kinds: dict[str, list[dict]] = {}
+    for name, one in told.items():
+        kinds.setdefault(name.split("_")[0].rstrip("12"), []).append(one)
     rows = []
     for i, (axis, share) in enumerate((("x", 1 + flapping["anisotropy"]), ("y", 1 - flapping["anisotropy"]))):
-        gradient, std = (room[kind]["moment_gradient"][i] for kind in ("parameters", "uncertainty"))
+        gradient, std = (moment[kind]["gradient"][i] for kind in ("parameters", "uncertainty"))
         per_speed = flapping["coefficient"] * share
-        cells = (gradient / per_speed, abs(std / per_speed)), told["drag"][i], told["column"][i]
-        rows.append(f"| {axis} | " + " | ".join(f"{m:.3f} +- {s:.3f}" for m, s in cells) + " |")
+        cells = [f"{gradient / per_speed:.3f} +- {abs(std / per_speed):.3f}"]
+        cells += [_mean([one["drag"][i] for one in some]) for some in kinds.values()]
+        cells += [_mean([one["column"][i] for one in told.values()])]
+        rows.append(f"| {axis} | " + " | ".join(cells) + " |")
     return [
-        "`room_circulation` lets the moment hang on the place as it would in air that moves towards the middle of the",
+        "`position_moment` lets a torque hang on the position as it would in air that moves towards the middle of the",
         "room, the faster the farther out. By which share of the distance a second, 1/s, in the flights fitted to:",
         "told by the moments (over `blade_flapping`); by the accelerometer, which feels the drag of that air beside",
-        f"the drag of the motion (below {slow:g} Hz); and what of both is no air: what the velocity column, from which",
-        "the model takes its airspeed, lacks against the slope of the position.",
+        f"the drag of the motion (below {slow:g} Hz), reference by reference; and what of both is no air: what the",
+        "velocity column, from which the model takes its airspeed, lacks against the slope of the position.",
         "",
-        "| axis | by moments | by drag | missing from the velocity column |",
-        "|---|---:|---:|---:|",
+        "| axis | by moments |" + "".join(f" by drag, {kind} |" for kind in kinds) + " velocity column |",
+        "|---|---:|" + "---:|" * len(kinds) + "---:|",
         *rows,
     ]
+
+
+def _mean(values: list[float]) -> str:
+    mean = sum(values) / len(values)
+    if len(values) == 1:
+        return f"{mean:.3f}"
+    spread = (sum((x - mean) ** 2 for x in values) / (len(values) - 1) / len(values)) ** 0.5
+    return f"{mean:.3f} +- {spread:.3f}"
 
 
 def _columns(seen: dict, tilted_by: dict) -> list[str]:
@@ -240,7 +253,7 @@ ARGUMENTS = {
     "cog_offset": "the mean place of the batteries; every flight has its own besides",
     "torque_scale": "less reactive torque; yaw only",
     "thrust_tilt": "rotors a few milliradians off the vertical",
-    "room_circulation": "the air of the room, drawn inwards by the drone's own jet; see below",
+    "position_moment": "a velocity column that leans towards the middle, and perhaps air that moves there; see below",
     "battery_sag": "rotor speed follows the charge of the battery, little its dips under load (hence the lag)",
     "motor_asymmetry": "motors are driven up and coast down",
 }

@@ -34,8 +34,8 @@ from cfb_mjx.model.effects import (
     ParasiticDrag,
     Payload,
     PayloadSwing,
+    PositionMoment,
     Reading,
-    RoomCirculation,
     RotorDrag,
     ThrustScale,
     ThrustTilt,
@@ -63,7 +63,7 @@ AIR = {
     "parasitic_drag": ParasiticDrag(0.0, 0.01),
     "blade_flapping": BladeFlapping(8e-4, 0.3, 0.2),
     "wind": Wind([2.0, -1.0, 0.5], 0.03),
-    "room_circulation": RoomCirculation([4e-4, -3e-4]),
+    "position_moment": PositionMoment([4e-4, -3e-4]),
 }
 
 
@@ -99,7 +99,7 @@ def _wrench(constants, y, on):
         torque += 8e-4 * speed.mean() / 1594 * np.exp(0.3 * v[2]) * np.array([-0.8 * v[1], 1.2 * v[0], 0.0])
     if "wind" in on:
         force += matrix.T @ (0.03 * np.array([2.0, -1.0, 0.5]))
-    if "room_circulation" in on:
+    if "position_moment" in on:
         # As blade flapping of an airspeed that grows with the distance from the middle.
         place = y[:3] + matrix @ constants.center_of_gravity
         airspeed = matrix.T @ [4e-4 * place[0], -3e-4 * place[1], 0.0]

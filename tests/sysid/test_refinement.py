@@ -64,10 +64,10 @@ def test_air_drawn_to_the_middle_of_a_room_is_told_by_the_moments(monkeypatch):
     strengths = (("rotor_drag", 1.0), ("blade_flapping", 1.0), ("circulating_room", 1.0))
     flown = fly_campaigns([Case("room", 9010, strengths)], duration_scale=0.35)[0]
     beside = ("rotor_drag", "blade_flapping")
-    found = refine(Quadrotor(GUARDS()), flown.fit, plausible_numbers(GUARDS(), (*beside, "room_circulation")))
+    found = refine(Quadrotor(GUARDS()), flown.fit, plausible_numbers(GUARDS(), (*beside, "position_moment")))
     value = dict(zip([n.name for n in found.numbers], found.values, strict=True))
     per_speed = value["blade_flapping.coefficient"]
-    told = [value[f"room_circulation.moment_gradient[{i}]"] / per_speed for i in range(2)]
+    told = [value[f"position_moment.gradient[{i}]"] / per_speed for i in range(2)]
     np.testing.assert_allclose(told, convergence, rtol=0.2)
     still = refine(Quadrotor(GUARDS()), flown.fit, plausible_numbers(GUARDS(), beside))
     errors = [evaluate(one.model, flown.held_out).metrics("commands_in") for one in (found, still)]

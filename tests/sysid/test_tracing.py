@@ -228,10 +228,10 @@ def test_what_no_search_looks_for_takes_part_where_it_is_named_or_declared(campa
         return Search.start(campaigns["clean"].fit[:1], base.parameters(), 0.008, sensors, *given).names
 
     sensors = check_sensors(campaigns["clean"].fit, 0.008)
-    assert "room_circulation" not in names()
+    assert "position_moment" not in names()
     assert len(names()) == len(CATALOGUE) - 1
-    assert "room_circulation" in names((), ["room_circulation"])
-    assert "room_circulation" in names((CATALOGUE["room_circulation"].neutral(),))
+    assert "position_moment" in names((), ["position_moment"])
+    assert "position_moment" in names((CATALOGUE["position_moment"].neutral(),))
 
 
 def test_nothing_is_reported_on_a_clean_drone(campaigns, base):

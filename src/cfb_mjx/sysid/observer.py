@@ -39,6 +39,10 @@ AGREES = 0.05
 """For so long, s, what a model misses of its own angular acceleration stays about the same: the motors' lag."""
 
 
+TURN = 10.0
+"""Angular acceleration at which ``rate_share`` is meant, rad/s^2."""
+
+
 class Observer(eqx.Module):
     """Noise levels of the filters: standard deviations and correlation times.
 
@@ -51,7 +55,8 @@ class Observer(eqx.Module):
     rate_walk: float = 0.4
     """White angular acceleration, rad/s per square root of a second."""
     rate_share: float = 0.2
-    """What the model may miss of its own angular acceleration, as a share: hard turns tell less of what wanders."""
+    """What the model may miss of its own angular acceleration, as a share, at `TURN`; it grows in proportion, for hard
+    turns tell less of what wanders."""
     torque: tuple[float, float, float] = (2.0, 2.0, 0.6)
     """Quickly wandering angular acceleration, rad/s^2."""
     torque_time: float = 0.5
@@ -238,7 +243,7 @@ def _body(model: Quadrotor, flight: Flight, said: Replay, o: Observer):
             quick, slow = jnp.exp(-dt / o.torque_time), jnp.exp(-dt / o.trim_time)
             reach = o.torque_time * (1 - quick)
             move = jnp.array([[1.0, reach, dt], [0.0, quick, 0.0], [0.0, 0.0, slow]])
-            walk = o.rate_walk**2 + (o.rate_share * alpha) ** 2 * AGREES
+            walk = o.rate_walk**2 + (o.rate_share * alpha * alpha / TURN) ** 2 * AGREES
             noise = jnp.stack([walk * dt, torque**2 * (1 - quick**2), trim**2 * (1 - slow**2)])
             x = move @ jnp.stack([w, a, b]) + jnp.stack([alpha * dt, 0.0, 0.0])
             p = move @ p @ move.T + jnp.diag(noise)

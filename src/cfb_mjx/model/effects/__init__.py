@@ -26,7 +26,7 @@ from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
 from cfb_mjx.model.effects.parasitic_drag import ParasiticDrag
 from cfb_mjx.model.effects.payload import Payload
 from cfb_mjx.model.effects.payload_swing import PayloadSwing
-from cfb_mjx.model.effects.room_circulation import RoomCirculation
+from cfb_mjx.model.effects.position_moment import PositionMoment
 from cfb_mjx.model.effects.rotor_drag import RotorDrag
 from cfb_mjx.model.effects.thrust_scale import ThrustScale
 from cfb_mjx.model.effects.thrust_tilt import ThrustTilt
@@ -58,9 +58,9 @@ __all__ = [
     "ParasiticDrag",
     "Payload",
     "PayloadSwing",
+    "PositionMoment",
     "Reading",
     "ResidualFormula",
-    "RoomCirculation",
     "RotorDrag",
     "ThrustScale",
     "ThrustTilt",

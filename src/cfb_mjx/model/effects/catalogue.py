@@ -28,7 +28,7 @@ from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
 from cfb_mjx.model.effects.parasitic_drag import ParasiticDrag
 from cfb_mjx.model.effects.payload import Payload
 from cfb_mjx.model.effects.payload_swing import PayloadSwing
-from cfb_mjx.model.effects.room_circulation import RoomCirculation
+from cfb_mjx.model.effects.position_moment import PositionMoment
 from cfb_mjx.model.effects.rotor_drag import RotorDrag
 from cfb_mjx.model.effects.thrust_scale import ThrustScale
 from cfb_mjx.model.effects.thrust_tilt import ThrustTilt
@@ -59,7 +59,7 @@ CATALOGUE: dict[str, type[Effect]] = {
         ParasiticDrag,
         BladeFlapping,
         Wind,
-        RoomCirculation,
+        PositionMoment,
         PayloadSwing,
     )
 }

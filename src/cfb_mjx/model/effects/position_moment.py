@@ -1,0 +1,55 @@
+"""A moment that hangs on the position: air that moves in a room, or a velocity column that leans.
+
+A drone's jet draws in the air around it, sinks, spreads on the floor and rises along the walls. In a closed room the
+air above the floor therefore moves towards where the jet goes down most of the time, the faster the farther out: a wind
+w = -convergence (p - middle). Flying through it twists the drone as if it flew faster outwards (`blade_flapping`), with
+one gradient along each of the world's horizontal axes:
+
+    tau = (Omega / 1594 rad/s) (-q_y, q_x, 0),  q = R^T (gradient * (p_x, p_y, 0))
+
+with the mean rotor speed. A gradient over the coefficient of `blade_flapping` is the convergence. An on-board estimator
+whose velocity leans towards the middle does the same to predictions that start from its column: compare the column with
+the slope of the position before you believe in air, and ask the accelerometer, which feels that air's drag. The middle
+is the origin of the positions; another one adds a constant torque, which `cog_offset` takes.
+
+Not searched for by `cfb close-loop`: cables and walls act by the position as well. Name it to ``cfb refine``.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Condition, Effect, Wrench
+from cfb_mjx.model.effects.fields import mean_hover_ratio, vector
+from cfb_mjx.model.vector import Vec, rotate_inverse
+
+
+class PositionMoment(Effect):
+    """tau = (Omega / 1594) (-q_y, q_x, 0) with q = R^T (gradient * (p_x, p_y, 0))."""
+
+    name: ClassVar[str] = "position_moment"
+    units: ClassVar[dict[str, str]] = {"gradient": "N"}
+    source: ClassVar[str] = (
+        "F. Ricou, D. Spalding, Measurements of entrainment by axisymmetrical turbulent jets, J. Fluid Mech. 11(1), "
+        "1961"
+    )
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"gradient": (-5e-4, 5e-4)}
+    strengths: ClassVar[tuple[str, ...]] = ("gradient",)
+    searched: ClassVar[bool] = False
+
+    gradient: Float[Array, "*batch 2"] = eqx.field(converter=vector(2))
+    """Torque per distance along the world's x and y axes."""
+
+    @classmethod
+    def neutral(cls) -> PositionMoment:
+        return cls(gradient=0.0)
+
+    def body(self, wrench: Wrench, condition: Condition) -> Wrench:
+        ratio = mean_hover_ratio(condition)
+        along_x, along_y = Vec.unstack(self.gradient)
+        x, y, _ = condition.position
+        q = rotate_inverse(condition.quaternion, Vec(along_x * x * ratio, along_y * y * ratio, 0.0 * x))
+        return Wrench(wrench.force, wrench.torque + Vec(-q[1], q[0], 0.0))
