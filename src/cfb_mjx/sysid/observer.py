@@ -50,20 +50,20 @@ class Observer(eqx.Module):
     flights ``docs/closing-real-flights.md`` learns from).
     """
 
-    gyro: float = 0.04
+    gyro: float = 0.08
     """White noise of a gyro row, rad/s."""
-    rate_walk: float = 0.4
+    rate_walk: float = 0.2
     """White angular acceleration, rad/s per square root of a second."""
-    rate_share: float = 0.2
+    rate_share: float = 0.4
     """What the model may miss of its own angular acceleration, as a share, at `TURN`; it grows in proportion, for hard
     turns tell less of what wanders."""
     torque: tuple[float, float, float] = (2.0, 2.0, 0.6)
     """Quickly wandering angular acceleration, rad/s^2."""
-    torque_time: float = 0.5
+    torque_time: float = 0.25
     """Its correlation time, s."""
-    trim: tuple[float, float, float] = (1.0, 1.0, 0.5)
+    trim: tuple[float, float, float] = (2.0, 2.0, 1.0)
     """Slowly wandering angular acceleration, rad/s^2."""
-    trim_time: float = 100.0
+    trim_time: float = 200.0
     """Its correlation time, s."""
     accelerometer: float = 0.6
     """White noise of an accelerometer row, m/s^2."""

@@ -20,7 +20,7 @@ from cfb_mjx.sysid.observer import Observer
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 
 FACTORS = (2.0, 1.5)
-"""Steps of the search: every level is multiplied and divided by the first for as long as it helps, then by the next."""
+"""Steps of the search: levels are multiplied and divided by the first until that helps no more, then by the next."""
 LEAST = 1e-3
 """A step must lower the score by this."""
 HORIZON = 0.5
@@ -78,7 +78,7 @@ def tune_observer(
     factors: Sequence[float] = FACTORS,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Observer:
-    """Move the levels one after another for as long as predictions get better.
+    """Move the levels one after another, again and again, until no step makes predictions better.
 
     Args:
         model: the drone, with the effects it will be used with; run with x64 enabled.
@@ -94,13 +94,18 @@ def tune_observer(
     """
     best = observer or Observer()
     lowest = score(model, groups, best, faults)
+    moving = levels_of(best) if levels is None else levels
     for factor in factors:
-        for level in levels_of(best) if levels is None else levels:
-            for step in (factor, 1 / factor):
-                moved = False
-                while (other := score(model, groups, tried := scaled(best, level, step), faults)) < lowest - LEAST:
-                    best, lowest, moved = tried, other, True
-                    progress(f"{level[0]}{'' if level[1] is None else f'[{level[1]}]'} x {step:.3g}: {lowest:.4f}")
-                if moved:
-                    break
+        settled = False
+        while not settled:
+            settled = True
+            for level in moving:
+                for step in (factor, 1 / factor):
+                    moved = False
+                    while (other := score(model, groups, tried := scaled(best, level, step), faults)) < lowest - LEAST:
+                        best, lowest, moved = tried, other, True
+                        progress(f"{level[0]}{'' if level[1] is None else f'[{level[1]}]'} x {step:.3g}: {lowest:.4f}")
+                    if moved:
+                        settled = False
+                        break
     return best
