@@ -20,6 +20,12 @@ def test_a_configuration_survives_being_written():
     assert build(TrainingConfig, config.to_mapping(), "again") == config
 
 
+def test_a_count_may_be_written_with_an_exponent():
+    """As the help of ``cfb train`` writes it."""
+    steps = load_config("target", ("ppo.steps=2e7",)).ppo.steps
+    assert (steps, type(steps)) == (20_000_000, int)
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

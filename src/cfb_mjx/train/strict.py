@@ -54,7 +54,9 @@ def _value(kind: Any, raw: Any, where: str, key: str) -> Any:
         number = isinstance(raw, int | float) and not isinstance(raw, bool) and math.isfinite(raw)
         return float(_checked(number, raw, "a finite number", where, key))
     if kind is int:
-        return _checked(isinstance(raw, int) and not isinstance(raw, bool), raw, "a whole number", where, key)
+        # 2e7 is a float to YAML and to Python, and a count to whoever writes it.
+        whole = isinstance(raw, int | float) and not isinstance(raw, bool) and float(raw).is_integer()
+        return int(_checked(whole, raw, "a whole number", where, key))
     return _checked(isinstance(raw, kind), raw, {bool: "true or false", str: "text"}[kind], where, key)
 
 
