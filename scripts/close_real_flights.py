@@ -49,6 +49,10 @@ GENTLE = 7
 """Gentle flights among those fitted: the square counts as much as all of them, for the two are judged side by side."""
 SLOW = 2.0
 """Hz; below it what hangs on the place is looked for in velocity and acceleration."""
+STEP = 0.01
+"""Of the even grid on which signals are filtered, s."""
+INNER = slice(150, -150)
+"""Rows that a filter's ends do not reach."""
 BANDS = ((0.1, 0.3), (0.2, 0.5), (0.5, 1.0))
 """Hz; faster motion is too small in the gentle flights for the slope of a position to show it."""
 
@@ -125,26 +129,28 @@ def tilted(logs: list[FlightLog], scale: float) -> dict[str, dict]:
 def stretched(logs: list[FlightLog], low: float, high: float) -> dict[str, list[float]]:
     """Velocity, and specific force turned by the attitude, over what position says, of motion between ``low`` and
     ``high`` Hz; horizontally and vertically, over all flights."""
-    step, edge = 0.01, 150
-    sos = butter(2, [low, high], "band", fs=1 / step, output="sos")
+    sos = butter(2, [low, high], "band", fs=1 / STEP, output="sos")
     found: dict[str, list[tuple]] = {"horizontal": [], "vertical": []}
     for log in logs:
-        grid = np.arange(log.time[0], log.time[-1], step)
         force = to_world(log.quaternion, log.specific_force)
-        place, speed, force = (
-            sosfiltfilt(sos, interpolate(log.time, x, grid), axis=0) for x in (log.position, log.velocity, force)
-        )
-        slope = np.gradient(place, step, axis=0)
+        place, speed, force = _filtered(log, sos, log.position, log.velocity, force)
+        slope = np.gradient(place, STEP, axis=0)
         for name, axes in (("horizontal", slice(0, 2)), ("vertical", slice(2, 3))):
-            pairs = (slope, speed), (np.gradient(slope, step, axis=0), force)
-            found[name].append([(x[edge:-edge, axes], y[edge:-edge, axes]) for x, y in pairs])
-    return {name: [_in_step([row[i] for row in rows], step) for i in range(2)] for name, rows in found.items()}
+            pairs = (slope, speed), (np.gradient(slope, STEP, axis=0), force)
+            found[name].append([(x[INNER, axes], y[INNER, axes]) for x, y in pairs])
+    return {name: [_in_step([row[i] for row in rows]) for i in range(2)] for name, rows in found.items()}
 
 
-def _in_step(parts: list[tuple[np.ndarray, np.ndarray]], step: float) -> float:
+def _filtered(log: FlightLog, sos: np.ndarray, *signals: np.ndarray) -> list[np.ndarray]:
+    """Signals of a log on an even grid of `STEP`, filtered forth and back."""
+    grid = np.arange(log.time[0], log.time[-1], STEP)
+    return [sosfiltfilt(sos, interpolate(log.time, x, grid), axis=0) for x in signals]
+
+
+def _in_step(parts: list[tuple[np.ndarray, np.ndarray]]) -> float:
     """How many times larger the second is than the first; what is a quarter turn ahead or behind does not count."""
     one, other = (np.concatenate([x.ravel() for x in side]) for side in zip(*parts, strict=True))
-    beside = np.concatenate([np.gradient(x, step, axis=0).ravel() for x, _ in parts])
+    beside = np.concatenate([np.gradient(x, STEP, axis=0).ravel() for x, _ in parts])
     return float(np.linalg.lstsq(np.stack([one, beside], axis=1), other)[0][0])
 
 
@@ -152,24 +158,21 @@ def by_place(logs: list[FlightLog]) -> dict[str, dict[str, list[float]]]:
     """What moves per distance from the middle, 1/s, along x and y, by flight: what the velocity column takes off, its
     scale and age apart; and the air, by the drag that the accelerometer feels beside that of the motion, thrust that
     leans and a lag of the drag apart."""
-    step, edge = 0.01, 150
-    sos = butter(2, SLOW, fs=1 / step, output="sos")
+    sos = butter(2, SLOW, fs=1 / STEP, output="sos")
     found = {}
     for log in logs:
-        grid = np.arange(log.time[0], log.time[-1], step)
         in_body = [to_body(log.quaternion, x) for x in (log.velocity, log.position * [1.0, 1.0, 0.0])]
         raw = (log.position, log.velocity, log.specific_force, *in_body)
-        place, speed, force, own_speed, own_place = (
-            sosfiltfilt(sos, interpolate(log.time, x, grid), axis=0) for x in raw
-        )
-        slope, turn = (np.gradient(x, step, axis=0) for x in (place, own_speed))
-        one = np.ones(len(grid))
+        place, speed, force, own_speed, own_place = _filtered(log, sos, *raw)
+        slope = np.gradient(place, STEP, axis=0)
+        bend, turn = (np.gradient(x, STEP, axis=0) for x in (slope, own_speed))
+        one = np.ones(len(place))
         column, drag = [], []
         for i in range(2):
-            beside = np.stack([place[:, i], slope[:, i], np.gradient(slope[:, i], step), one], axis=1)[edge:-edge]
-            column.append(float(-np.linalg.lstsq(beside, speed[edge:-edge, i])[0][0]))
-            felt = np.stack([own_place[:, i], own_speed[:, i], turn[:, i], force[:, 2], one], axis=1)[edge:-edge]
-            pull, per_speed = np.linalg.lstsq(felt, force[edge:-edge, i])[0][:2]
+            beside = np.stack([place[:, i], slope[:, i], bend[:, i], one], axis=1)
+            column.append(float(-np.linalg.lstsq(beside[INNER], speed[INNER, i])[0][0]))
+            felt = np.stack([own_place[:, i], own_speed[:, i], turn[:, i], force[:, 2], one], axis=1)
+            pull, per_speed = np.linalg.lstsq(felt[INNER], force[INNER, i])[0][:2]
             drag.append(float(pull / per_speed))
         found[log.name] = {"column": column, "drag": drag}
     return found

@@ -1,6 +1,7 @@
 """The page docs/closing-real-flights.md and its figure, from the numbers `close_real_flights` measured."""
 
 from pathlib import Path
+from statistics import mean, stdev
 
 from cfb_mjx.cli.runtime import environment
 from cfb_mjx.parameters import ModelFile
@@ -190,11 +191,9 @@ def _position(plant: ModelFile, told: dict[str, dict], slow: float) -> list[str]
 
 
 def _mean(values: list[float]) -> str:
-    mean = sum(values) / len(values)
     if len(values) == 1:
-        return f"{mean:.3f}"
-    spread = (sum((x - mean) ** 2 for x in values) / (len(values) - 1) / len(values)) ** 0.5
-    return f"{mean:.3f} +- {spread:.3f}"
+        return f"{values[0]:.3f}"
+    return f"{mean(values):.3f} +- {stdev(values) / len(values) ** 0.5:.3f}"
 
 
 def _columns(seen: dict, tilted_by: dict) -> list[str]:

@@ -37,8 +37,6 @@ stay where they were."""
 
 AGREES = 0.05
 """For so long, s, what a model misses of its own angular acceleration stays about the same: the motors' lag."""
-
-
 TURN = 10.0
 """Angular acceleration at which ``rate_share`` is meant, rad/s^2."""
 

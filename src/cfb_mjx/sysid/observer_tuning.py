@@ -95,17 +95,17 @@ def tune_observer(
     best = observer or Observer()
     lowest = score(model, groups, best, faults)
     moving = levels_of(best) if levels is None else levels
+
+    def moved(level: Level, step: float) -> bool:
+        nonlocal best, lowest
+        before = lowest
+        while (other := score(model, groups, tried := scaled(best, level, step), faults)) < lowest - LEAST:
+            best, lowest = tried, other
+            progress(f"{level[0]}{'' if level[1] is None else f'[{level[1]}]'} x {step:.3g}: {lowest:.4f}")
+        return lowest < before
+
     for factor in factors:
-        settled = False
-        while not settled:
-            settled = True
-            for level in moving:
-                for step in (factor, 1 / factor):
-                    moved = False
-                    while (other := score(model, groups, tried := scaled(best, level, step), faults)) < lowest - LEAST:
-                        best, lowest, moved = tried, other, True
-                        progress(f"{level[0]}{'' if level[1] is None else f'[{level[1]}]'} x {step:.3g}: {lowest:.4f}")
-                    if moved:
-                        settled = False
-                        break
+        # A list: every level has its turn in every round.
+        while any([moved(level, factor) or moved(level, 1 / factor) for level in moving]):
+            pass
     return best

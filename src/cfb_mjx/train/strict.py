@@ -50,12 +50,12 @@ def _value(kind: Any, raw: Any, where: str, key: str) -> Any:
     if origin is tuple:
         _checked(isinstance(raw, list | tuple), raw, "a list", where, key)
         return tuple(_value(arguments[0], x, where, key) for x in raw)
+    number = isinstance(raw, int | float) and not isinstance(raw, bool)
     if kind is float:
-        number = isinstance(raw, int | float) and not isinstance(raw, bool) and math.isfinite(raw)
-        return float(_checked(number, raw, "a finite number", where, key))
+        return float(_checked(number and math.isfinite(raw), raw, "a finite number", where, key))
     if kind is int:
-        # 2e7 is a float to YAML and to Python, and a count to whoever writes it.
-        whole = isinstance(raw, int | float) and not isinstance(raw, bool) and float(raw).is_integer()
+        # 2e7 is a float to Python, and a count to whoever writes it.
+        whole = number and (isinstance(raw, int) or raw.is_integer())
         return int(_checked(whole, raw, "a whole number", where, key))
     return _checked(isinstance(raw, kind), raw, {bool: "true or false", str: "text"}[kind], where, key)
 
