@@ -34,6 +34,7 @@ def contest(monkeypatch):
         monkeypatch.setattr(
             tracing, "confirm", lambda search, poorer, richer: SimpleNamespace(gain=made[richer.name][2])
         )
+        monkeypatch.setattr(tracing, "_without_lead", lambda search, hypothesis: np.log(made[hypothesis.name][3]))
         ranking = _ranking({name: (gain, numbers) for name, (gain, numbers, *_) in made.items()})
         options, stretched = tracing.contenders(search, NOTHING, ranking, lambda _: None)
         return [name for name, _ in options], stretched

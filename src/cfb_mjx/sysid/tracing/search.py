@@ -248,8 +248,8 @@ class Search:
         hypothesis = self.settled(hypothesis, rounds)
         return hypothesis, self.whole(hypothesis)
 
-    def settled(self, hypothesis: Hypothesis, rounds: int = 5) -> Hypothesis:
-        """Fit everything that is there together."""
+    def settled(self, hypothesis: Hypothesis, rounds: int = 5, lead_free: bool = True) -> Hypothesis:
+        """Fit everything that is there together, the lead of the commands too unless it is to stay."""
         for attempt in range(rounds - 1):
             own = self.own_columns(hypothesis)
             linear = self.linearise(hypothesis, own)
@@ -257,7 +257,7 @@ class Search:
             lead = linear.scale[1]
             pull = 0, (LEAD_USUAL - hypothesis.lead) / lead, (lead / LEAD_SPREAD) ** 2
             values = solve(linear.blocks.sum(0), index, linear.scale, pull)
-            kept = np.clip(hypothesis.lead + values[0] * lead, *LEAD_RANGE)
+            kept = np.clip(hypothesis.lead + lead_free * values[0] * lead, *LEAD_RANGE)
             if kept != hypothesis.lead + values[0] * lead:
                 # What the lead may not take the others have to explain.
                 fixed = 0, (kept - hypothesis.lead) / lead, 1e9

@@ -16,7 +16,7 @@ from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import SHIFT, Column
 from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
-from cfb_mjx.sysid.tracing.fits import ERRORS, Fit, completed, fitted
+from cfb_mjx.sysid.tracing.fits import ERRORS, Fit, completed, fitted, prediction_errors
 from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Linear, Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
 
@@ -195,10 +195,11 @@ def contenders(
         return [(name, fits[name])], stretched
     numbers = {variant[0].effect: len(variant) for _, variant in ranking}
     most = max(gains[name] for name in plausible)
-    errors = {name: np.log(fits[name].errors).mean() for name in plausible}
     rivals = [name for name in plausible if gains[name] >= (1 - CLOSE) * most]
-    # Innovations hardly tell a lag from a delay beside the unknown age of commands; half a second of flight does.
-    rivals = [name for name in rivals if errors[name] <= min(errors[r] for r in rivals) + SAME_ERRORS]
+    if len(rivals) > 1:
+        # Innovations hardly tell a lag from a delay beside the unknown age of commands; half a second of flight does.
+        errors = {name: _without_lead(search, fits[name].hypothesis) for name in rivals}
+        rivals = [name for name in rivals if errors[name] <= min(errors.values()) + SAME_ERRORS]
     most = max(gains[name] for name in rivals)
     close = [name for name in rivals if gains[name] >= most - PARSIMONY * abs(most)]
     first = min(close, key=numbers.get)
@@ -209,6 +210,15 @@ def contenders(
         first = delayed if gains[delayed] > (1 - CLOSE) * gains[first] else first
     order = sorted(plausible, key=lambda name: (name != first, -gains[name]))
     return [(name, fits[name]) for name in order], stretched
+
+
+def _without_lead(search: Search, hypothesis: Hypothesis) -> float:
+    """Mean logarithm of the prediction errors, commands held until the next row in the fit as in predictions.
+
+    A delay is longer by what a lead takes back, and a lag that wants no lead would seem to predict better.
+    """
+    held = search.settled(replace(hypothesis, lead=0.0), lead_free=False)
+    return float(np.log(prediction_errors(search, held)).mean())
 
 
 def needed(search: Search, less: LeftOut, fit: Fit, nothing: Fit) -> bool:
