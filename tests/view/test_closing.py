@@ -16,7 +16,8 @@ from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.floor import noise_floor, sensor_levels
-from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
+from cfb_mjx.sysid.tracing.formula import Term
+from cfb_mjx.sysid.tracing.outcome import Outcome, Reported, Unexplained
 from cfb_mjx.sysid.tracing.residuals import UNITS, Smoother, residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
@@ -24,6 +25,7 @@ from cfb_mjx.sysid.tracing.structure import BLOCK, OFFSET, binned, edges_of, exp
 from cfb_mjx.sysid.tracing.trace import Found, Trace
 from cfb_mjx.view import closing_words as words
 from cfb_mjx.view.closing import write_report
+from cfb_mjx.view.closing_next import next_flights
 from tests.rerun_command import rerun
 from tests.simulated_log import simulated_log
 
@@ -206,8 +208,26 @@ def test_noise_floor_is_the_noise_put_in(outcome, logs):
 def test_nothing_and_unexplained_in_words(outcome):
     nothing = replace(outcome, reported=[])
     assert words.verdict(nothing) == "Nothing is missing beyond chance."
-    nothing.unexplained = SimpleNamespace(formulas=["force_x = 1 N"], where="force_x follows x")
+    term = Term("force_x", "x", "N / (m)", 0.01, 0.001, 30.0)
+    nothing.unexplained = Unexplained(SimpleNamespace(terms=[term]), [])
     assert "no effect of the catalogue accounts for: force_x follows x." in words.verdict(nothing)
+
+
+def test_what_only_the_held_out_flights_show_is_flagged_and_asked_for(outcome):
+    looked = SimpleNamespace(structure=(None, SimpleNamespace(strongest=lambda _: [])), judge=SimpleNamespace(logs=[]))
+    term = Term("torque_x", "v_x w_z", "N m / (m rad/s^2)", 5e-5, 5e-6, 90.0)
+    found = replace(outcome, unexplained=Unexplained(None, [], [term]))
+    where = "in the held-out flights only, torque_x follows v_x w_z"
+    assert f"accounts for: {where}." in words.verdict(found)
+    report = found.to_json()
+    assert report["unexplained"] is True
+    assert report["unexplained_because"] == where
+    assert report["formula"] == [
+        "torque_x = (5e-05 +- 5e-06 N m / (m rad/s^2)) v_x w_z (held-out flights only, not in the model)"
+    ]
+    # A model learns nothing from the flights that judge it.
+    assert found.model_file("drone", {}) == outcome.model_file("drone", {})
+    assert any("like the held-out ones" in text and where in text for text in next_flights(found, looked))
     fault = replace(outcome, reported=outcome.reported[:1])
     assert "fault, not the physics" in words.verdict(fault)
 

@@ -38,8 +38,8 @@ def draw(outcome: Outcome, looked: Looked, folder: Path) -> Figures:
             binned_figure(panels, labels, path)
             what = ", ".join(f"{p.axis} against {p.signal}" for p in panels)
             figures[item.name] = [(path, f"{item.name}: {what}, {labels[0]} and {labels[1]}")]
-    without = getattr(getattr(outcome, "unexplained", None), "without", None)
-    panels = _compared(outcome, looked, without) if without is not None else []
+    formula = outcome.unexplained.proposal if outcome.unexplained is not None else None
+    panels = _compared(outcome, looked, formula.without) if formula is not None else []
     if panels:
         binned_figure(panels, ("without the terms", "with them"), folder / "unexplained.svg")
         figures["unexplained"] = [(folder / "unexplained.svg", "residuals without and with the terms found")]
@@ -80,7 +80,7 @@ def _effect(outcome: Outcome, looked: Looked, item: Reported) -> tuple[list[Pane
         less, more = looked.predictions
         return _panels(less, more, PREDICTION_BINS), ("before", "after")
     without = item.found.without
-    if getattr(outcome, "unexplained", None):
+    if outcome.unexplained is not None and outcome.unexplained.proposal is not None:
         # That was fitted before the formula; beside it only this effect may go.
         without = outcome.hypothesis.without(item.name)
     return _compared(outcome, looked, without), (f"best model without {item.name}", "corrected model")

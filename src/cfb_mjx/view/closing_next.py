@@ -72,6 +72,11 @@ def next_flights(outcome: Outcome, looked: Looked) -> list[str]:
             fly(EXPERIMENTS[item.name], f"{item.name} is known to {share:.0f} % only")
     for item in outcome.unconfirmed:
         fly(EXPERIMENTS[item.name], f"{item.name} was found, but not confirmed on held-out flights")
+    if outcome.unexplained is not None and outcome.unexplained.held_out_only:
+        fly(
+            "more flights like the held-out ones, some of them to fit to",
+            f"what they show is in no model yet: {outcome.unexplained.where}",
+        )
     after = looked.structure[1]
     for i, j in after.strongest(3):
         signal = after.signals[j]

@@ -11,7 +11,7 @@ from cfb_mjx.model.effects import CATALOGUE
 from cfb_mjx.sysid.evaluation import Evaluation
 from cfb_mjx.sysid.metrics import QUANTITIES
 from cfb_mjx.sysid.tracing.floor import noise_floor
-from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
+from cfb_mjx.sysid.tracing.outcome import Outcome, Reported, Unexplained
 from cfb_mjx.view.closing_drawing import Figures
 from cfb_mjx.view.closing_figures import squared
 from cfb_mjx.view.closing_look import Looked
@@ -28,9 +28,8 @@ def sections(
 ) -> list[Section]:
     """All of them, in the order they are read."""
     found = [_short(logs_fit, logs_held_out), _missing(outcome, figures), _errors(figures)]
-    unexplained = getattr(outcome, "unexplained", None)
-    if unexplained:
-        found.append(_unexplained(unexplained, figures))
+    if outcome.unexplained is not None:
+        found.append(_unexplained(outcome.unexplained, figures))
     found += [
         Section("What is left", what_is_left(outcome, looked), figures=figures.get("left", [])),
         Section("What to fly next", next_flights(outcome, looked)),
@@ -169,15 +168,21 @@ def _speed_in(before: dict, after: dict) -> Table:
     return caption, ["error of", "ahead", "before", "after", "change"], rows
 
 
-def _unexplained(found, figures: Figures) -> Section:
-    lead = (
-        "A structured residual remains that no effect of the catalogue accounts for. Terms that describe it were "
-        "fitted blindly and are part of the corrected model: a description of the data, not physics."
-    )
-    rows = [[str(text)] for text in getattr(found, "formulas", None) or []]
+def _unexplained(found: Unexplained, figures: Figures) -> Section:
+    texts = ["A structured residual remains that no effect of the catalogue accounts for."]
+    if found.proposal is not None:
+        texts[0] += (
+            " Terms that describe it were fitted blindly and are part of the corrected model: a description of the "
+            "data, not physics."
+        )
+    if found.held_out_only:
+        texts[0] += (
+            " Only the held-out flights show it: they do what the others hardly did. Terms that describe it were "
+            "fitted to them, so nothing is left to judge these by, and they are no part of the corrected model."
+        )
+    rows = [[text] for text in found.formulas]
     tables = [("Terms", ["term"], rows)] if rows else []
-    texts = [text for text in (lead, str(getattr(found, "where", "") or "")) if text]
-    return Section("Unexplained", texts, tables, figures.get("unexplained", []))
+    return Section("Unexplained", [*texts, found.where], tables, figures.get("unexplained", []))
 
 
 def _residuals(looked: Looked, figures: Figures) -> Section:

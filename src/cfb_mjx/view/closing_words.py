@@ -188,15 +188,13 @@ def verdict(outcome: Outcome) -> str:
     if faults:
         named = "; ".join(f"{item.name}, {MEANING[item.name]}: {strength(item)}" for item in faults)
         parts.append(f"The recording is at fault, not the physics: {named}.")
-        if not physics and not getattr(outcome, "unexplained", None):
+        if not physics and outcome.unexplained is None:
             parts.append("Of the physics nothing is missing beyond chance.")
-    unexplained = getattr(outcome, "unexplained", None)
-    if unexplained:
-        where = str(getattr(unexplained, "where", "") or "see below")
-        parts.append(f"Something is left that no effect of the catalogue accounts for: {where}.")
+    if outcome.unexplained is not None:
+        parts.append(f"Something is left that no effect of the catalogue accounts for: {outcome.unexplained.where}.")
     elif not outcome.reported:
         parts.append("Nothing is missing beyond chance.")
-    if outcome.reported or unexplained:
+    if outcome.reported or outcome.unexplained is not None:
         parts.append(_bought(outcome))
     return " ".join(parts)
 

@@ -7,29 +7,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS, ResidualFormula
+from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS
 from cfb_mjx.sysid.tracing.acceptance import enough
 from cfb_mjx.sysid.tracing.columns import FORMULA, Column, term_columns
-from cfb_mjx.sysid.tracing.evidence import covariance, evidence, solve
+from cfb_mjx.sysid.tracing.confirmation import confirm
+from cfb_mjx.sysid.tracing.evidence import covariance, solve
 from cfb_mjx.sysid.tracing.fits import prediction_errors
 from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Search
+from cfb_mjx.sysid.tracing.terms import Selection, select, with_library
 from cfb_mjx.sysid.tracing.trace import Trace
 
 STRUCTURE = 0.06
 """A formula counts when it lowers at least one prediction error by this share."""
 OF_FIRST = 0.05
 """And by this share of what the declared model scores: an effect of slightly another shape leaves crumbs."""
-PER_AXIS = 3
-"""Terms or families along one axis at most."""
-_QUADRATIC = ("n_roll^2", "n_pitch^2", "n_roll n_pitch")
-FAMILIES = {"body_terms": [_QUADRATIC], "place": [(p, f"{p}^2") for p in ("x", "y", "z")]}
-"""Terms that describe one thing only together: a force that grows towards a wall is badly told by its slope alone, and
-what one term describes badly does not stand against chance."""
-OF_FAMILY = 0.9
-"""A single term is preferred if it gains this share of what a family gains."""
-NEEDLESS = 2.0
-"""A term that gains fewer nats beside the others is left out again."""
-ALPHA, LEAST_GAIN = 1e-3, 8.0
+SURE = 3.0
+"""A formula counts when its statistic on flights nothing was fitted to is above this."""
+THERE_ALONE = 0.2
+"""Terms that only those flights show must lower an error by this share, and by as much of the declared model's."""
 _WIDTH = 64
 
 
@@ -61,60 +56,6 @@ def describe(column: Column) -> tuple[str, str, str]:
 
 def _per(unit: str, signal: str) -> str:
     return unit if signal == "1" else f"{unit} / ({signal})"
-
-
-def with_library(search: Search, hypothesis: Hypothesis) -> tuple[Search, Hypothesis]:
-    """The same search and hypothesis with the (empty) formula among the effects."""
-    empty = ResidualFormula.neutral()
-    widened = replace(search, names=(*search.names, FORMULA), _flights=search._flights)
-    return widened, replace(hypothesis, effects=(*hypothesis.effects, empty), origin=(*hypothesis.origin, empty))
-
-
-def propose(
-    search: Search, hypothesis: Hypothesis, progress: Callable[[str], None] = lambda _: None
-) -> tuple[list[Column], dict[Column, float]]:
-    """Terms that improve blocks left out beyond chance beside everything found, by forward selection per axis."""
-    own = search.own_columns(hypothesis)
-    tried = sum(len(term_columns(axis)) for axis in range(6))
-    chosen, gains = [], {}
-    progress("looking for structure in what is left")
-    for linear in search.linearise_terms(hypothesis, own):
-        library = [c for c in linear.columns if c.effect == FORMULA and c not in own]
-        base, picked = linear.index(own), []
-        families = [[c] for c in library] + _families(library)
-
-        def gaining(columns, beside, linear=linear, base=base):
-            return evidence(linear.blocks, base + linear.index(beside), linear.index(columns), linear.scale)
-
-        for _ in range(PER_AXIS):
-            rest = [[c for c in family if c not in picked] for family in families]
-            found = [(gaining(columns, picked), columns) for columns in rest if columns]
-            passing = [pair for pair in found if pair[0].p_value * tried < ALPHA and pair[0].gain > LEAST_GAIN]
-            if not passing:
-                break
-            most = max(e.gain for e, _ in passing)
-            best, columns = min(
-                (pair for pair in passing if pair[0].gain >= OF_FAMILY * most),
-                key=lambda pair: (len(pair[1]), -pair[0].gain),
-            )
-            picked += columns
-            gains |= dict.fromkeys(columns, best.gain)
-        for column in list(picked):
-            others = [c for c in picked if c != column]
-            if others and gaining([column], others).gain < NEEDLESS:
-                picked = others
-        chosen += picked
-    return chosen, gains
-
-
-def _families(library: list[Column]) -> list[list[Column]]:
-    """`FAMILIES` among the terms of one axis."""
-    found = []
-    for field, groups in FAMILIES.items():
-        signals = list(TERMS if field == "body_terms" else PLACES)
-        named = {signals[c.index[1]]: c for c in library if c.field == field}
-        found += [[named[s] for s in group] for group in groups if set(group) <= set(named)]
-    return found
 
 
 def fit_formula(search: Search, hypothesis: Hypothesis, terms: list[Column]) -> tuple[Hypothesis, np.ndarray]:
@@ -194,17 +135,14 @@ def explain(
     """
     search, hypothesis = found.search, found.hypothesis
     widened, base = with_library(search, hypothesis)
-    terms, gains = propose(widened, base, progress)
+    chosen = select(widened, base, progress)
+    terms = _material(widened, base, chosen.sure, found, held_out)
+    if held_out is not None:
+        terms = _with_rare(widened, base, terms, chosen, held_out)
     if not terms:
         return search, None
     richer, deviation = fit_formula(widened, base, terms)
     new = prediction_errors(widened, richer)
-    if not _lowered(found.errors, new, found.declared_errors):
-        if held_out is None:
-            return search, None
-        three = hypothesis, richer, held_out.nothing()
-        if not _lowered(*(prediction_errors(held_out, each) for each in three)):
-            return search, None
     # A force that hangs on the place has a constant part, which looked like wind.
     windy = "wind" in hypothesis.present and any(c.field == "place" for c in terms)
     for name in sorted(hypothesis.present, key=lambda name: not (windy and name == "wind")):
@@ -222,7 +160,64 @@ def explain(
         plain = plain.without(name)
     plain = widened.settled(plain)
     buys = float(np.max(1 - new / prediction_errors(widened, plain)))
-    return widened, Proposal(terms_of(richer, deviation, gains), buys, richer, plain)
+    return widened, Proposal(terms_of(richer, deviation, chosen.gains), buys, richer, plain)
+
+
+def only_there(held_out: Search, hypothesis: Hypothesis) -> list[Term]:
+    """Structure in flights nothing was fitted to that the fitted ones do not show: terms fitted to those flights.
+
+    They tell what is missing and what to fly; no model learns from them, for nothing is left to judge it by.
+
+    Args:
+        held_out: over those flights.
+        hypothesis: what was found on the others. Its numbers are fitted anew, so that what they are wrong by there is
+            not taken for structure.
+    """
+    widened, base = with_library(held_out, hypothesis)
+    chosen = select(widened, base)
+    if not chosen.sure:
+        return []
+    plain, _ = fit_formula(widened, base, [])
+    richer, deviation = fit_formula(widened, base, chosen.sure)
+    three = [prediction_errors(widened, each) for each in (plain, richer, widened.nothing())]
+    return terms_of(richer, deviation, chosen.gains) if enough(*three, THERE_ALONE, THERE_ALONE) else []
+
+
+def _material(
+    search: Search, base: Hypothesis, terms: list[Column], found: Trace, held_out: Search | None
+) -> list[Column]:
+    """The terms, if they lower errors of the fit flights or else of the held-out ones; nothing if not."""
+    if not terms:
+        return []
+    richer, _ = fit_formula(search, base, terms)
+    if _lowered(found.errors, prediction_errors(search, richer), found.declared_errors):
+        return terms
+    if held_out is None:
+        return []
+    three = found.hypothesis, richer, held_out.nothing()
+    return terms if _lowered(*(prediction_errors(held_out, each) for each in three)) else []
+
+
+def _with_rare(
+    search: Search, base: Hypothesis, terms: list[Column], chosen: Selection, held_out: Search
+) -> list[Column]:
+    """The terms, and those that few blocks of the fit flights excite, if flights nothing was fitted to bear them out.
+
+    What a drone rarely does in some flights may be what others consist of.
+    """
+    judge, _ = with_library(held_out, held_out.nothing())
+    poorer = fit_formula(search, base, terms)[0] if terms else base
+    known = [c for c in chosen.sure if c not in terms]
+    more = []
+    for group in chosen.rare + [known] * bool(known):
+        richer, _ = fit_formula(search, base, terms + group)
+        if confirm(judge, poorer, richer).t >= SURE:
+            more += group
+    if not more:
+        return terms
+    richer, _ = fit_formula(search, base, terms + more)
+    three = [prediction_errors(judge, each) for each in (poorer, richer, judge.nothing())]
+    return terms + more if _lowered(*three) else terms
 
 
 def _constant_forces(terms: list[Column]) -> list[Column]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,15 +18,13 @@ from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import FORMULA
 from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
 from cfb_mjx.sysid.tracing.fits import prediction_errors
-from cfb_mjx.sysid.tracing.formula import Proposal, explain
+from cfb_mjx.sysid.tracing.formula import SURE, Proposal, Term, explain, only_there
 from cfb_mjx.sysid.tracing.lines import Line, find_lines
 from cfb_mjx.sysid.tracing.residuals import residual_rows
 from cfb_mjx.sysid.tracing.search import Hypothesis, Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.trace import Found, Trace, numbers_of, trace
 
-SURE = 3.0
-"""A formula counts when its statistic on held-out flights is above this."""
 ENOUGH, SAME_LINE = 3, 0.1
 """Held-out flights from which lines are looked for there too, and Hz by which the two may differ."""
 DOUBTFUL = 2.3
@@ -68,19 +66,26 @@ class Unexplained:
     """A formula that describes it, borne out by the held-out flights."""
     lines: list[Line]
     """What swings at its own pace."""
+    held_out_only: list[Term] = field(default_factory=list)
+    """What only the held-out flights show, fitted to them: no part of the corrected model."""
 
     @property
     def formulas(self) -> list[str]:
         """One line per term, with units and uncertainty."""
-        return [str(term) for term in self.proposal.terms] if self.proposal else []
+        found = [str(term) for term in self.proposal.terms] if self.proposal else []
+        return found + [f"{term} (held-out flights only, not in the model)" for term in self.held_out_only]
 
     @property
     def where(self) -> str:
         """Axes, signals and frequencies in words."""
-        terms = self.proposal.terms if self.proposal else []
-        axes = list(dict.fromkeys(term.axis for term in terms))
-        words = [f"{a} follows {', '.join(t.signal for t in terms if t.axis == a)}" for a in axes]
-        return "; ".join(words + [str(line) for line in self.lines])
+        words = _followed(self.proposal.terms if self.proposal else [])
+        there = [f"in the held-out flights only, {each}" for each in _followed(self.held_out_only)]
+        return "; ".join(words + there + [str(line) for line in self.lines])
+
+
+def _followed(terms: list[Term]) -> list[str]:
+    axes = list(dict.fromkeys(term.axis for term in terms))
+    return [f"{a} follows {', '.join(t.signal for t in terms if t.axis == a)}" for a in axes]
 
 
 @dataclass
@@ -176,7 +181,8 @@ def close_loop(
     if proposal is not None and not _borne_out(wide, proposal):
         proposal, search, wide = None, found.search, judge
     hypothesis, reported, unconfirmed = _judged(search, judge, found, proposal)
-    unexplained = _unexplained(search, wide, proposal, proposal.hypothesis if proposal else found.hypothesis)
+    left = proposal.hypothesis if proposal else found.hypothesis
+    unexplained = _unexplained(search, wide, proposal, left, judge)
     faults = replace(found.sensors.faults, motor_shift=hypothesis.shift)
     after = evaluate(hypothesis.model(parameters), held_out, faults=faults)
     return Outcome(found, base, reported, unconfirmed, hypothesis, faults, before, after, unexplained)
@@ -214,13 +220,19 @@ def _judged(
     return hypothesis, reported, unconfirmed
 
 
-def _unexplained(search: Search, wide: Search, proposal: Proposal | None, hypothesis: Hypothesis) -> Unexplained | None:
-    """What is left: a formula, and lines that most flights share, held-out ones too where there are enough of them."""
+def _unexplained(
+    search: Search, wide: Search, proposal: Proposal | None, hypothesis: Hypothesis, judge: Search
+) -> Unexplained | None:
+    """What is left: a formula, and lines that most flights share, held-out ones too where there are enough of them.
+
+    If neither, what only the held-out flights show.
+    """
     lines = find_lines(residual_rows(search, hypothesis))
     if len(wide.logs) >= ENOUGH:
         again = find_lines(residual_rows(wide, hypothesis))
         lines = [a for a in lines if any(_same(a, b) for b in again)]
-    return Unexplained(proposal, lines) if proposal or lines else None
+    there = [] if proposal or lines else only_there(judge, hypothesis)
+    return Unexplained(proposal, lines, there) if proposal or lines or there else None
 
 
 def _same(a: Line, b: Line) -> bool:
