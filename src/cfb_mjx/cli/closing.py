@@ -72,7 +72,7 @@ def _print(report: dict, output: Path) -> None:
     from cfb_mjx.view.closing_words import separating
 
     if not report["effects"]:
-        print("nothing is missing beyond chance")
+        print("no effect of the catalogue stands" if report["unexplained"] else "nothing is missing beyond chance")
     for effect in report["effects"]:
         values = []
         for key, value in effect["parameters"].items():

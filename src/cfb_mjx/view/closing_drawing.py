@@ -13,6 +13,7 @@ from cfb_mjx.sysid.tracing.spectra import sensor_spectra, spectra
 from cfb_mjx.sysid.tracing.structure import BINS, Pooled, explained, pool
 from cfb_mjx.view.closing_figures import Panel, binned_figure, errors_figure, matrix_figure, spectra_figure
 from cfb_mjx.view.closing_look import PREDICTION_BINS, Looked
+from cfb_mjx.view.closing_terms import panels_of
 
 PANELS = 3
 """Of one figure at most."""
@@ -38,11 +39,11 @@ def draw(outcome: Outcome, looked: Looked, folder: Path) -> Figures:
             binned_figure(panels, labels, path)
             what = ", ".join(f"{p.axis} against {p.signal}" for p in panels)
             figures[item.name] = [(path, f"{item.name}: {what}, {labels[0]} and {labels[1]}")]
-    formula = outcome.unexplained.proposal if outcome.unexplained is not None else None
-    panels = _compared(outcome, looked, formula.without) if formula is not None else []
+    panels, labels = _terms(outcome, looked)
     if panels:
-        binned_figure(panels, ("without the terms", "with them"), folder / "unexplained.svg")
-        figures["unexplained"] = [(folder / "unexplained.svg", "residuals without and with the terms found")]
+        binned_figure(panels, labels, folder / "unexplained.svg")
+        what = ", ".join(f"{p.axis} against {p.signal}" for p in panels)
+        figures["unexplained"] = [(folder / "unexplained.svg", f"{what}: {' and '.join(filter(None, labels))}")]
     matrix_figure(*looked.structure, folder / "matrix.svg")
     figures["residuals"] = [
         (folder / "matrix.svg", "share of each residual that follows each signal, before and after")
@@ -86,15 +87,32 @@ def _effect(outcome: Outcome, looked: Looked, item: Reported) -> tuple[list[Pane
     return _compared(outcome, looked, without), (f"best model without {item.name}", "corrected model")
 
 
+def _terms(outcome: Outcome, looked: Looked) -> tuple[list[Panel], tuple[str, str]]:
+    """Panels of the terms of a formula: on all flights, or on those that alone show them."""
+    left = outcome.unexplained
+    if left is not None and left.proposal is not None:
+        both = _both(outcome, looked, left.proposal.without)
+        return panels_of(left.proposal.terms, *both, PANELS), ("without the terms", "with them")
+    if left is not None and left.held_out_only:
+        after = looked.pooled[1]
+        return panels_of(left.held_out_only, after, after, PANELS), ("left on the held-out flights", "")
+    return [], ("", "")
+
+
 def _compared(outcome: Outcome, looked: Looked, without: Hypothesis) -> list[Panel]:
     """Panels of a poorer hypothesis beside the corrected model, on all flights."""
+    return _panels(*_both(outcome, looked, without))
+
+
+def _both(outcome: Outcome, looked: Looked, without: Hypothesis) -> tuple[Pooled, Pooled]:
+    """Residuals of a poorer hypothesis and of the corrected model, on all flights."""
     searches = outcome.trace.search, looked.judge
     less, more = (
         [row for search in searches for row in residual_rows(search, hypothesis)]
         for hypothesis in (without, outcome.hypothesis)
     )
     less, more = aligned(less, more)
-    return _panels(pool(less), pool(more))
+    return pool(less), pool(more)
 
 
 def _panels(less: Pooled, more: Pooled, bins: int = BINS) -> list[Panel]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cfb_mjx.model.effects.formula import PLACES, TERMS
 from cfb_mjx.sysid.metrics import QUANTITIES
 from cfb_mjx.sysid.tracing.residuals import UNITS
 from cfb_mjx.sysid.tracing.structure import Pooled, Structure, binned
@@ -137,7 +138,8 @@ def _binned(drawn, panel: Panel, labels: tuple[str, str]) -> None:
         )
     drawn.axhline(0, color=style.MEASURED, linewidth=0.8)
     drawn.locator_params(axis="x", nbins=6)
-    drawn.set_xlabel(f"{panel.signal}, {squared(UNITS[panel.signal])}")
+    unit = (UNITS | TERMS | PLACES)[panel.signal]
+    drawn.set_xlabel(panel.signal if unit == "1" else f"{panel.signal}, {squared(unit)}")
     drawn.set_ylabel(f"{panel.axis}, {squared(panel.before.units[panel.axis])}")
 
 
