@@ -3,7 +3,8 @@
     python scripts/close_real_flights.py FOLDER [--work out/real]
 
 FOLDER holds fit/*.parquet and validation/*.parquet. Nothing is fitted to validation/. Only aggregate numbers are
-written; the flights themselves never enter the project. What a step leaves in the work folder is used again.
+written; the flights themselves never enter the project. What a step leaves in the work folder is used again. The plant
+and the predictor become the presets cfb-idsia and cfb-idsia-predictor.
 """
 
 import argparse
@@ -21,13 +22,13 @@ from real_flights_page import GROUPS, figure, page
 from scipy.signal import butter, sosfiltfilt
 
 from cfb_mjx.cli.refining import by_predictions
-from cfb_mjx.cli.runtime import configure_jax
+from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import to_body, to_world
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.parameters import ModelFile, load_model_file
+from cfb_mjx.parameters import ModelFile, load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.flow_estimator import fit_flow_estimator
 from cfb_mjx.sysid.nanodrone import QUANTITIES, Contestant, benchmark
@@ -36,7 +37,9 @@ from cfb_mjx.sysid.observer_tuning import tune_observer
 from cfb_mjx.sysid.repeatability import repeated
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "closing-real-flights.md"
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "closing-real-flights.md"
+PRESETS = {"plant": "cfb-idsia", "predictor": "cfb-idsia-predictor"}
 MASS = 0.045
 MOTORS = ("battery_sag", "motor_asymmetry")
 BESIDE = ("blade_flapping", "thrust_scale", "inertia")
@@ -207,6 +210,21 @@ def sums(models: dict[str, ModelFile], judged: list[FlightLog], observer: Observ
     return {name: [row[f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for name, row in rows.items()}
 
 
+def published(name: str, described: ModelFile, what: str, fit: list[FlightLog]) -> ModelFile:
+    """A fitted model as a preset: no file of this machine in it, and where it comes from."""
+    description = (
+        "A Crazyflie 2.1 Brushless with AI-deck and flow deck, the drone of the IDSIA nano-drone benchmark (Busetto "
+        f"et al., Control Engineering Practice 172, 2026): {what}. Velocities are those of its on-board estimator, and "
+        "position_moment belongs to the room it flew in; docs/closing-real-flights.md says what each number is worth."
+    )
+    origin = {
+        "made_by": "scripts/close_real_flights.py",
+        "fitted_to": [log.name for log in fit],
+        "environment": environment(),
+    }
+    return replace(described, name=name, description=description, provenance=origin)
+
+
 def repeats(models: dict[str, ModelFile], logs: list[FlightLog]) -> dict:
     """Pairs of flights of one reference: what each model misses in both."""
     found = {}
@@ -268,6 +286,10 @@ def main() -> None:
     results["repeats"] = kept(work / "repeats.json", lambda: repeats(both, logs["fit"] + judged))
     chosen = {"plant": made["plant"], "plant, scale taken out": made["repaired"], "predictor": made["predictor"]}
     results["sums"] = kept(work / "sums.json", lambda: sums(chosen, judged, observer))
+    for name, what in (("plant", "a plant"), ("predictor", "a predictor, with inertia left free, no plant")):
+        preset = PRESETS[name]
+        path = ROOT / "configs" / "parameters" / f"{preset}.yaml"
+        save_model_file(published(preset, made[name], what, logs["fit"]), path)
     figure(results, PAGE.with_suffix(".png"))
     write_text(PAGE, page(models, results, commands))
     print(PAGE)

@@ -13,49 +13,17 @@ from collections import Counter, defaultdict
 from pathlib import Path
 
 import numpy as np
+from tracing_cases import LEAST, MOST, achievable, cases
 
 from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.files import write_text
-from cfb_mjx.labelled_plants import EFFECTS, Case, fly_campaigns, label
+from cfb_mjx.labelled_plants import Case, fly_campaigns, label
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid.tracing.fits import ERRORS
 
 ROOT = Path(__file__).resolve().parents[1]
 
 BATCH = 8
-WEAK = 0.35
-MIXTURES = [
-    ("rotor_drag", "cog_offset"),
-    ("inflow_thrust", "battery_sag"),
-    ("ground_effect", "motor_gain_mismatch"),
-    ("blade_flapping", "inertia"),
-    ("payload", "command_delay"),
-    ("parasitic_drag", "torque_scale"),
-    ("motor_thermal_drift", "rotor_drag"),
-    ("thrust_tilt", "inflow_thrust"),
-    ("motor_time_constant", "rotor_drag", "cog_offset"),
-    ("wind", "motor_gain_mismatch"),
-    ("motor_second_order", "parasitic_drag"),
-    ("thrust_scale", "ground_effect", "rotor_drag"),
-]
-
-
-def cases(nulls: int, seed: int) -> list[Case]:
-    """Every campaign of the sweep; seeds never used while the search was written."""
-    single = [name for name in EFFECTS if not name.startswith("outside")]
-    outside = [name for name in EFFECTS if name.startswith("outside")]
-    found = [Case(f"{name}-strong", seed + i, ((name, 1.0),)) for i, name in enumerate(single)]
-    found += [Case(f"{name}-weak", seed + 100 + i, ((name, WEAK),)) for i, name in enumerate(single)]
-    found += [
-        Case("+".join(names), seed + 200 + i, tuple((n, 1.0 if k == 0 else 0.5) for k, n in enumerate(names)))
-        for i, names in enumerate(MIXTURES)
-    ]
-    found += [
-        Case(f"{name}-{k}", seed + 300 + 10 * i + k, ((name, 1.0),)) for i, name in enumerate(outside) for k in (1, 2)
-    ]
-    found += [Case(f"clean-{i}", seed + 1000 + i, ()) for i in range(nulls)]
-    # In an order of no meaning, so that a sweep cut short is a sample of the whole.
-    return [found[i] for i in np.random.default_rng(seed).permutation(len(found))]
 
 
 def run(wanted: list[Case], results: Path, from_end: bool) -> None:
@@ -108,11 +76,6 @@ def _pick(metrics: dict) -> dict:
     return {key: metrics[key] for key in ERRORS}
 
 
-def achievable(line: dict) -> float:
-    """Largest share by which a perfect model would lower an error."""
-    return max(1 - line["perfect"][key] / line["before"][key] for key in ERRORS)
-
-
 def recovered(line: dict) -> float:
     """Share of the achievable improvement reached, mean over errors a perfect model lowers by a tenth or more."""
     shares = [
@@ -151,11 +114,15 @@ def page(results: Path, planned: int) -> str:
         "|---|---|---|---|---|---|---|---|",
     ]
     groups = {
-        "one strong effect": [x for x in single if x["strengths"][0] == 1.0 and not _sensor(x)],
-        "one weak effect": [x for x in single if x["strengths"][0] < 1.0 and not _sensor(x)],
-        "sensor fault, strong": [x for x in single if x["strengths"][0] == 1.0 and _sensor(x)],
-        "sensor fault, weak": [x for x in single if x["strengths"][0] < 1.0 and _sensor(x)],
-        "two or three effects": mixed,
+        "one strong effect": [x for x in single if x["name"].endswith("-strong") and not _sensor(x)],
+        "one weak effect": [x for x in single if x["name"].endswith("-weak") and not _sensor(x)],
+        "sensor fault, strong": [x for x in single if x["name"].endswith("-strong") and _sensor(x)],
+        "sensor fault, weak": [x for x in single if x["name"].endswith("-weak") and _sensor(x)],
+        "two or three effects": [x for x in mixed if not _hard(x)],
+        f"*hard:* one effect that buys {LEAST:.0%} to {MOST:.0%}": [x for x in single if x["name"].endswith("-mild")],
+        "*hard:* a strong effect and weak ones": [x for x in mixed if x["name"].startswith("uneven")],
+        "*hard:* sensor fault of 0.6 or 0.8": [x for x in single if x["name"][-2:] in ("-1", "-2")],
+        "*hard:* sensor fault and an effect": [x for x in mixed if x["name"].startswith("faulty")],
     }
     for name, group in groups.items():
         if group:
@@ -191,6 +158,10 @@ def page(results: Path, planned: int) -> str:
     return "\n".join(text)
 
 
+def _hard(line: dict) -> bool:
+    return line["name"].startswith(("uneven", "faulty"))
+
+
 def _sensor(line: dict) -> bool:
     return line["labels"][0].startswith("sensor_")
 
@@ -215,7 +186,8 @@ def _detail(line: dict, what: str) -> str:
     found = ", ".join(item["name"] for item in line["found"]) or "-"
     strengths = ", ".join(f"{s:g}" for s in line["strengths"])
     flag = "" if line["unexplained"] is None else "yes" if line["unexplained"] else "yes, lines in the spectrum"
-    return f"| {what} | {strengths} | {achievable(line):.0%} | {found} | {recovered(line):.2f} | {flag} |"
+    buys = achievable(line["before"], line["perfect"])
+    return f"| {what} | {strengths} | {buys:.0%} | {found} | {recovered(line):.2f} | {flag} |"
 
 
 def _confusion(single: list[dict]) -> list[str]:

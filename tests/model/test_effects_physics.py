@@ -319,6 +319,25 @@ def test_rate_limit_ramps(uneven, guards):
     assert 0 < reached < commands.size
 
 
+def test_a_limit_of_the_rotors_acceleration_is_that_of_the_equation(guards, fly_fleet):
+    """Omega' = clip((K u - Omega) / T, -K / slowness, K / slowness), whatever part of it limits the output."""
+    slowness = 0.4
+    model = Quadrotor(guards, (EscRateLimit(slowness, rotor=1.0),))
+    y = np.zeros(17)
+    y[6], y[13:] = 1.0, 1450.0
+    commands = np.repeat(np.random.default_rng(8).uniform(0.3, 0.8, (8, 4)), 25, axis=0)
+    flown = fly_fleet(_batch([model]), helpers.state_of(y), jnp.asarray(commands)).rotor_speed[0]
+    count, speed, limited = 200, np.full(4, 1450.0), 0
+    for command, found in zip(commands, flown, strict=True):
+        for _ in range(count):
+            rate = (2900 * command - speed) / 0.05
+            limited += np.sum(np.abs(rate) > 2900 / slowness)
+            speed = speed + 0.004 / count * np.clip(rate, -2900 / slowness, 2900 / slowness)
+        # A step in which the limit ends is limited as a whole or not at all.
+        np.testing.assert_allclose(found, speed, atol=2.0)
+    assert 0.1 < limited / (count * commands.size) < 0.9
+
+
 def test_second_lag_follows_two_lags_in_series(guards, fly_fleet):
     lags = (0.003, 0.012, 0.05)
     dt, each = 0.001, 16
@@ -388,15 +407,20 @@ def test_warm_motors_turn_slower(guards, fly_fleet):
     model = Quadrotor(guards, (effect,))
     y = np.zeros(17)
     y[6], y[13:] = 1.0, 1450.0
-    flown = fly_fleet(_batch([model]), helpers.state_of(y), jnp.full((1000, 4), 0.5))
-    t = 0.004 * np.arange(1, 1001)
-    np.testing.assert_allclose(flown.memory[0][0][0, :, 0], t, rtol=1e-9)
-    # The drop changes slowly beside the motors' lag of 50 ms: 1450 (1 - 0.1 (1 - exp(-t / 2))), 50 ms late.
-    late = 1450 * (1 - 0.1 * (1 - np.exp(-(t - 0.05) / 2)))
-    np.testing.assert_allclose(flown.rotor_speed[0, 200:, 0], late[200:], atol=0.2)
-    memory = effect.sense(effect.start(Vec(*jnp.full(4, 1450.0)), guards), _reading(np.nan, 30.0))
-    motors, _ = _steered(effect, guards, np.full(4, 1450.0), np.full(4, 1450.0), memory)
-    np.testing.assert_allclose(motors.target.stack(), 1450 * 0.9, rtol=1e-6)
+    commands = jnp.broadcast_to(jnp.array([0.5, 0.6, 0.5, 0.45]), (1000, 4))
+    flown = fly_fleet(_batch([model]), helpers.state_of(y), commands)
+
+    def slope(t, x, command):
+        speed, warmth = x
+        return [(2900 * command * (1 - 0.1 * warmth) - speed) / 0.05, ((speed / 1594) ** 3 - warmth) / 2]
+
+    for motor, command in enumerate(commands[0]):
+        times = 0.004 * np.arange(1, 1001)
+        known = solve_ivp(slope, (0, 4), [1450.0, 0.0], args=(command,), t_eval=times, rtol=1e-9, atol=1e-9).y
+        np.testing.assert_allclose(flown.memory[0][0][0, :, motor], known[1], atol=1e-3)
+        np.testing.assert_allclose(flown.rotor_speed[0, :, motor], known[0], atol=0.2)
+    # A motor that works harder than in hover gets warmer, one that works less stays cooler.
+    assert flown.memory[0][0][0, -1, 1] > 0.95 * flown.memory[0][0][0, -1, 0] * (0.6 / 0.5) ** 3
 
 
 # The slung load.

@@ -256,9 +256,11 @@ def test_the_command_writes_its_table_and_json(folder, tmp_path, capsys, monkeyp
     assert main(["benchmark-nanodrone", str(folder), "--model", "cfb-guards", "--json", str(out)]) == 0
     printed = capsys.readouterr().out
     found = json.loads(out.read_text())
-    assert set(found["rows"]) == {"naive", "hold", "physics", "declared", "model", "model_observer"}
+    judged = {"declared", "plant", "plant_observer", "model", "model_observer"}
+    assert set(found["rows"]) == {"naive", "hold", "physics"} | judged
     assert set(found["flights"]["made"]["rows"]["model"]) == set(found["rows"]["naive"])
     assert found["windows"] > 50
     assert found["published"]["physics"]["attitude_sum_rad"] == 5.101
-    for label in ("naive", "hold", "physics (rate held)", "cfb-guards, 45 g", "model with observer", "LSTM"):
+    own = ("cfb-guards, 45 g", "cfb-idsia", "cfb-idsia with observer", "model", "model with observer")
+    for label in ("naive", "hold", "physics (rate held)", *own, "LSTM"):
         assert f"\n{label} " in printed

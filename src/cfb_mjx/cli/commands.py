@@ -62,7 +62,7 @@ def evaluate(
 
     Args:
         logs: flight logs (MCAP, parquet, csv).
-        model: preset (cfb-guards, cfb, cf21b-500, cf2x) or model YAML.
+        model: preset (cfb-guards, cfb, cfb-idsia, cf21b-500, cf2x) or model YAML.
         set: parameters to change, for instance mass=0.045.
         json: write the results here.
         figure: draw prediction against measurement here (.png, .svg, .pdf).
@@ -78,17 +78,19 @@ def evaluate(
 
 def benchmark_nanodrone(
     folder: tyro.conf.Positional[Path],
-    model: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None,
+    model: str = "cfb-idsia-predictor",
     json: File = None,
     stride: int = 1,
 ) -> None:
     """Judge a model by the rules of the IDSIA nano-drone benchmark, beside the published results.
 
-    Predictions of 50 steps at 100 Hz from every row, rotor speeds in, and only those measured by then.
+    Predictions of 50 steps at 100 Hz from every row, rotor speeds in, and only those measured by then. The preset
+    cfb-idsia, the plant fitted to flights of that drone, stands beside the model.
 
     Args:
         folder: holds the flights, raw 100 Hz merges (parquet or csv).
-        model: preset or model YAML; judged alone and with a disturbance observer.
+        model: preset or model YAML; judged alone and with a disturbance observer. The default was fitted to flights of
+            the benchmark's drone, none of them its test flights.
         json: write the results here.
         stride: rows from one prediction's start to the next.
     """

@@ -10,10 +10,12 @@ from cfb_mjx.files import require_folder, write_json
 from cfb_mjx.logs import read_log
 
 DECLARED = "cfb-guards"
+PLANT = "cfb-idsia"
+"""Fitted to flights of the benchmark's drone, none of them its test flights."""
 _ENDINGS = (".parquet", ".csv")
 
 
-def run_nanodrone(folder: Path, model: str | None, json: Path | None, stride: int) -> None:
+def run_nanodrone(folder: Path, model: str, json: Path | None, stride: int) -> None:
     """Run the benchmark, print its table, write the results.
 
     Raises:
@@ -38,16 +40,22 @@ def run_nanodrone(folder: Path, model: str | None, json: Path | None, stride: in
 
     declared = load_model_file(DECLARED).with_values("the benchmark's description", mass=VEHICLE_MASS)
     contestants = {"declared": Contestant.of(declared)}
-    if model is not None:
-        described = load_model_file(model)
-        contestants["model"] = Contestant.of(described, where=model)
-        contestants["model_observer"] = Contestant.of(described, Observer(), where=model)
+    for name, where in {"plant": PLANT, "model": model}.items():
+        described = load_model_file(where)
+        contestants[name] = Contestant.of(described, where=where)
+        contestants[f"{name}_observer"] = Contestant.of(described, Observer(), where=where)
     result = benchmark(logs, contestants, stride, Progress("benchmark"))
     published = {
         name: {f"{quantity}_sum_{unit}": x for (quantity, unit), x in zip(QUANTITIES.items(), sums, strict=True)}
         for name, sums in PUBLISHED.items()
     }
-    result |= {"published": published, "steps": STEPS, "stride": stride, "model": model, "environment": environment()}
+    result |= {
+        "published": published,
+        "steps": STEPS,
+        "stride": stride,
+        "model": model,
+        "environment": environment(),
+    }
     _print(result)
     if json is not None:
         write_json(json, result)
@@ -58,6 +66,8 @@ _UNITS = {"position": "m", "velocity": "m/s", "attitude": "rad", "rate": "rad/s"
 _LABELS = {
     "physics": "physics (rate held)",
     "declared": f"{DECLARED}, 45 g",
+    "plant": PLANT,
+    "plant_observer": f"{PLANT} with observer",
     "model": "model",
     "model_observer": "model with observer",
 }
@@ -70,9 +80,9 @@ def _print(result: dict) -> None:
     for name, flight in result["flights"].items():
         print(f"{name}: {flight['windows']} windows")
     print(f"\nmean errors after h steps of 10 ms, and their sum over h = 1 to {STEPS}; {result['windows']} windows")
-    print(f"{'':<22}" + "".join(f"{f'{q}, {_UNITS[q]}':<38}" for q in QUANTITIES).rstrip())
+    print(f"{'':<26}" + "".join(f"{f'{q}, {_UNITS[q]}':<38}" for q in QUANTITIES).rstrip())
     heads = [f"h = {h}" for h in SHOWN] + ["sum"]
-    print(f"{'':<22}" + "".join("".join(f"{head:<9}" for head in heads) + "  " for _ in QUANTITIES).rstrip())
+    print(f"{'':<26}" + "".join("".join(f"{head:<9}" for head in heads) + "  " for _ in QUANTITIES).rstrip())
     for name, row in result["rows"].items():
         _row(_LABELS.get(name, name), row, keys)
     print("as published, on the paper's own test flights:")
@@ -82,4 +92,4 @@ def _print(result: dict) -> None:
 
 def _row(label: str, row: dict, keys: list[list[str]]) -> None:
     cells = ("".join(f"{row[k]:<9.4g}" if k in row else f"{'':<9}" for k in group) + "  " for group in keys)
-    print(f"{label:<22}{''.join(cells)}".rstrip())
+    print(f"{label:<26}{''.join(cells)}".rstrip())

@@ -135,7 +135,11 @@ def command_delay(rng, drone, strength):
 
 @effect
 def esc_rate_limit(rng, drone, strength):
-    return put(drone, esc_rate=rng.uniform(3.0, 6.0) / strength)
+    rate = rng.uniform(3.0, 6.0) / strength
+    if rng.random() < 0.5:
+        return put(drone, esc_rate=rate)
+    # Its current is limited, and so the rotor's acceleration.
+    return put(drone, spin_limit=rate * c.MOTOR_GAIN)
 
 
 @effect

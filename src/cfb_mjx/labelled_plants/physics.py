@@ -38,6 +38,7 @@ NOMINAL: dict[str, object] = {
     "asymmetry_width": 80.0,  # rad/s over which one passes into the other
     "delay_ms": 0,
     "esc_rate": 0.0,  # 1/s; 0: none
+    "spin_limit": 0.0,  # rad/s^2 that a rotor's acceleration approaches; 0: none
     "second_lag": 0.0,  # s
     "flapping": 0.0,  # N m s/m of all rotors at hover
     "flapping_cross": 0.0,

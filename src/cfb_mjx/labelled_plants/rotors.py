@@ -29,7 +29,12 @@ def motor_rates(p: SimpleNamespace, gain, command, speed, esc, lagged):
     if "asymmetry" in p.on:
         # Braking relies on drag and is slower; geometric mean of both constants is the plain one.
         lag = lag * np.exp(-0.5 * p.asymmetry * np.tanh(missing / p.asymmetry_width))
-    return missing / lag, esc_rate, lag_rate
+    rate = missing / lag
+    if "spin_limit" in p.on:
+        has = p.spin_limit > 0
+        limit = np.where(has, p.spin_limit, 1.0)
+        rate = np.where(has, limit * np.tanh(rate / limit), rate)
+    return rate, esc_rate, lag_rate
 
 
 def rotor_wrench(p: SimpleNamespace, height, rotation, body_velocity, w, speed, speed_rate):

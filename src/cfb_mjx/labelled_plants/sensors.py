@@ -24,6 +24,8 @@ class Instruments:
     twist: float  # rad/s^2 rms about x and y; 0.4 of it about z
     irregular: bool
     measures_rotors: bool
+    jolt: float = 0.0
+    """By how much velocity wanders in a second beside ``push``, m/s: knocks too short for the accelerometer."""
 
 
 QUIET = Instruments(*(0.0,) * 9, irregular=False, measures_rotors=True)
@@ -47,7 +49,14 @@ def draw_instruments(rng: np.random.Generator) -> Instruments:
         twist=0.15 * 2 ** rng.uniform(-1, 1),
         irregular=bool(rng.random() < 0.4),
         measures_rotors=bool(rng.random() < 0.6),
+        # Draws of its own: all others stay what they are without it.
+        jolt=_jolt(*rng.spawn(1)),
     )
+
+
+def _jolt(rng: np.random.Generator) -> float:
+    """None in half of the campaigns: still air."""
+    return float(rng.uniform(0.02, 0.06)) if rng.random() < 0.5 else 0.0
 
 
 def row_ticks(rng: np.random.Generator, ticks: int, irregular: bool, dropouts: bool) -> np.ndarray:

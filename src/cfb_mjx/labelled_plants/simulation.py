@@ -100,6 +100,7 @@ class _Loop:
         self.past_gyro = [self.x[W]] * c.POSE_TICKS
         self.commands = np.full((DELAY_RING, 4, count), c.HOVER_SPEED / c.MOTOR_GAIN)
         self.wander = np.zeros((8, count))
+        self.jolt = _jolts([lane.instruments for lane in lanes])
         self.phase = np.array([lane.rng.uniform(0, 2 * np.pi) for lane in lanes])
         self.heat = np.zeros((4, count))
         self.charge, self.current = np.zeros(count), np.full(count, HOVER_CURRENT)
@@ -124,6 +125,7 @@ class _Loop:
         self.pose(tick, late)
         self.inertial(tick, self.low_pass(gyro), specific, voltage[None])
         self.motors(tick, command, self.x[SPEED])
+        moved[V] += self.jolt * noise[13:16]
         self.x = moved
         if tick % 5 == 0:
             self._check(tick)
@@ -201,6 +203,11 @@ def _levels(instruments: list[Instruments]) -> np.ndarray:
             for i in instruments
         ]
     ).T  # fmt: skip
+
+
+def _jolts(instruments: list[Instruments]) -> np.ndarray:
+    """(F,) steps of velocity in a tick over what drives ``push``, whose draws they share."""
+    return np.array([i.jolt / i.push if i.push else 0.0 for i in instruments]) * np.sqrt(c.TICK)
 
 
 def _padded(setpoints: list[np.ndarray]) -> np.ndarray:

@@ -1,9 +1,10 @@
-"""A speed controller that limits how fast its output changes: |du/dt| <= 1 / slowness.
+"""A speed controller that limits how fast it follows: its output, |du/dt| <= 1 / slowness, or the rotor.
 
-The output runs towards the command at that rate and stops there. What the motors receive in a step is the exact mean of
-this ramp; remembered is where it ended. Given as slowness, the time from zero to full output, so that zero is no limit;
-the mean makes the effect grow from there with a slope, where the end of the ramp alone would show nothing until the
-limit is slower than a step.
+With ``rotor`` = 0 the output runs towards the command at that rate and stops there. What the motors receive in a step
+is the exact mean of this ramp; remembered is where it ended. With ``rotor`` = 1 it is the rotor's acceleration that is
+limited, as by a limit of the motor's current: |dOmega/dt| <= K / slowness. Values between divide the slowness. It is
+given as the time from zero to full output, so that zero is no limit; the mean makes the effect grow from there with a
+slope, where the end of the ramp alone would show nothing until the limit is slower than a step.
 """
 
 from __future__ import annotations
@@ -14,25 +15,28 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.effects.base import Effect, Memory
+from cfb_mjx.model.effects.base import Effect, Memory, Motors
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.parameters import Parameters
 
 
 class EscRateLimit(Effect):
-    """|du/dt| <= 1 / slowness."""
+    """|du/dt| <= 1 / ((1 - rotor) slowness), |dOmega/dt| <= K / (rotor slowness)."""
 
     name: ClassVar[str] = "esc_rate_limit"
-    units: ClassVar[dict[str, str]] = {"slowness": "s"}
+    units: ClassVar[dict[str, str]] = {"slowness": "s", "rotor": "1"}
     source: ClassVar[str] = (
         "B. Stevens, F. Lewis, E. Johnson, Aircraft Control and Simulation, 3rd ed. 2016 (rate-limited actuator)"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"slowness": (0.0, 0.4)}
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"slowness": (0.0, 0.6), "rotor": (0.0, 1.0)}
     strengths: ClassVar[tuple[str, ...]] = ("slowness",)
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({"rotor": 0.0}, {"rotor": 1.0})
 
     slowness: Float[Array, "*batch"] = eqx.field(converter=number)
     """Time from zero to full output; zero or positive."""
+    rotor: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
+    """Share of the slowness that limits the rotor's acceleration instead of the output."""
 
     @classmethod
     def neutral(cls) -> EscRateLimit:
@@ -45,7 +49,7 @@ class EscRateLimit(Effect):
     def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
         (last,) = memory
         # Comparison instead of maximum: at zero the derivative is that of a growing slowness.
-        slowness = jnp.where(self.slowness >= 0, self.slowness, 0.0)
+        slowness = (1 - self.rotor) * jnp.where(self.slowness >= 0, self.slowness, 0.0)
         limit = dt / jnp.where(slowness > 0, slowness, 1.0)
         inverse = 1 / jnp.where(dt > 0, dt, 1.0)
 
@@ -59,3 +63,21 @@ class EscRateLimit(Effect):
 
         ramps = command.map(ramp, last)
         return Vec(*(mean for mean, _ in ramps)), (Vec(*(end for _, end in ramps)),)
+
+    def motors(
+        self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
+    ) -> tuple[Motors, Memory]:
+        slowness = self.rotor * jnp.where(self.slowness >= 0, self.slowness, 0.0)
+        limited = slowness > 0
+        limits = parameters.motor_gain * (dt / jnp.where(limited, slowness, 1.0))
+
+        def reached(target, speed, lag, limit):
+            # A target so far away that the rotor, lagging, comes as far in this step as the limit lets it.
+            share = -jnp.expm1(-dt / lag)
+            furthest = limit / jnp.where(share > 0, share, 1.0)
+            kept = speed + jnp.clip(target - speed, -furthest, furthest)
+            return jnp.where(limited & (share > 0), kept, target)
+
+        return Motors(
+            motors.target.map(reached, rotor_speed, motors.time_constant, limits), motors.time_constant
+        ), memory

@@ -1,8 +1,9 @@
 """Motors that get weaker as they warm up: winding resistance rises, the magnets' field falls.
 
-    steady rotor speed *= 1 - drop (1 - exp(-t / time_constant))
+    steady rotor speed of motor i *= 1 - drop h_i,  time_constant h_i' = (Omega_i / 1594 rad/s)^3 - h_i
 
-with t the time since power-on, remembered; a log's own time is taken over where there is one.
+h is the warmth, 0 of a cold motor and 1 of one that has hovered for long: a rotor's power grows with the cube of its
+speed, and so do losses, roughly. Motors are cold where a log, or a rollout, begins.
 """
 
 from __future__ import annotations
@@ -13,14 +14,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.effects.base import Condition, Effect, Memory, Motors, Reading
-from cfb_mjx.model.effects.fields import number
+from cfb_mjx.model.effects.base import Condition, Effect, Memory, Motors
+from cfb_mjx.model.effects.fields import HOVER_SPEED, number
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.parameters import Parameters
 
 
 class MotorThermalDrift(Effect):
-    """Steady rotor speed *= 1 - drop (1 - exp(-t / time_constant))."""
+    """Steady rotor speed *= 1 - drop h, where h follows (Omega / 1594)^3 with time_constant."""
 
     name: ClassVar[str] = "motor_thermal_drift"
     units: ClassVar[dict[str, str]] = {"drop": "1", "time_constant": "s"}
@@ -32,7 +33,7 @@ class MotorThermalDrift(Effect):
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"time_constant": 8.0}, {"time_constant": 20.0})
 
     drop: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Relative loss of speed once warm."""
+    """Relative loss of speed of a motor that has hovered for long."""
     time_constant: Float[Array, "*batch"] = eqx.field(converter=number)
     """Of warming up."""
 
@@ -41,19 +42,17 @@ class MotorThermalDrift(Effect):
         return cls(drop=0.0, time_constant=15.0)
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
-        return (Vec(jnp.zeros_like(rotor_speed[0])),)
-
-    def sense(self, memory: Memory, reading: Reading) -> Memory:
-        ((time,),) = memory
-        return (Vec(jnp.asarray(reading.time, time.dtype)),)
+        return (rotor_speed.map(jnp.zeros_like),)
 
     def motors(
         self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
     ) -> tuple[Motors, Memory]:
-        ((time,),) = memory
-        factor = 1 - self.drop * (1 - jnp.exp(-time / self.time_constant))
-        return Motors(motors.target * factor, motors.time_constant), memory
+        (warmth,) = memory
+        weaker = motors.target.map(lambda target, warm: target * (1 - self.drop * warm), warmth)
+        return Motors(weaker, motors.time_constant), memory
 
     def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
-        ((time,),) = condition.memory
-        return (Vec(time + dt),)
+        (warmth,) = condition.memory
+        load = (condition.rotor_speed * (1 / HOVER_SPEED)).map(lambda ratio: ratio * ratio * ratio)
+        # Exact for a constant load: rows of a log may be far apart.
+        return (warmth + (load - warmth) * (1 - jnp.exp(-dt / self.time_constant)),)

@@ -20,6 +20,7 @@ from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
 from cfb_mjx.sysid.tracing.fits import prediction_errors
 from cfb_mjx.sysid.tracing.formula import SURE, Proposal, Term, explain, only_there
 from cfb_mjx.sysid.tracing.lines import Line, find_lines
+from cfb_mjx.sysid.tracing.rare import with_rare
 from cfb_mjx.sysid.tracing.residuals import residual_rows
 from cfb_mjx.sysid.tracing.search import Hypothesis, Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
@@ -174,6 +175,7 @@ def close_loop(
     # Biases of the held-out sensors come from their own kinematics; no model is fitted.
     check = replace(check_sensors(held_out, delay), faults=found.sensors.faults)
     judge = found.search.beside(held_out, check)
+    found = with_rare(found, judge, progress)
     search, proposal = explain(found, progress, judge)
     progress("judging on held-out flights")
     before = evaluate(found.search.nothing().model(parameters), held_out)

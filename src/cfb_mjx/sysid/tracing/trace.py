@@ -67,6 +67,8 @@ class Trace:
     """`prediction_errors` of the declared model."""
     errors: np.ndarray
     """Of the hypothesis."""
+    fit: Fit | None = None
+    """Of the hypothesis, with derivatives by the whole catalogue."""
 
     @property
     def faults(self) -> SensorFaults:
@@ -152,11 +154,11 @@ def trace(
         single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
         fit, left_out = (completed(search, single), {}) if single is not None else (fit, left_out)
     found = [
-        _summary(search, fit, name, left_out.get(name) or leave_out(search, fit, name))
+        summary(search, fit, name, left_out.get(name) or leave_out(search, fit, name))
         for name in fit.hypothesis.present
     ]
     found.sort(key=lambda f: -f.buys)
-    return Trace(fit.hypothesis, sensors, found, tried, search, nothing.errors, fit.errors)
+    return Trace(fit.hypothesis, sensors, found, tried, search, nothing.errors, fit.errors, fit)
 
 
 def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, list[Column]]]:
@@ -349,7 +351,8 @@ def numbers_of(search: Search, hypothesis: Hypothesis, linear: Linear, name: str
     return parameters, uncertainty
 
 
-def _summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
+def summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
+    """What is reported of an effect, from a fit and what is left of it without the effect."""
     parameters, uncertainty = numbers_of(search, fit.hypothesis, fit.linear, name)
     gain, p_value = (less.own.gain, less.own.p_value) if less.own else (0.0, 1.0)
     rivals = [v[0].effect for e, v in less.ranking if v[0].effect != name and e.gain > (1 - CLOSE) * gain]
