@@ -140,7 +140,7 @@ if __name__ == "__main__":
     from cfb_mjx.files import write_text
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=93_000)
+    parser.add_argument("--seed", type=int, default=97_000)
     parser.add_argument("-o", type=Path, default=MILD)
     arguments = parser.parse_args()
     configure_jax(x64=True)

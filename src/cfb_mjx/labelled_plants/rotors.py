@@ -33,7 +33,7 @@ def motor_rates(p: SimpleNamespace, gain, command, speed, esc, lagged):
     if "spin_limit" in p.on:
         has = p.spin_limit > 0
         limit = np.where(has, p.spin_limit, 1.0)
-        rate = np.where(has, limit * np.tanh(rate / limit), rate)
+        rate = np.where(has, rate / (1 + (rate / limit) ** 6) ** (1 / 6), rate)
     return rate, esc_rate, lag_rate
 
 

@@ -29,7 +29,7 @@ class EscRateLimit(Effect):
     source: ClassVar[str] = (
         "B. Stevens, F. Lewis, E. Johnson, Aircraft Control and Simulation, 3rd ed. 2016 (rate-limited actuator)"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"slowness": (0.0, 0.6), "rotor": (0.0, 1.0)}
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"slowness": (0.0, 1.0), "rotor": (0.0, 1.0)}
     strengths: ClassVar[tuple[str, ...]] = ("slowness",)
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"rotor": 0.0}, {"rotor": 1.0})
 

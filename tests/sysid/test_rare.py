@@ -1,0 +1,94 @@
+"""Effects few blocks excite: what held-out flights must show of them, told from stand-ins for the fits."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from cfb_mjx.sysid.tracing import rare
+from cfb_mjx.sysid.tracing.columns import neutral_effects, strengths
+from cfb_mjx.sysid.tracing.evidence import Evidence
+from cfb_mjx.sysid.tracing.fits import Fit
+from cfb_mjx.sysid.tracing.search import Hypothesis
+from cfb_mjx.sysid.tracing.trace import Found, Trace
+
+NAMES = ("rotor_drag", "torque_scale", "gyroscopic")
+
+
+@pytest.fixture
+def tried(monkeypatch):
+    """Names found where rotor drag is known; ``evidence`` (gain, t) by name on the fit flights, and what others say."""
+    effects = neutral_effects(NAMES)
+    base = Hypothesis(effects, ("rotor_drag",), origin=effects)
+
+    def fit_of(hypothesis):
+        return Fit(hypothesis, None, np.full(8, 0.9 ** len(hypothesis.present)), np.ones((1, 8)))
+
+    def run(evidence, statistic=9.0, with_it=0.5):
+        asked = []
+
+        def rank(search, fit, refused):
+            left = [name for name in evidence if name not in {*fit.hypothesis.present, *refused}]
+            pairs = [(Evidence(*evidence[name], 0.01, np.zeros(1)), strengths(name)[0]) for name in left]
+            return sorted(pairs, key=lambda pair: -pair[0].gain)
+
+        def richer(hypothesis, variant, _):
+            asked.append(variant[0].effect)
+            return hypothesis.having(hypothesis.effect(variant[0].effect))
+
+        def errors(_, one):
+            return np.full(8, with_it if len(one.present) > 1 else 1.0)
+
+        def left_out(search, fit, name):
+            return SimpleNamespace(fit=fit_of(fit.hypothesis.without(name)))
+
+        monkeypatch.setattr(rare, "rank", rank)
+        monkeypatch.setattr(rare, "fitted", lambda search, one, whole: fit_of(one))
+        monkeypatch.setattr(rare, "completed", lambda search, fit: fit)
+        monkeypatch.setattr(rare, "confirm", lambda *_: SimpleNamespace(t=statistic))
+        monkeypatch.setattr(rare, "prediction_errors", errors)
+        monkeypatch.setattr(rare, "leave_out", left_out)
+        monkeypatch.setattr(rare, "summary", lambda s, f, name, less: Found(name, 0.01, 9.0, 0.1, {}, {}))
+        search = SimpleNamespace(with_candidate=richer)
+        judge = SimpleNamespace(nothing=lambda: base.without("rotor_drag"))
+        first = Found("rotor_drag", 1e-9, 99.0, 0.4, {}, {})
+        found = Trace(base, None, [first], [], search, np.ones(8), np.ones(8), fit_of(base))
+        result = rare.with_rare(found, judge)
+        assert set(result.hypothesis.present) == {item.name for item in result.found}
+        return [item.name for item in result.found], asked, result
+
+    return run
+
+
+def test_an_effect_that_held_out_flights_bear_out_is_taken_with_what_it_buys_there(tried):
+    names, _, result = tried({"torque_scale": (20.0, 3.0)})
+    assert names == ["torque_scale", "rotor_drag"]
+    assert result.found[0].buys == pytest.approx(0.5)
+    assert result.fit.hypothesis is result.hypothesis
+
+
+@pytest.mark.parametrize(
+    ("evidence", "statistic", "with_it"),
+    [
+        ((20.0, 1.9), 9.0, 0.5),  # says too little on the fit flights
+        ((7.0, 3.0), 9.0, 0.5),
+        ((20.0, 3.0), 3.9, 0.5),  # not borne out
+        ((20.0, 3.0), 9.0, 0.95),  # matters too little
+        ((20.0, 3.0), 9.0, 1.2),  # predicts worse
+    ],
+)
+def test_an_effect_is_left_where_one_condition_fails(tried, evidence, statistic, with_it):
+    names, _, _ = tried({"torque_scale": evidence}, statistic, with_it)
+    assert names == ["rotor_drag"]
+
+
+def test_no_more_than_two_are_tried_and_one_that_needs_an_impossible_strength_is_not_taken(tried, monkeypatch):
+    evidence = {"torque_scale": (20.0, 3.0), "gyroscopic": (30.0, 3.0)}
+    monkeypatch.setattr(rare, "implausible", lambda hypothesis, name: name == "gyroscopic")
+    names, asked, _ = tried(evidence)
+    assert asked == ["gyroscopic", "torque_scale"]
+    assert "gyroscopic" not in names
+    monkeypatch.setattr(rare, "TRIED", 1)
+    assert tried(evidence)[1] == ["gyroscopic"]
