@@ -419,8 +419,8 @@ def test_warm_motors_turn_slower(guards, fly_fleet):
         known = solve_ivp(slope, (0, 4), [1450.0, 0.0], args=(command,), t_eval=times, rtol=1e-9, atol=1e-9).y
         np.testing.assert_allclose(flown.memory[0][0][0, :, motor], known[1], atol=1e-3)
         np.testing.assert_allclose(flown.rotor_speed[0, :, motor], known[0], atol=0.3)
-    # A motor that works harder than in hover gets warmer, one that works less stays cooler.
-    assert flown.memory[0][0][0, -1, 1] > 0.95 * flown.memory[0][0][0, -1, 0] * (0.6 / 0.5) ** 3
+    # A motor that works harder gets warmer, and so slower than the cube of its command would have it.
+    assert 1.4 < flown.memory[0][0][0, -1, 1] / flown.memory[0][0][0, -1, 0] < (0.6 / 0.5) ** 3
 
 
 # The slung load.

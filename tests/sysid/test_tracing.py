@@ -26,7 +26,7 @@ from cfb_mjx.sysid.tracing.lines import find_lines
 from cfb_mjx.sysid.tracing.outcome import close_loop
 from cfb_mjx.sysid.tracing.residuals import residual_rows
 from cfb_mjx.sysid.tracing.search import Search
-from cfb_mjx.sysid.tracing.sensors import check_sensors
+from cfb_mjx.sysid.tracing.sensors import check_sensors, lags
 from cfb_mjx.sysid.tracing.trace import trace
 
 # One worker: every program is compiled once.
@@ -83,6 +83,26 @@ def test_sensor_faults_are_named_and_measured(campaigns, case, fault, truth, tol
     before = evaluate(model, campaign.held_out).metrics("commands_in")[key]
     after = evaluate(model, campaign.held_out, faults=check.faults).metrics("commands_in")[key]
     assert after < 0.8 * before
+
+
+@pytest.mark.parametrize(
+    ("pose", "gyro", "knocks"),
+    [
+        (0.0, 0.0, 1e-3),
+        (0.012, 0.0, 3e-3),
+        (0.0, 0.008, 3e-3),
+        (0.02, 0.01, 5e-4),
+        (-0.008, 0.0, 5e-4),
+        (0.03, 0.0, 5e-4),
+    ],
+)
+@pytest.mark.parametrize("away", [-1.0, 0.0, 1.0])
+def test_lags_are_told_apart_however_inexact_the_velocity_is(pose, gyro, knocks, away):
+    found = {f.name: f.value for f in lags((pose - gyro, 2e-4), (pose + away * knocks, knocks))}
+    there = {"sensor_delay": pose, "sensor_gyro_lowpass": gyro}
+    assert set(found) == {name for name, value in there.items() if value}
+    for name, value in found.items():
+        assert value == pytest.approx(there[name], abs=7e-4)
 
 
 @pytest.mark.parametrize(("across", "up"), [(1.09, 1.0), (1.0, 0.94), (1.05, 1.10)])

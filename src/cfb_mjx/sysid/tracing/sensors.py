@@ -91,27 +91,16 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
         "velocity_lag": _pooled(kinematics, "velocity_lag", 1),
         "velocity_scale": _pooled(kinematics, "velocity_scale", 2),
     }
-    (turn, turn_std), (gain, gain_std), (scale, scale_std) = pooled.values()
-    # The accelerometer has its own clockwork beside the pose's; the gyro's lag is what is left between the two.
-    gyro = gain - turn, float(np.hypot(turn_std, gain_std))
+    turn, gain, (scale, scale_std) = pooled.values()
     looked = {
-        "sensor_delay": (gain, gain_std),
-        "sensor_gyro_lowpass": gyro,
+        "sensor_delay": gain,
+        # The accelerometer has its own clockwork beside the pose's; the gyro's lag is what is left between the two.
+        "sensor_gyro_lowpass": (gain[0] - turn[0], float(np.hypot(turn[1], gain[1]))),
         "sensor_velocity_scale": (scale, scale_std),
     }
-    findings = []
-    for name, (value, std) in looked.items():
-        own = vertical if name == "sensor_velocity_scale" else None
-        # A gyro cannot be ahead of what it measures.
-        if (_away(name, value, std) or own) and not (name == "sensor_gyro_lowpass" and value < 0):
-            findings.append(Finding(name, value, std, own))
-    if any(f.name == "sensor_delay" for f in findings) and not any(f.name == "sensor_gyro_lowpass" for f in findings):
-        # With a healthy gyro both comparisons show the same delay; the turn tells it more exactly.
-        weight = np.array([1 / turn_std**2, 1 / gain_std**2])
-        value = float(weight @ [turn, gain] / weight.sum())
-        findings = [
-            Finding(f.name, value, float(weight.sum() ** -0.5)) if f.name == "sensor_delay" else f for f in findings
-        ]
+    findings = lags(turn, gain)
+    if _away("sensor_velocity_scale", scale, scale_std) or vertical:
+        findings.append(Finding("sensor_velocity_scale", scale, scale_std, vertical))
     faults = SensorFaults(**{ATTRIBUTES[f.name][key]: x for f in findings for key, x in f.parameters.items()})
     if not faults.healthy:
         # Biases again, from repaired flights.
@@ -124,6 +113,29 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
         dict(zip(names, [k.gyro_bias for k in kinematics], strict=True)),
         dict(zip(names, _shrunk(np.array([k.accelerometer_bias for k in kinematics])), strict=True)),
     )
+
+
+def lags(turn: tuple[float, float], gain: tuple[float, float]) -> list[Finding]:
+    """Lags of the pose, beyond the declared one, and of the gyro, which cannot be ahead of what it measures.
+
+    Args:
+        turn: by how much the attitude is behind the gyro, s, and its deviation: the pose's lag less the gyro's.
+        gain: by how much the velocity is behind the accelerometer: the pose's lag. Knocks too short for the
+            accelerometer make it far less exact than ``turn``.
+    """
+    gyro = gain[0] - turn[0], float(np.hypot(turn[1], gain[1]))
+    late, slow = _away("sensor_delay", *gain), _away("sensor_gyro_lowpass", *gyro) and gyro[0] > 0
+    if late and slow:
+        return [Finding("sensor_delay", *gain), Finding("sensor_gyro_lowpass", *gyro)]
+    if not (late or _away("sensor_delay", *turn)):
+        return [Finding("sensor_gyro_lowpass", *gyro)] if slow else []
+    if not late and turn[0] < 0 and abs(gain[0]) < abs(gyro[0]):
+        # Of the two, a slow gyro and a pose younger than declared, the velocity is nearer to the first.
+        return [Finding("sensor_gyro_lowpass", -turn[0], turn[1])]
+    # With a healthy gyro both comparisons show the same delay; the turn tells it more exactly.
+    weight = np.array([1 / turn[1] ** 2, 1 / gain[1] ** 2])
+    value = float(weight @ [turn[0], gain[0]] / weight.sum())
+    return [Finding("sensor_delay", value, float(weight.sum() ** -0.5))]
 
 
 def _away(name: str, value: float, std: float, healthy: float | None = None) -> bool:
