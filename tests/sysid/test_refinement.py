@@ -31,7 +31,7 @@ GUARDS = load_model_file("cfb-guards").parameters
 
 @pytest.fixture(scope="module")
 def campaign():
-    return fly_campaigns([Case("drag", 9002, (("rotor_drag", 1.0),))], duration_scale=0.35)[0]
+    return fly_campaigns([Case("drag", 9007, (("rotor_drag", 1.0),))], duration_scale=0.35)[0]
 
 
 @pytest.fixture(scope="module")
