@@ -222,7 +222,8 @@ def published(name: str, described: ModelFile, what: str, fit: list[FlightLog]) 
         "fitted_to": [log.name for log in fit],
         "environment": environment(),
     }
-    return replace(described, name=name, description=description, provenance=origin)
+    weighed = described.with_values("weighed with its decks, the benchmark's description", mass=MASS)
+    return replace(weighed, name=name, description=description, provenance=origin)
 
 
 def repeats(models: dict[str, ModelFile], logs: list[FlightLog]) -> dict:

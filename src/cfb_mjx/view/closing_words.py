@@ -22,7 +22,7 @@ MEANING = {
     "motor_thermal_drift": "the motors slow down as they warm up",
     "battery_sag": "rotor speed follows the battery's voltage",
     "command_delay": "commands reach the motors late",
-    "esc_rate_limit": "the motor controllers limit how fast a command may change",
+    "esc_rate_limit": "the motor controllers limit how fast a command, or the rotor, may change",
     "inflow_thrust": "thrust falls in climb and grows in descent",
     "ground_effect": "thrust grows near the ground",
     "gyroscopic": "the spinning rotors resist being turned",
