@@ -39,7 +39,10 @@ from cfb_mjx.sysid.sensor_faults import SensorFaults
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "closing-real-flights.md"
-PRESETS = {"plant": "cfb-idsia", "predictor": "cfb-idsia-predictor"}
+PRESETS = {
+    "plant": ("cfb-idsia", "a plant"),
+    "predictor": ("cfb-idsia-predictor", "a predictor, with inertia left free, no plant"),
+}
 MASS = 0.045
 MOTORS = ("battery_sag", "motor_asymmetry")
 BESIDE = ("blade_flapping", "thrust_scale", "inertia")
@@ -287,8 +290,7 @@ def main() -> None:
     results["repeats"] = kept(work / "repeats.json", lambda: repeats(both, logs["fit"] + judged))
     chosen = {"plant": made["plant"], "plant, scale taken out": made["repaired"], "predictor": made["predictor"]}
     results["sums"] = kept(work / "sums.json", lambda: sums(chosen, judged, observer))
-    for name, what in (("plant", "a plant"), ("predictor", "a predictor, with inertia left free, no plant")):
-        preset = PRESETS[name]
+    for name, (preset, what) in PRESETS.items():
         path = ROOT / "configs" / "parameters" / f"{preset}.yaml"
         save_model_file(published(preset, made[name], what, logs["fit"]), path)
     figure(results, PAGE.with_suffix(".png"))

@@ -42,14 +42,18 @@ class EscRateLimit(Effect):
     def neutral(cls) -> EscRateLimit:
         return cls(slowness=0.0)
 
+    @property
+    def _slowness(self) -> Array:
+        # Comparison instead of maximum: at zero the derivative is that of a growing slowness.
+        return jnp.where(self.slowness >= 0, self.slowness, 0.0)
+
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
         steady = (rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
         return (steady.map(lambda u: jnp.clip(u, 0.0, 1.0)),)
 
     def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
         (last,) = memory
-        # Comparison instead of maximum: at zero the derivative is that of a growing slowness.
-        slowness = (1 - self.rotor) * jnp.where(self.slowness >= 0, self.slowness, 0.0)
+        slowness = (1 - self.rotor) * self._slowness
         limit = dt / jnp.where(slowness > 0, slowness, 1.0)
         inverse = 1 / jnp.where(dt > 0, dt, 1.0)
 
@@ -67,7 +71,7 @@ class EscRateLimit(Effect):
     def motors(
         self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
     ) -> tuple[Motors, Memory]:
-        slowness = self.rotor * jnp.where(self.slowness >= 0, self.slowness, 0.0)
+        slowness = self.rotor * self._slowness
         limited = slowness > 0
         limits = parameters.motor_gain * (dt / jnp.where(limited, slowness, 1.0))
 
@@ -78,6 +82,5 @@ class EscRateLimit(Effect):
             kept = speed + jnp.clip(target - speed, -furthest, furthest)
             return jnp.where(limited & (share > 0), kept, target)
 
-        return Motors(
-            motors.target.map(reached, rotor_speed, motors.time_constant, limits), motors.time_constant
-        ), memory
+        target = motors.target.map(reached, rotor_speed, motors.time_constant, limits)
+        return Motors(target, motors.time_constant), memory

@@ -18,6 +18,10 @@ MATERIAL = 0.05
 """And lower at least one prediction error (four quantities, two horizons) by this share."""
 OF_FIRST = 0.02
 """And by this share of what the declared model scores, so that the last crumbs of a large error are not chased."""
+STRUCTURE = 0.06
+"""What a search did not find (a formula, a rarely excited effect) counts when it lowers an error by this share."""
+STRUCTURE_OF_FIRST = 0.05
+"""And by this share of what the declared model scores: an effect of slightly another shape leaves crumbs."""
 CLEAR = 8.0
 """An effect whose statistic is above this need only be material in one flight: what few flights excite (yaw, most of
 all) drowns in the errors of the others, and no chance brings such a statistic about."""
@@ -67,3 +71,8 @@ def material(fit: Fit, richer: Fit, nothing: Fit, clear: bool) -> bool:
 def enough(poorer: np.ndarray, better: np.ndarray, first: np.ndarray, share: float, of_first: float) -> bool:
     """Whether an error is lowered by a share, and an error by a share of what the declared model (``first``) scores."""
     return bool(np.max(1 - better / poorer) >= share and np.max((poorer - better) / first) >= of_first)
+
+
+def lowered(old: np.ndarray, new: np.ndarray, first: np.ndarray) -> bool:
+    """Whether what a search did not find lowers an error by a share that matters, and errors on the whole."""
+    return enough(old, new, first, STRUCTURE, STRUCTURE_OF_FIRST) and np.log(new / old).sum() <= 0

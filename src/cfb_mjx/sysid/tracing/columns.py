@@ -21,10 +21,13 @@ TORQUE_UNIT, FORCE_UNIT = 3e-5, 4e-3
 """What a term of a formula typically adds, N m and N: about 1 rad/s^2 and 0.1 m/s^2 on this drone."""
 LEAST_SIZE = 1e-4
 """Signals smaller than this, in their units, were not excited."""
-_COARSE = {"esc_rate_limit": 0.05, "command_delay": 0.2, "motor_second_order": 0.3}
-"""Effects whose slope at zero says little are looked for at this share of their prior range."""
-_COARSER = {("esc_rate_limit", (("rotor", 1.0),)): 0.8}
-"""The same for one of their probes: no rotor comes near the limits that are tried for commands."""
+_COARSE = {
+    ("command_delay", ()): 0.2,
+    ("motor_second_order", ()): 0.3,
+    ("esc_rate_limit", (("rotor", 1.0),)): 0.8,
+}
+"""Effects and probes whose slope at zero says little are looked for at this share of their prior range; no rotor comes
+near the limits that are tried for commands."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +75,7 @@ def shapes(effect: Effect) -> list[Column]:
 
 def step_of(column: Column, present: bool) -> float:
     """Step of the finite difference by which a column is found."""
-    coarse = _COARSER.get((column.effect, column.probe), _COARSE.get(column.effect, 0.05))
-    share = 0.02 if present else coarse
+    share = 0.02 if present else _COARSE.get((column.effect, column.probe), 0.05)
     # A step towards positive values: where zero is the lowest value possible there is nothing on the other side.
     return share * 2 * column.scale
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS
-from cfb_mjx.sysid.tracing.acceptance import enough
+from cfb_mjx.sysid.tracing.acceptance import STRUCTURE, enough, lowered
 from cfb_mjx.sysid.tracing.columns import FORMULA, Column, term_columns
 from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.evidence import covariance, solve
@@ -17,10 +17,6 @@ from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Search
 from cfb_mjx.sysid.tracing.terms import Selection, select, with_library
 from cfb_mjx.sysid.tracing.trace import Trace
 
-STRUCTURE = 0.06
-"""A formula counts when it lowers at least one prediction error by this share."""
-OF_FIRST = 0.05
-"""And by this share of what the declared model scores: an effect of slightly another shape leaves crumbs."""
 SURE = 3.0
 """A formula counts when its statistic on flights nothing was fitted to is above this."""
 THERE_ALONE = 0.2
@@ -116,10 +112,6 @@ def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Colu
     return bool(said > 0.5 * np.trace(total[np.ix_(effect, effect)]))
 
 
-def _lowered(old: np.ndarray, new: np.ndarray, first: np.ndarray) -> bool:
-    return enough(old, new, first, STRUCTURE, OF_FIRST) and np.log(new / old).sum() <= 0
-
-
 def explain(
     found: Trace, progress: Callable[[str], None] = lambda _: None, held_out: Search | None = None
 ) -> tuple[Search, Proposal | None]:
@@ -190,12 +182,12 @@ def _material(
     if not terms:
         return []
     richer, _ = fit_formula(search, base, terms)
-    if _lowered(found.errors, prediction_errors(search, richer), found.declared_errors):
+    if lowered(found.errors, prediction_errors(search, richer), found.declared_errors):
         return terms
     if held_out is None:
         return []
     three = found.hypothesis, richer, held_out.nothing()
-    return terms if _lowered(*(prediction_errors(held_out, each) for each in three)) else []
+    return terms if lowered(*(prediction_errors(held_out, each) for each in three)) else []
 
 
 def _with_rare(
@@ -217,7 +209,7 @@ def _with_rare(
         return terms
     richer, _ = fit_formula(search, base, terms + more)
     three = [prediction_errors(judge, each) for each in (poorer, richer, judge.nothing())]
-    return terms + more if _lowered(*three) else terms
+    return terms + more if lowered(*three) else terms
 
 
 def _constant_forces(terms: list[Column]) -> list[Column]:

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cfb_mjx.sysid.tracing.acceptance import enough, implausible
+from cfb_mjx.sysid.tracing.acceptance import implausible, lowered
 from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.fits import Fit, completed, fitted, prediction_errors
 from cfb_mjx.sysid.tracing.search import Search
@@ -23,8 +23,6 @@ TRIED = 2
 """Effects tried at most, the largest gain first."""
 SURE = 4.0
 """Statistic on flights nothing was fitted to: beyond chance after a search through the catalogue."""
-SHARE, OF_FIRST = 0.06, 0.05
-"""It must lower an error there by this share, and by this share of what the declared model scores."""
 
 
 def with_rare(found: Trace, held_out: Search, progress: Callable[[str], None] = lambda _: None) -> Trace:
@@ -71,6 +69,4 @@ def _share(held_out: Search, fit: Fit, richer: Fit, name: str) -> float | None:
         return None
     pair = fit.hypothesis, richer.hypothesis
     old, new, first = (prediction_errors(held_out, each) for each in (*pair, held_out.nothing()))
-    if not enough(old, new, first, SHARE, OF_FIRST) or np.log(new / old).sum() > 0:
-        return None
-    return float(np.max(1 - new / old))
+    return float(np.max(1 - new / old)) if lowered(old, new, first) else None

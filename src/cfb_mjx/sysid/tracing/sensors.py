@@ -94,8 +94,7 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
     turn, gain, (scale, scale_std) = pooled.values()
     looked = {
         "sensor_delay": gain,
-        # The accelerometer has its own clockwork beside the pose's; the gyro's lag is what is left between the two.
-        "sensor_gyro_lowpass": (gain[0] - turn[0], float(np.hypot(turn[1], gain[1]))),
+        "sensor_gyro_lowpass": _gyro_lag(turn, gain),
         "sensor_velocity_scale": (scale, scale_std),
     }
     findings = lags(turn, gain)
@@ -123,7 +122,7 @@ def lags(turn: tuple[float, float], gain: tuple[float, float]) -> list[Finding]:
         gain: by how much the velocity is behind the accelerometer: the pose's lag. Knocks too short for the
             accelerometer make it far less exact than ``turn``.
     """
-    gyro = gain[0] - turn[0], float(np.hypot(turn[1], gain[1]))
+    gyro = _gyro_lag(turn, gain)
     late, slow = _away("sensor_delay", *gain), _away("sensor_gyro_lowpass", *gyro) and gyro[0] > 0
     if late and slow:
         return [Finding("sensor_delay", *gain), Finding("sensor_gyro_lowpass", *gyro)]
@@ -136,6 +135,11 @@ def lags(turn: tuple[float, float], gain: tuple[float, float]) -> list[Finding]:
     weight = np.array([1 / turn[1] ** 2, 1 / gain[1] ** 2])
     value = float(weight @ [turn[0], gain[0]] / weight.sum())
     return [Finding("sensor_delay", value, float(weight.sum() ** -0.5))]
+
+
+def _gyro_lag(turn: tuple[float, float], gain: tuple[float, float]) -> tuple[float, float]:
+    """The accelerometer has its own clockwork beside the pose's; the gyro's lag is what is left between the two."""
+    return gain[0] - turn[0], float(np.hypot(turn[1], gain[1]))
 
 
 def _away(name: str, value: float, std: float, healthy: float | None = None) -> bool:

@@ -355,11 +355,13 @@ def summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
     """What is reported of an effect, from a fit and what is left of it without the effect."""
     parameters, uncertainty = numbers_of(search, fit.hypothesis, fit.linear, name)
     gain, p_value = (less.own.gain, less.own.p_value) if less.own else (0.0, 1.0)
-    # Slopes at neutral understate an effect whose shape was fitted; what it explains as it is counts.
-    explained = max(gain, confirm(search, less.fit.hypothesis, fit.hypothesis).gain)
-    rivals = [v[0].effect for e, v in less.ranking if v[0].effect != name and e.gain > (1 - CLOSE) * explained]
+    rivals = {v[0].effect: e.gain for e, v in less.ranking if v[0].effect != name and e.gain > (1 - CLOSE) * gain}
+    if rivals:
+        # Slopes at neutral understate an effect whose shape was fitted; what it explains as it is counts.
+        explained = max(gain, confirm(search, less.fit.hypothesis, fit.hypothesis).gain)
+        rivals = {rival: its for rival, its in rivals.items() if its > (1 - CLOSE) * explained}
     buys = float(np.max(1 - fit.errors / less.fit.errors))
-    return Found(name, p_value, gain, buys, parameters, uncertainty, rivals, less.fit.hypothesis)
+    return Found(name, p_value, gain, buys, parameters, uncertainty, list(rivals), less.fit.hypothesis)
 
 
 def _line(variant: list[Column], found: Evidence) -> dict:
