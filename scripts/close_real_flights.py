@@ -30,12 +30,15 @@ from cfb_mjx.logs.rotation import to_body, to_world
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import ModelFile, load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
+from cfb_mjx.sysid.flight import usual_delay
 from cfb_mjx.sysid.flow_estimator import fit_flow_estimator
 from cfb_mjx.sysid.nanodrone import QUANTITIES, Contestant, benchmark
 from cfb_mjx.sysid.observer import Observer
 from cfb_mjx.sysid.observer_tuning import tune_observer
 from cfb_mjx.sysid.repeatability import repeated
 from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.tracing.sensors import check_sensors
+from cfb_mjx.sysid.velocity_band import explained
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "closing-real-flights.md"
@@ -59,6 +62,7 @@ STEP = 0.01
 """Of the even grid on which signals are filtered, s."""
 INNER = slice(150, -150)
 """Rows that a filter's ends do not reach."""
+PARTS = {"fit": "fitted to", "validation": "judged on"}
 BANDS = ((0.1, 0.3), (0.2, 0.5), (0.5, 1.0))
 """Hz; faster motion is too small in the gentle flights for the slope of a position to show it."""
 
@@ -108,19 +112,33 @@ def errors(described: ModelFile, logs: list[FlightLog], observer: Observer | Non
     return found
 
 
-def columns(made: dict[str, ModelFile], fit: list[FlightLog]) -> dict:
-    """The fit flights, predicted with the sensor faults taken out and as they were logged."""
-    faults = SensorFaults.from_mappings(made["repaired"].effects, "repaired")
-    found = {name: errors(made[name], fit) for name in ("repaired", "plant")}
-    bands = {f"{low:g} to {high:g} Hz": stretched(fit, low, high) for low, high in BANDS}
-    return {"stretch": faults.stretch.tolist(), "bands": bands, "errors": found}
+def columns(made: dict[str, ModelFile], logs: dict[str, list[FlightLog]]) -> dict:
+    """The fit flights, predicted with the sensor faults taken out and as they were logged; what the velocity column
+    does, stretched alike at all frequencies or in a band of them."""
+    fit = logs["fit"]
+    even = check_sensors(fit, usual_delay(fit, made["repaired"].parameters())).faults
+    band = SensorFaults.from_mappings(made["repaired"].effects, "repaired")
+    explains = {
+        f"{PARTS[part]}, {group}": [
+            float(np.mean([explained(faults, log) for log in some if group_of(log.name) == group]))
+            for faults in (even, band)
+        ]
+        for part, some in logs.items()
+        for group in GROUPS
+    }
+    return {
+        "stretch": even.stretch.scale.tolist(),
+        "band": [band.velocity_scale, band.velocity_rise, band.velocity_fade],
+        "explained": explains,
+        "bands": {f"{low:g} to {high:g} Hz": stretched(fit, low, high) for low, high in BANDS},
+        "errors": {name: errors(made[name], fit) for name in ("repaired", "plant")},
+    }
 
 
 def tilts(logs: dict[str, list[FlightLog]], scale: float) -> dict[str, dict]:
     """`tilted` of every group of the flights fitted to and judged on."""
-    titles = {"fit": "fitted to", "validation": "judged on"}
     return {
-        f"{titles[part]}, {group}": tilted([log for log in some if group_of(log.name) == group], scale)
+        f"{PARTS[part]}, {group}": tilted([log for log in some if group_of(log.name) == group], scale)
         for part, some in logs.items()
         for group in GROUPS
     }
@@ -276,7 +294,7 @@ def main() -> None:
     }
     judged = logs["validation"]
     results = {part: [log.name for log in some] for part, some in logs.items()} | {"mass": MASS, "slow": SLOW}
-    results["columns"] = kept(work / "columns.json", lambda: columns(made, logs["fit"]))
+    results["columns"] = kept(work / "columns.json", lambda: columns(made, logs))
     scale = results["columns"]["stretch"][0]
     results["tilt"] = kept(work / "tilt.json", lambda: tilts(logs, scale))
     results["place"] = kept(work / "place.json", lambda: by_place(logs["fit"]))
@@ -288,7 +306,7 @@ def main() -> None:
     results["without"] = kept(work / "without.json", lambda: without_each(made["plant"], logs["fit"], judged))
     both = {name: models[name] for name in ("declared", "plant")}
     results["repeats"] = kept(work / "repeats.json", lambda: repeats(both, logs["fit"] + judged))
-    chosen = {"plant": made["plant"], "plant, scale taken out": made["repaired"], "predictor": made["predictor"]}
+    chosen = {"plant": made["plant"], "plant, stretch taken out": made["repaired"], "predictor": made["predictor"]}
     results["sums"] = kept(work / "sums.json", lambda: sums(chosen, judged, observer))
     for name, (preset, what) in PRESETS.items():
         path = ROOT / "configs" / "parameters" / f"{preset}.yaml"

@@ -210,11 +210,21 @@ def _columns(seen: dict, tilted_by: dict) -> list[str]:
             rows.append(f"| {TITLES[variant]} | {group} | " + " | ".join(cells) + " |")
     tilt = [_tilt(flights, by_reason) for flights, by_reason in tilted_by.items()]
     across, _, up = seen["stretch"]
+    largest, rise, fade = seen["band"]
     return [
         f"The sensors, compared with each other, say that the logged velocity is {across:.3f} times too large",
         f"horizontally and {up:.3f} times vertically (`sensor_velocity_scale`). The drone carried a flow deck, which",
-        "measures horizontal velocity by optical flow and height by a ranger. The tilt is too large as well, says the",
-        "accelerometer, turned by the logged attitude and set beside the position; in the flights fitted to:",
+        "measures horizontal velocity by optical flow and height by a ranger. It is not so at all frequencies: "
+        f"{1 - 1 / largest:.2f} of the velocity,",
+        f"{rise:.2f} s late, less the same another {fade:.2f} s late (`rise`, `fade`; `cfb_mjx.sysid.velocity_band`),",
+        "accounts for more of what the horizontal velocity has over the slope of the position, below 4 Hz:",
+        "",
+        "| flights | stretched alike | in a band |",
+        "|---|---:|---:|",
+        *(f"| {part} | {100 * even:.0f}% | {100 * band:.0f}% |" for part, (even, band) in seen["explained"].items()),
+        "",
+        "The tilt is too large as well, says the accelerometer,",
+        "turned by the logged attitude and set beside the position; in the flights fitted to:",
         "",
         "| motion | velocity / position, horizontally | acceleration / position | velocity / position, vertically | "
         "acceleration / position |",
@@ -232,13 +242,13 @@ def _columns(seen: dict, tilted_by: dict) -> list[str]:
         *tilt,
         "",
         "In gentle flights the logged tilt is too large because its estimator knows no drag. In square flights it is",
-        "corrected by more than either explains. Taking the scale out of the velocity alone leaves the tilt that moves",
-        "the drone too large: positions are predicted better, the velocity column worse. The plant therefore takes",
-        "columns as they were logged (`--as-logged`): they agree with each other, and its drag and thrust are those",
-        "of this velocity; the predictor takes the scale out.",
+        "corrected by more than either explains. Taking the stretch out of the velocity alone leaves the tilt that",
+        "moves the drone too large: positions are predicted better, attitude and velocity of square flights worse.",
+        "The plant therefore takes columns as they were logged (`--as-logged`): they agree with each other, and its",
+        "drag and thrust are those of this velocity; the predictor takes the stretch out.",
         "Mean errors on the flights fitted to after 0.5 s, attitude, rad, / velocity as logged, m/s:",
         "",
-        "| prediction | flights | scale taken out | as logged |",
+        "| prediction | flights | stretch taken out | as logged |",
         "|---|---|---|---|",
         *rows,
     ]

@@ -112,7 +112,7 @@ def test_a_velocity_stretched_along_some_axes_only_is_told_from_one_stretched_al
     flights = [log.replace(velocity=log.velocity * stretch) for log in campaigns["clean"].fit]
     check = check_sensors(flights, 0.008)
     assert [f.name for f in check.findings] == ["sensor_velocity_scale"]
-    np.testing.assert_allclose(check.faults.stretch, stretch, atol=0.004)
+    np.testing.assert_allclose(check.faults.stretch.scale, stretch, atol=0.004)
     assert check.findings[0].p_value < 1e-6
     assert check.findings[0].parameters == {
         "scale": check.faults.velocity_scale,

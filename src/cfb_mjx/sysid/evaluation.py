@@ -128,9 +128,10 @@ def _evaluate_log(
 ) -> LogEvaluation:
     delay = delay_of(log, model.parameters)
     recorded = find_windows(log, horizons, delay)
-    reached = faults.reached(horizons)
+    reached, as_logged = faults.reached(horizons), log
     log = faults.repaired(log)
     windows = recorded if faults.healthy else find_windows(log, reached, delay, recorded.start)
+    began = faults.began(as_logged, windows, delay)
     measured = np.isfinite(windows.rotor_speed).all(axis=(1, 2))
     predictions: dict[str, State | None] = dict.fromkeys(VARIANTS + OBSERVED)
     if len(windows):
@@ -140,10 +141,10 @@ def _evaluate_log(
         predictions["hold"] = hold(recorded, horizons)
         if observer is not None:
             predictions |= _observed(model, log, delay, windows, measured, memory, observer, over)
-    predictions = {
-        variant: predicted if predicted is None or variant == "hold" else faults.as_recorded(predicted, horizons)
-        for variant, predicted in predictions.items()
-    }
+    for variant, predicted in predictions.items():
+        if predicted is not None and variant != "hold":
+            own = jax.tree.map(lambda x: x[measured], began) if variant.startswith("rotor") else began
+            predictions[variant] = faults.as_recorded(predicted, horizons, own)
     errors = {
         variant: None
         if predicted is None

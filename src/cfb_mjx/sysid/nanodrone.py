@@ -164,14 +164,16 @@ class Contestant:
 def predict(contestant: Contestant, log: FlightLog, starts: Starts):
     """A contestant's prediction: position, velocity, quaternion and body rate, (W, S, 3 or 4).
 
-    A window starts from its row; in the step after row k the rotors turn as row k says. A scale of the velocity column
-    is taken out of the row and put back into what is predicted; lags of sensors are left alone, for rows later than a
-    window's start would be needed. An observer adds the disturbance and the filtered body rate it knows at that row.
+    A window starts from its row; in the step after row k the rotors turn as row k says. A stretch of the velocity
+    column is taken out of the row, which needs earlier ones at most, and put back into what is predicted; lags of
+    sensors are left alone, for rows later than a window's start would be needed. An observer adds the disturbance and
+    the filtered body rate it knows at that row.
     """
     model, observer, stretch = contestant.model, contestant.observer, contestant.faults.stretch
+    carried = stretch.memory(log.time, log.velocity)[starts.row]
     log = contestant.faults.unstretched(log)
     position, _, quaternion, rate = (x[starts.row] for x in starts.truth)
-    velocity = log.velocity[starts.row]
+    began = velocity = log.velocity[starts.row]
     memory = _memory(model, log, starts.row)
     if observer is not None:
         # Pose is read without its delay: to allow for it, rows later than a window's start would be needed.
@@ -187,7 +189,8 @@ def predict(contestant: Contestant, log: FlightLog, starts: Starts):
         flown = _fly(model, jax.tree.map(lambda x, i=index: x[i], state), inputs[index])
         parts.append(jax.tree.map(lambda x, n=len(starts) - first: np.asarray(x)[:n], flown))
     position, velocity, quaternion, rate = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    return position, velocity * stretch, quaternion, rate
+    velocity = np.concatenate([began[:, None], velocity], axis=1)
+    return position, stretch.done(carried, np.full(STEPS, INTERVAL), velocity)[:, 1:], quaternion, rate
 
 
 def _memory(model: Quadrotor, log: FlightLog, rows: np.ndarray) -> tuple:

@@ -14,14 +14,25 @@ from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import tidy
 from cfb_mjx.model import State
 from cfb_mjx.model.effects import SENSOR_FAULTS
+from cfb_mjx.sysid.velocity_stretch import VelocityStretch
+from cfb_mjx.sysid.windows import Windows
 
 ATTRIBUTES = {
     "sensor_delay": {"delay": "delay"},
-    "sensor_velocity_scale": {"scale": "velocity_scale", "vertical": "vertical_scale"},
+    "sensor_velocity_scale": {
+        "scale": "velocity_scale",
+        "vertical": "vertical_scale",
+        "rise": "velocity_rise",
+        "fade": "velocity_fade",
+    },
     "sensor_gyro_lowpass": {"lag": "gyro_lag"},
     "sensor_time_shift": {"shift": "motor_shift"},
 }
 """Attributes of `SensorFaults` that hold the parameters of a fault of `SENSOR_FAULTS`."""
+TIMES = ("rise", "fade")
+"""Of these, what says nothing without another."""
+STRETCH_STEP = 0.05
+"""Of a window, in which a stretched velocity is followed, s: far below the times such a stretch takes."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +43,8 @@ class SensorFaults:
         delay: age of pose and velocity beyond the declared observation delay, s.
         velocity_scale: logged velocity over true velocity, horizontally; and vertically too unless told otherwise.
         vertical_scale: the same vertically, where an estimator (optical flow, say) stretches only one of the two.
+        velocity_rise: time after which the scale shows in the velocity column, s (`VelocityStretch`); None: at once.
+        velocity_fade: time after which it fades again, s; None: never.
         gyro_lag: lag of the gyro column, s.
         motor_shift: how late command and rotor-speed columns are against all others, s (negative: early).
     """
@@ -39,6 +52,8 @@ class SensorFaults:
     delay: float = 0.0
     velocity_scale: float = 1.0
     vertical_scale: float | None = None
+    velocity_rise: float | None = None
+    velocity_fade: float | None = None
     gyro_lag: float = 0.0
     motor_shift: float = 0.0
 
@@ -48,19 +63,21 @@ class SensorFaults:
         return self == SensorFaults()
 
     @property
-    def stretch(self) -> np.ndarray:
-        """Logged over true velocity along the world's axes, (3,)."""
+    def stretch(self) -> VelocityStretch:
+        """What is done to the velocity along the world's axes."""
         vertical = self.velocity_scale if self.vertical_scale is None else self.vertical_scale
-        return np.array([self.velocity_scale, self.velocity_scale, vertical])
+        scale = np.array([self.velocity_scale, self.velocity_scale, vertical])
+        return VelocityStretch(scale, self.velocity_rise or 0.0, self.velocity_fade)
 
     def unstretched(self, log: FlightLog) -> FlightLog:
-        """The log with nothing but the scale of its velocity taken out, which needs no row but itself."""
-        return log if (self.stretch == 1.0).all() else log.replace(velocity=log.velocity / self.stretch)
+        """The log with nothing but the stretch of its velocity taken out, which needs no later row."""
+        return log if self.stretch.none else log.replace(velocity=self.stretch.undone(log.time, log.velocity))
 
     def repaired(self, log: FlightLog) -> FlightLog:
         """The log a healthy chain would have recorded; rows whose replacements lie in a gap or beyond the end go."""
         if self.healthy:
             return log
+        log = self.unstretched(log)
         time = log.time
         gaps = log.gaps()
         changes = {}
@@ -71,8 +88,7 @@ class SensorFaults:
         if self.delay:
             changes["position"] = later(log.position, self.delay)
             changes["quaternion"] = tidy(later(tidy(log.quaternion), self.delay))
-        if self.delay or (self.stretch != 1.0).any():
-            changes["velocity"] = later(log.velocity, self.delay) / self.stretch
+            changes["velocity"] = later(log.velocity, self.delay)
         if self.gyro_lag:
             changes["body_rate"] = later(log.body_rate, self.gyro_lag)
         if self.motor_shift:
@@ -89,18 +105,37 @@ class SensorFaults:
 
     def reached(self, horizons: tuple[float, ...]) -> tuple[float, ...]:
         """Ascending times after a window's start at which a prediction is needed to say what is recorded later."""
-        return tuple(sorted({self._instant(h, lag) for h in horizons for lag in (0.0, self.delay, self.gyro_lag)}))
+        between = () if self.stretch.constant else np.arange(STRETCH_STEP, max(horizons), STRETCH_STEP)
+        lags = (0.0, self.delay, self.gyro_lag)
+        return tuple(sorted({self._instant(h, lag) for h in (*horizons, *between) for lag in lags}))
 
-    def as_recorded(self, predicted: State, horizons: tuple[float, ...]) -> State:
-        """What this chain records at the horizons, from predictions (W, H) at `reached` times."""
+    def began(self, log: FlightLog, windows: Windows, delay: float) -> tuple[np.ndarray, np.ndarray]:
+        """What `as_recorded` must know of the windows' starts: true velocities (W, 3) and what their estimator carries.
+
+        Args:
+            log: as recorded.
+            windows: of the repaired log.
+            delay: declared age of pose and velocity, s.
+        """
+        memory = np.zeros((len(windows), 2, 3))
+        if len(windows) and not self.stretch.constant:
+            carried = self.stretch.memory(log.time, log.velocity).reshape(len(log), 6)
+            memory = interpolate(log.time, carried, windows.start + delay + self.delay).reshape(memory.shape)
+        return windows.velocity, memory
+
+    def as_recorded(self, predicted: State, horizons: tuple[float, ...], began: tuple[np.ndarray, np.ndarray]) -> State:
+        """What this chain records at the horizons, from predictions (W, H) at `reached` times and how they `began`."""
         if self.healthy:
             return predicted
         times = self.reached(horizons)
         pose = [times.index(self._instant(h, self.delay)) for h in horizons]
         gyro = [times.index(self._instant(h, self.gyro_lag)) for h in horizons]
+        velocity, memory = began
+        flown = np.concatenate([velocity[:, None], predicted.velocity], axis=1)
+        logged = self.stretch.done(memory, np.diff(times, prepend=0.0), flown)[:, 1:]
         return State(
             predicted.position[:, pose],
-            predicted.velocity[:, pose] * self.stretch,
+            logged[:, pose],
             predicted.quaternion[:, pose],
             predicted.body_rate[:, gyro],
             predicted.rotor_speed[:, gyro],
@@ -116,7 +151,7 @@ class SensorFaults:
         for name, fault in SENSOR_FAULTS.items():
             values = {key: getattr(self, attribute) for key, attribute in ATTRIBUTES[name].items()}
             values = {key: value for key, value in values.items() if value is not None}
-            if any(value != fault.healthy for value in values.values()):
+            if any(value != fault.healthy for key, value in values.items() if key not in TIMES):
                 found.append({"name": name, "parameters": values})
         return found
 

@@ -13,6 +13,7 @@ from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.trace import deviations
+from cfb_mjx.sysid.velocity_band import with_band
 
 ROUNDS = 3
 """Fits, each with the noise levels learned from the one before."""
@@ -56,7 +57,7 @@ def fit_given(
             raise CfbError(f"{name}: no such effect; the catalogue has {', '.join(sorted(CATALOGUE))}.")
     progress("comparing the sensors with each other")
     sensors = check_sensors(list(logs), delay)
-    sensors = replace(sensors, faults=HEALTHY) if as_logged else sensors
+    sensors = replace(sensors, faults=HEALTHY if as_logged else with_band(sensors.faults, logs))
     search = Search.start(list(logs), parameters, delay, sensors, declared, names)
     progress("replaying the declared model")
     hypothesis = search.settled(replace(search.learned(search.nothing()), present=tuple(names)))

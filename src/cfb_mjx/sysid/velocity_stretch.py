@@ -1,0 +1,97 @@
+"""A velocity column that is too large: what its estimator did to a velocity, undone and done again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class VelocityStretch:
+    """Logged velocity over true velocity, of motion of any frequency or of a band of it.
+
+    An estimator whose velocity follows a stretched flow only slowly, and is in the end pulled back by what its position
+    is corrected with, stretches neither quick nor slow motion: of the logged velocity v the share 1 - 1 / scale,
+    lagged by ``rise`` and less the same lagged by ``fade`` once more, was never flown.
+
+    Attributes:
+        scale: (3,) along the world's axes, where it is largest.
+        rise: s; 0: at once.
+        fade: s; None: never.
+    """
+
+    scale: np.ndarray
+    rise: float = 0.0
+    fade: float | None = None
+
+    @property
+    def none(self) -> bool:
+        """Whether velocity is logged as it was."""
+        return bool((self.scale == 1.0).all())
+
+    @property
+    def constant(self) -> bool:
+        """Whether all motion is stretched alike, so that no row needs another."""
+        return self.none or (self.rise == 0.0 and self.fade is None)
+
+    def memory(self, time: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """What the estimator carries at every row, (N, 2, 3), from times (N,) and logged velocities (N, 3); its
+        history before the first row was like that row."""
+        step = np.diff(time, prepend=time[0])
+        slow = lagged(step, velocity, self.rise)
+        return np.stack([slow, np.zeros_like(slow) if self.fade is None else lagged(step, slow, self.fade)], axis=1)
+
+    def undone(self, time: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """True velocities, (N, 3), of logged ones; every row rests on itself and earlier ones."""
+        if self.constant:
+            return velocity / self.scale
+        slow, slower = np.moveaxis(self.memory(time, velocity), 1, 0)
+        return velocity - self._share * (slow - slower)
+
+    def done(self, memory: np.ndarray, step: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """What is logged, (W, H + 1, 3), of true velocities of the same shape that follow each other by steps (H,), s.
+
+        Args:
+            memory: (W, 2, 3) at the first of them.
+        """
+        if self.constant:
+            return velocity * self.scale
+        slow, slower = memory[:, 0], memory[:, 1]
+        logged = [velocity[:, 0] + self._share * (slow - slower)]
+        for i, h in enumerate(step):
+            # Logged velocity depends on both lags at the end of the step, and they on it: three linear equations.
+            keep, last, now = lag_weights(h, self.rise)
+            known = keep * slow + last * logged[-1]
+            keep, last, share = (1.0, 0.0, 0.0) if self.fade is None else lag_weights(h, self.fade)
+            carried = keep * slower + last * slow
+            true = velocity[:, i + 1]
+            slow = (known + now * (true - self._share * carried)) / (1.0 - now * self._share * (1.0 - share))
+            slower = carried + share * slow
+            logged.append(true + self._share * (slow - slower))
+        return np.stack(logged, axis=1)
+
+    @property
+    def _share(self) -> np.ndarray:
+        return 1.0 - 1.0 / self.scale
+
+
+def lagged(step: np.ndarray, values: np.ndarray, time: float) -> np.ndarray:
+    """Values (N, ...) after a first-order lag; linear between rows, steps (N,) before each of them, s."""
+    if time == 0.0:
+        return values
+    found = np.empty_like(values)
+    found[0] = values[0]
+    for i in range(1, len(values)):
+        keep, last, now = lag_weights(step[i], time)
+        found[i] = keep * found[i - 1] + last * values[i - 1] + now * values[i]
+    return found
+
+
+def lag_weights(step: float, time: float) -> tuple[float, float, float]:
+    """What a lagged value takes over a step of itself, of its input before and of its input after (linear between)."""
+    if time == 0.0:
+        return 0.0, 0.0, 1.0
+    keep = np.exp(-step / time)
+    mean = time * -np.expm1(-step / time) / step if step > 0 else 1.0
+    return keep, mean - keep, 1.0 - mean
