@@ -36,8 +36,7 @@ def run(wanted: list[Case], results: Path, from_end: bool) -> None:
     base = load_model_file("cfb-guards")
     while True:
         # Read anew: another process may be at the other end.
-        done = {json.loads(line)["name"] for line in results.read_text().splitlines()} if results.exists() else set()
-        rest = [case for case in wanted if case.name not in done]
+        rest = [case for case in wanted if case.name not in traced(results)]
         batch = rest[-BATCH:] if from_end else rest[:BATCH]
         if not batch:
             return
@@ -48,6 +47,8 @@ def run(wanted: list[Case], results: Path, from_end: bool) -> None:
         # Programs of every shape met would pile up until the process may map no more memory; they are kept on disk.
         jax.clear_caches()
         for campaign in flown[: len(batch)]:
+            if campaign.case.name in traced(results):
+                continue
             began = time.perf_counter()
             outcome = close_loop(campaign.fit, campaign.held_out, base)
             seconds = time.perf_counter() - began
@@ -70,6 +71,11 @@ def run(wanted: list[Case], results: Path, from_end: bool) -> None:
                 file.write(json.dumps(line, default=float) + "\n")
             names = [item.name for item in outcome.reported]
             print(f"{campaign.case.name}: {names} unexplained={bool(outcome.unexplained)} {seconds:.0f} s", flush=True)
+
+
+def traced(results: Path) -> set[str]:
+    """Names of the campaigns that are done."""
+    return {json.loads(line)["name"] for line in results.read_text().splitlines()} if results.exists() else set()
 
 
 def _pick(metrics: dict) -> dict:
