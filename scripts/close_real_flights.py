@@ -80,7 +80,15 @@ def steps(folder: Path, work: Path) -> dict[str, list[str]]:
         "motors": ["refine", *fit, "--model", made["rotors"], "--estimator", "innovations", "--effects", together],
         "repaired": [*refine, "--model", made["motors"], *body],
         "plant": [*refine, "--model", made["motors"], *body, "--as-logged", *kept_numbers["plant"]],
-        "predictor": [*refine, "--model", made["repaired"], *body, "--predictor", *kept_numbers["predictor"]],
+        "predictor": [
+            *refine,
+            "--model",
+            made["plant"],
+            *body,
+            "--as-logged",
+            "--predictor",
+            *kept_numbers["predictor"],
+        ],
     }
     return {name: [*command, "-o", made[name]] for name, command in options.items()}
 

@@ -214,8 +214,8 @@ def _columns(seen: dict, tilted_by: dict) -> list[str]:
     return [
         f"The sensors, compared with each other, say that the logged velocity is {across:.3f} times too large",
         f"horizontally and {up:.3f} times vertically (`sensor_velocity_scale`). The drone carried a flow deck, which",
-        "measures horizontal velocity by optical flow and height by a ranger. It is not so at all frequencies: "
-        f"{1 - 1 / largest:.2f} of the velocity,",
+        "measures horizontal velocity by optical flow and height by a ranger. It is not so at all",
+        f"frequencies: {1 - 1 / largest:.2f} of the velocity,",
         f"{rise:.2f} s late, less the same another {fade:.2f} s late (`rise`, `fade`; `cfb_mjx.sysid.velocity_band`),",
         "accounts for more of what the horizontal velocity has over the slope of the position, below 4 Hz:",
         "",
@@ -244,8 +244,9 @@ def _columns(seen: dict, tilted_by: dict) -> list[str]:
         "In gentle flights the logged tilt is too large because its estimator knows no drag. In square flights it is",
         "corrected by more than either explains. Taking the stretch out of the velocity alone leaves the tilt that",
         "moves the drone too large: positions are predicted better, attitude and velocity of square flights worse.",
-        "The plant therefore takes columns as they were logged (`--as-logged`): they agree with each other, and its",
-        "drag and thrust are those of this velocity; the predictor takes the stretch out.",
+        "Plant and predictor therefore take attitude and velocity as they were logged (`--as-logged`): they agree with",
+        "each other, and drag and thrust are those of this velocity. Only the position they predict is put right: it",
+        "moves less than that velocity says (`with_attitude`).",
         "Mean errors on the flights fitted to after 0.5 s, attitude, rad, / velocity as logged, m/s:",
         "",
         "| prediction | flights | stretch taken out | as logged |",

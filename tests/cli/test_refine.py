@@ -64,18 +64,27 @@ def test_bad_requests_are_refused(cfb, tmp_path, arguments, needles):
     assert not (tmp_path / "m.yaml").exists()
 
 
-def test_sensor_faults_of_the_model_stay_out_of_a_fit_as_logged(monkeypatch, tmp_path):
+def test_sensor_faults_of_the_model_stay_out_of_a_fit_as_logged_but_a_stretch_of_the_attitude_too(
+    monkeypatch, tmp_path
+):
     seen = {}
 
     def fit(base, logs, names, as_logged, progress):
-        seen.update(effects=[e["name"] for e in base.effects], as_logged=as_logged)
+        seen.update(effects={e["name"]: e["parameters"] for e in base.effects}, as_logged=as_logged)
         return base, {"numbers": {}}
 
     monkeypatch.setattr(refining, "by_innovations", fit)
-    known = ({"name": "sensor_velocity_scale", "parameters": {"scale": 1.1}}, {"name": "rotor_drag", "parameters": {}})
+    stretch = {"scale": 1.1}
+    known = (
+        {"name": "sensor_velocity_scale", "parameters": stretch},
+        {"name": "sensor_delay", "parameters": {"delay": 0.01}},
+        {"name": "rotor_drag", "parameters": {}},
+    )
     faulty = replace(load_model_file("cfb-guards"), effects=known)
     save_model_file(faulty, tmp_path / "faulty.yaml")
-    for as_logged, kept in ((False, ["sensor_velocity_scale", "rotor_drag"]), (True, ["rotor_drag"])):
+    everything = {item["name"]: item["parameters"] for item in known}
+    leaning = {"rotor_drag": {}, "sensor_velocity_scale": stretch | {"with_attitude": 1.0}}
+    for as_logged, kept in ((False, everything), (True, leaning)):
         rest = (str(tmp_path / "faulty.yaml"), [], "rotor_drag", "innovations", False, [], as_logged, None)
         refining.run_refine([LOG], [], tmp_path / "m.yaml", *rest)
         assert seen == {"effects": kept, "as_logged": as_logged}

@@ -171,6 +171,27 @@ def test_a_stretched_velocity_column_is_known_at_the_start_and_put_back(log, obs
     assert np.abs(ignored[0] - true[0]).max() > 1e-4
 
 
+@pytest.mark.parametrize("observer", [None, Observer()], ids=["model", "observer"])
+def test_of_a_column_stretched_with_the_attitude_only_the_position_is_put_right(log, observer):
+    model = Quadrotor(GUARDS.parameters, (BladeFlapping(-5e-4, 0.0),))
+    faults = SensorFaults(
+        velocity_scale=1.16, vertical_scale=1.0, velocity_rise=0.3, velocity_fade=0.7, with_attitude=1
+    )
+    memory = faults.stretch.memory(log.time, log.velocity)
+    led = log.replace(position=faults.stretch.left(log.position, memory))
+    a, b = nanodrone.find_starts(log), nanodrone.find_starts(led)
+    true = nanodrone.predict(nanodrone.Contestant(model, observer), log, a)
+    found = nanodrone.predict(nanodrone.Contestant(model, observer, faults), led, b)
+    for x, y in zip(found[1:], true[1:], strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-9, atol=1e-9)
+    # Carried along the flown velocities, the lags take off the position what they do along the predicted ones.
+    carried = faults.stretch.carried(
+        memory[a.row], np.full(50, 0.01), np.concatenate([log.velocity[a.row, None], true[1]], 1)
+    )
+    np.testing.assert_allclose(found[0], faults.stretch.left(true[0], carried[:, 1:]), atol=1e-9)
+    assert np.abs(found[0] - true[0]).max() > 1e-4
+
+
 def test_an_exact_model_with_an_observer_beats_hold():
     # Rows of 10 ms and the speed of the row before are what is left to err.
     long = fly(Plant(), 3.0, 6, noise=0.0)[0]

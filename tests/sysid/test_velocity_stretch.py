@@ -27,6 +27,12 @@ def logged_by_estimator(time, true):
     )
 
 
+def perfectly(windows):
+    """What a perfect model predicts."""
+    truth = (getattr(windows, f"true_{name}") for name in ("position", "velocity", "quaternion", "body_rate"))
+    return State(*truth, jnp.zeros((*windows.true_position.shape[:2], 4)))
+
+
 @pytest.fixture(scope="module")
 def flights():
     return fly_campaigns([Case("clean", 9100, ())])[0].fit
@@ -76,6 +82,41 @@ def test_done_again_is_what_was_undone(rise, fade):
     assert stretch.constant == (rise == 0.0 and fade is None)
 
 
+@pytest.mark.parametrize("fade", [FADE, None])
+@pytest.mark.parametrize("rise", [RISE, 0.0])
+def test_a_position_in_step_moves_as_the_logged_velocity_says(rise, fade):
+    """Against the integral of the velocity, by the trapezium rule."""
+    time = np.arange(0.0, 20.0, 0.002)
+    true = np.stack([np.sin(1.3 * time), np.cos(0.4 * time) - 1.0, 0.3 * np.sin(5.0 * time)], axis=1)
+    stretch = VelocityStretch(np.array([1.2, 0.9, 1.0]), rise, fade)
+    begin = np.zeros((1, 2, 3))
+    logged = stretch.done(begin, np.diff(time), true[None])[0]
+    carried = stretch.carried(begin, np.diff(time), logged[None])[0]
+    position, there = (
+        np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (v[1:] + v[:-1]) * 0.002, axis=0)]) for v in (true, logged)
+    )
+    followed = stretch.followed(position, carried)
+    np.testing.assert_allclose(followed - followed[0], there, atol=2e-4)
+    np.testing.assert_allclose(stretch.left(followed, carried), position, atol=1e-12)
+
+
+def test_faults_taken_as_logged_move_the_position_alone(stretched):
+    faults = SensorFaults(**{**vars(BAND), "delay": 0.02, "gyro_lag": 0.01}).as_logged
+    assert SensorFaults(delay=0.02).as_logged == SensorFaults()
+    horizons = (0.05, 0.5)
+    for bad in stretched[:3]:
+        log = faults.repaired(bad)
+        for name in ("time", "velocity", "quaternion", "body_rate", "command"):
+            np.testing.assert_array_equal(getattr(log, name), getattr(bad, name))
+        recorded = find_windows(bad, horizons, 0.008)
+        windows = find_windows(log, faults.reached(horizons), 0.008, recorded.start)
+        told = faults.as_recorded(perfectly(windows), horizons, faults.began(bad, windows, 0.008))
+        np.testing.assert_allclose(told.velocity, recorded.true_velocity, atol=1e-12)
+        off = log.position - bad.position
+        assert np.abs(off).max() > 2e-3
+        assert np.abs(told.position - recorded.true_position).max() < 0.1 * np.abs(off).max()
+
+
 @pytest.mark.parametrize("delay", [0.0, 0.02])
 def test_what_is_recorded_of_a_perfect_prediction_is_the_record(stretched, delay):
     horizons = (0.05, 0.1, 0.2, 0.5)
@@ -84,14 +125,7 @@ def test_what_is_recorded_of_a_perfect_prediction_is_the_record(stretched, delay
         recorded = find_windows(bad, horizons, 0.008)
         repaired = faults.repaired(bad)
         windows = find_windows(repaired, faults.reached(horizons), 0.008, recorded.start)
-        perfect = State(
-            windows.true_position,
-            windows.true_velocity,
-            windows.true_quaternion,
-            windows.true_body_rate,
-            jnp.zeros((*windows.true_position.shape[:2], 4)),
-        )
-        told = faults.as_recorded(perfect, horizons, faults.began(bad, windows, 0.008))
+        told = faults.as_recorded(perfectly(windows), horizons, faults.began(bad, windows, 0.008))
         wrong = np.abs(recorded.true_velocity - told.velocity)
         # Linear between the times a window is followed at, which noise is not; the stretch itself is far larger.
         assert np.sqrt(np.mean(wrong**2)) < 0.004
@@ -114,7 +148,8 @@ def test_a_band_is_told_from_a_stretch_of_all_motion(flights, stretched):
 def test_a_model_file_names_a_band():
     assert SensorFaults.from_mappings(BAND.to_mappings(), "drone.yaml") == BAND
     assert SensorFaults(velocity_rise=RISE, velocity_fade=FADE).to_mappings() == []
-    for key, value in (("rise", -0.1), ("fade", 0.0), ("rise", "slow")):
+    assert SensorFaults.from_mappings(BAND.as_logged.to_mappings(), "drone.yaml") == BAND.as_logged
+    for key, value in (("rise", -0.1), ("fade", 0.0), ("rise", "slow"), ("with_attitude", 0.5)):
         item = {"name": "sensor_velocity_scale", "parameters": {"scale": 1.1, key: value}}
         with pytest.raises(CfbError, match=f"drone.yaml: effects.sensor_velocity_scale.parameters.{key}"):
             SensorFaults.from_mappings([item], "drone.yaml")

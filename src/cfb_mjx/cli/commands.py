@@ -317,7 +317,8 @@ def refine(
         estimator: what is fitted.
         predictor: leave inertia and inflow free; the result predicts better, is a wrong plant, and is marked so.
         weight: what flights whose names begin with NAME count against the others (predictions only).
-        as_logged: take no sensor fault out, even where sensors disagree or the model lists one.
+        as_logged: take no sensor fault out, even where sensors disagree or the model lists one. A stretched velocity is
+            then said to be an attitude's too, and only the position predicted is put right.
         json: write the results here.
     """
     if not logs:

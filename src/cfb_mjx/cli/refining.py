@@ -50,10 +50,13 @@ def run_refine(
     configure_jax(x64=True)
     from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS
     from cfb_mjx.parameters import save_model_file
+    from cfb_mjx.sysid.sensor_faults import SensorFaults
 
     base = changed_model(model, changes)
     if as_logged:
-        base = replace(base, effects=tuple(e for e in base.effects if e["name"] not in SENSOR_FAULTS))
+        known = SensorFaults.from_mappings(base.effects, f"model {base.name}").as_logged.to_mappings()
+        physics = (e for e in base.effects if e["name"] not in SENSOR_FAULTS)
+        base = replace(base, effects=(*physics, *known))
     names = effects.split(",") if effects else [e["name"] for e in base.effects if e["name"] in CATALOGUE]
     if not names:
         raise CfbError(f"model {base.name} has no effects; name some to fit, for instance --effects rotor_drag.")

@@ -169,11 +169,12 @@ def predict(contestant: Contestant, log: FlightLog, starts: Starts):
     sensors are left alone, for rows later than a window's start would be needed. An observer adds the disturbance and
     the filtered body rate it knows at that row.
     """
-    model, observer, stretch = contestant.model, contestant.observer, contestant.faults.stretch
-    carried = stretch.memory(log.time, log.velocity)[starts.row]
-    log = contestant.faults.unstretched(log)
-    position, _, quaternion, rate = (x[starts.row] for x in starts.truth)
-    began = velocity = log.velocity[starts.row]
+    model, observer, faults = contestant.model, contestant.observer, contestant.faults
+    carried = faults.stretch.memory(log.time, log.velocity)[starts.row]
+    log = faults.unstretched(log)
+    _, _, quaternion, rate = (x[starts.row] for x in starts.truth)
+    position, velocity = log.position[starts.row], log.velocity[starts.row]
+    began = velocity, carried
     memory = _memory(model, log, starts.row)
     if observer is not None:
         # Pose is read without its delay: to allow for it, rows later than a window's start would be needed.
@@ -189,8 +190,8 @@ def predict(contestant: Contestant, log: FlightLog, starts: Starts):
         flown = _fly(model, jax.tree.map(lambda x, i=index: x[i], state), inputs[index])
         parts.append(jax.tree.map(lambda x, n=len(starts) - first: np.asarray(x)[:n], flown))
     position, velocity, quaternion, rate = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    velocity = np.concatenate([began[:, None], velocity], axis=1)
-    return position, stretch.done(carried, np.full(STEPS, INTERVAL), velocity)[:, 1:], quaternion, rate
+    position, velocity = faults.stretched(began, np.full(STEPS, INTERVAL), position, velocity)
+    return position, velocity, quaternion, rate
 
 
 def _memory(model: Quadrotor, log: FlightLog, rows: np.ndarray) -> tuple:

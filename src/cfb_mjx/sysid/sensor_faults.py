@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,12 +24,13 @@ ATTRIBUTES = {
         "vertical": "vertical_scale",
         "rise": "velocity_rise",
         "fade": "velocity_fade",
+        "with_attitude": "with_attitude",
     },
     "sensor_gyro_lowpass": {"lag": "gyro_lag"},
     "sensor_time_shift": {"shift": "motor_shift"},
 }
 """Attributes of `SensorFaults` that hold the parameters of a fault of `SENSOR_FAULTS`."""
-TIMES = ("rise", "fade")
+FORMS = ("rise", "fade", "with_attitude")
 """Of these, what says nothing without another."""
 STRETCH_STEP = 0.05
 """Of a window, in which a stretched velocity is followed, s: far below the times such a stretch takes."""
@@ -45,6 +46,9 @@ class SensorFaults:
         vertical_scale: the same vertically, where an estimator (optical flow, say) stretches only one of the two.
         velocity_rise: time after which the scale shows in the velocity column, s (`VelocityStretch`); None: at once.
         velocity_fade: time after which it fades again, s; None: never.
+        with_attitude: 1 where the attitude leans along with the velocity, as that of an estimator does which corrects
+            both by the same flow: the drone's motion is then taken as logged, and only the position moves less than the
+            velocity says. None: the attitude is right, and the velocity alone is not.
         gyro_lag: lag of the gyro column, s.
         motor_shift: how late command and rotor-speed columns are against all others, s (negative: early).
     """
@@ -54,6 +58,7 @@ class SensorFaults:
     vertical_scale: float | None = None
     velocity_rise: float | None = None
     velocity_fade: float | None = None
+    with_attitude: float | None = None
     gyro_lag: float = 0.0
     motor_shift: float = 0.0
 
@@ -69,9 +74,34 @@ class SensorFaults:
         scale = np.array([self.velocity_scale, self.velocity_scale, vertical])
         return VelocityStretch(scale, self.velocity_rise or 0.0, self.velocity_fade)
 
+    @property
+    def as_logged(self) -> SensorFaults:
+        """What is left where columns are taken as they were logged: a stretch of the velocity, the attitude with it."""
+        if self.stretch.none:
+            return SensorFaults()
+        return replace(self, delay=0.0, gyro_lag=0.0, motor_shift=0.0, with_attitude=1.0)
+
     def unstretched(self, log: FlightLog) -> FlightLog:
-        """The log with nothing but the stretch of its velocity taken out, which needs no later row."""
-        return log if self.stretch.none else log.replace(velocity=self.stretch.undone(log.time, log.velocity))
+        """The log with velocity and position in step, which needs no later row: the stretch taken out of the velocity,
+        or, where the attitude leans along, put into the position."""
+        stretch = self.stretch
+        if stretch.none:
+            return log
+        if self.with_attitude is None:
+            return log.replace(velocity=stretch.undone(log.time, log.velocity))
+        return log.replace(position=stretch.followed(log.position, stretch.memory(log.time, log.velocity)))
+
+    def stretched(
+        self, began: tuple[np.ndarray, np.ndarray], step: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The inverse of `unstretched`, of positions and velocities (W, H, 3) after steps (H,), s, from how they
+        `began`."""
+        first, memory = began
+        velocity = np.concatenate([first[:, None], velocity], axis=1)
+        if self.with_attitude is None:
+            return position, self.stretch.done(memory, step, velocity)[:, 1:]
+        carried = self.stretch.carried(memory, step, velocity)[:, 1:]
+        return self.stretch.left(position, carried), velocity[:, 1:]
 
     def repaired(self, log: FlightLog) -> FlightLog:
         """The log a healthy chain would have recorded; rows whose replacements lie in a gap or beyond the end go."""
@@ -110,7 +140,7 @@ class SensorFaults:
         return tuple(sorted({self._instant(h, lag) for h in (*horizons, *between) for lag in lags}))
 
     def began(self, log: FlightLog, windows: Windows, delay: float) -> tuple[np.ndarray, np.ndarray]:
-        """What `as_recorded` must know of the windows' starts: true velocities (W, 3) and what their estimator carries.
+        """What `as_recorded` must know of the windows' starts: velocities (W, 3) and what their estimator carries.
 
         Args:
             log: as recorded.
@@ -130,12 +160,11 @@ class SensorFaults:
         times = self.reached(horizons)
         pose = [times.index(self._instant(h, self.delay)) for h in horizons]
         gyro = [times.index(self._instant(h, self.gyro_lag)) for h in horizons]
-        velocity, memory = began
-        flown = np.concatenate([velocity[:, None], predicted.velocity], axis=1)
-        logged = self.stretch.done(memory, np.diff(times, prepend=0.0), flown)[:, 1:]
+        step = np.diff(times, prepend=0.0)
+        position, velocity = self.stretched(began, step, predicted.position, predicted.velocity)
         return State(
-            predicted.position[:, pose],
-            logged[:, pose],
+            position[:, pose],
+            velocity[:, pose],
             predicted.quaternion[:, pose],
             predicted.body_rate[:, gyro],
             predicted.rotor_speed[:, gyro],
@@ -151,7 +180,7 @@ class SensorFaults:
         for name, fault in SENSOR_FAULTS.items():
             values = {key: getattr(self, attribute) for key, attribute in ATTRIBUTES[name].items()}
             values = {key: value for key, value in values.items() if value is not None}
-            if any(value != fault.healthy for key, value in values.items() if key not in TIMES):
+            if any(value != fault.healthy for key, value in values.items() if key not in FORMS):
                 found.append({"name": name, "parameters": values})
         return found
 
@@ -173,7 +202,8 @@ class SensorFaults:
             for key in dict.fromkeys([SENSOR_FAULTS[name].parameter, *values]):
                 value = values.get(key)
                 number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-                if key not in known or not number or (name == "sensor_velocity_scale" and value <= 0):
+                wrong = name == "sensor_velocity_scale" and number and (value <= 0 or (key == FORMS[-1] and value != 1))
+                if key not in known or not number or wrong:
                     raise CfbError(
                         f"{where}: effects.{name}.parameters.{key} = {value!r} must be a number that makes sense"
                         f" ({name} has {' and '.join(known)})."

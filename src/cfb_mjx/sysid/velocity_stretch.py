@@ -71,6 +71,36 @@ class VelocityStretch:
             logged.append(true + self._share * (slow - slower))
         return np.stack(logged, axis=1)
 
+    def carried(self, memory: np.ndarray, step: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+        """`memory` along logged velocities (W, H + 1, 3) that follow each other by steps (H,), s: (W, H + 1, 2, 3).
+
+        Args:
+            memory: (W, 2, 3) at the first of them.
+        """
+        found = [memory]
+        for i, h in enumerate(step):
+            (slow, slower), (before, after) = np.moveaxis(found[-1], 1, 0), (velocity[:, i], velocity[:, i + 1])
+            keep, last, now = lag_weights(h, self.rise)
+            next_slow = keep * slow + last * before + now * after
+            if self.fade is not None:
+                keep, last, now = lag_weights(h, self.fade)
+                slower = keep * slower + last * slow + now * next_slow
+            found.append(np.stack([next_slow, slower], axis=1))
+        return np.stack(found, axis=1)
+
+    def followed(self, position: np.ndarray, memory: np.ndarray) -> np.ndarray:
+        """Positions (..., 3) that move as the logged velocity says; what the stretch adds to them is bounded by what
+        its lags hold (..., 2, 3), or grows with the position where it never fades."""
+        if self.fade is None:
+            return self.scale * (position - self._share * self.rise * memory[..., 0, :])
+        return position + self._share * self.fade * memory[..., 1, :]
+
+    def left(self, followed: np.ndarray, memory: np.ndarray) -> np.ndarray:
+        """The inverse of `followed`."""
+        if self.fade is None:
+            return followed / self.scale + self._share * self.rise * memory[..., 0, :]
+        return followed - self._share * self.fade * memory[..., 1, :]
+
     @property
     def _share(self) -> np.ndarray:
         return 1.0 - 1.0 / self.scale

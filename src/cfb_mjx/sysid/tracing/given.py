@@ -9,7 +9,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import CATALOGUE, Effect
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
+from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.trace import deviations
@@ -47,7 +47,8 @@ def fit_given(
         declared: effects the declared model has already; they start the fit.
         delay: declared age of pose and velocity in a row, s.
         progress: told what happens.
-        as_logged: take no sensor fault out of the flights, only biases.
+        as_logged: take no sensor fault out of the flights, only biases; a stretch of the velocity is
+            one of the attitude too (`SensorFaults.as_logged`).
 
     Raises:
         CfbError: an effect the catalogue does not have.
@@ -57,7 +58,8 @@ def fit_given(
             raise CfbError(f"{name}: no such effect; the catalogue has {', '.join(sorted(CATALOGUE))}.")
     progress("comparing the sensors with each other")
     sensors = check_sensors(list(logs), delay)
-    sensors = replace(sensors, faults=HEALTHY if as_logged else with_band(sensors.faults, logs))
+    faults = with_band(sensors.faults, logs)
+    sensors = replace(sensors, faults=faults.as_logged if as_logged else faults)
     search = Search.start(list(logs), parameters, delay, sensors, declared, names)
     progress("replaying the declared model")
     hypothesis = search.settled(replace(search.learned(search.nothing()), present=tuple(names)))
