@@ -150,15 +150,17 @@ def _story(results: dict) -> list[str]:
         for what, value, goal in (("attitude", seen[0], attitude), ("velocity", seen[1], velocity)):
             if goal is not None and value > goal:
                 missed.append(f"{TITLES[variant]}, {group}, {what}: {value:.4f} where {goal:.2f} was the goal")
-    gentle = plant["commands_in gentle 0.5"][0], declared["hold gentle 0.5"][0]
-    hold = "better" if gentle[0] < gentle[1] else "still worse"
-    text = [
-        f"On gentle flights the plant, commands in, is {hold} than hold in attitude ({gentle[0]:.3f} against "
-        f"{gentle[1]:.3f} rad).",
-    ]
+    hold = declared["hold gentle 0.5"][0]
+    told = {variant: plant[f"{variant} gentle 0.5"][0] for variant in ("commands_in", "rotor_speed_in_observer")}
+    compared = (f"{TITLES[v]}, {_beside(error / hold)} hold ({error:.3f} rad)" for v, error in told.items())
+    text = [f"Attitude on gentle flights, where hold errs by {hold:.3f} rad: the plant, {'; '.join(compared)}."]
     if missed:
         text += ["", "**Goals not reached**:", "", *(f"- {line}" for line in missed)]
     return text
+
+
+def _beside(ratio: float) -> str:
+    return "better than" if ratio < 0.95 else "worse than" if ratio > 1.05 else "about as good as"
 
 
 def _position(plant: ModelFile, told: dict[str, dict], slow: float) -> list[str]:
