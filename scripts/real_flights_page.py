@@ -68,8 +68,10 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "  does not bias.",
             "- *plant*: the same effects and a few more fitted to predictions; inertia within 25 %, damping within",
             "  2 per second.",
-            "- *predictor*: inertia left free. It predicts gentle flights best and is a wrong plant: `cfb refine`",
-            "  marks it so.",
+            "- *predictor*: inertia left free, and small torques answered by less than their size",
+            "  (`regression_dilution`, no physics). It predicts gentle flights better, square ones after half a second",
+            "  worse, and is a wrong plant: `cfb refine` marks it so.",
+            *_dilution(models["predictor"]),
             "",
             "Plant and predictor are shipped as the presets `cfb-idsia` and `cfb-idsia-predictor`:",
             "`cfb evaluate LOG --model cfb-idsia --observer`, `cfb benchmark-nanodrone FOLDER`.",
@@ -157,6 +159,16 @@ def _story(results: dict) -> list[str]:
     if missed:
         text += ["", "**Goals not reached**:", "", *(f"- {line}" for line in missed)]
     return text
+
+
+def _dilution(predictor: ModelFile) -> list[str]:
+    numbers = {e["name"]: e["parameters"] for e in predictor.effects}
+    diluted, inertia = numbers["regression_dilution"], numbers["inertia"]["relative"]
+    return [
+        f"  Of a torque far below {diluted['knee']:.2g} N m it answers {100 * (1 - diluted['dilution']):.0f} %. Beside "
+        "that, inertia left free",
+        f"  comes out {', '.join(f'{100 * x:+.0f}' for x in inertia[:2])} % from the declared one.",
+    ]
 
 
 def _beside(ratio: float) -> str:

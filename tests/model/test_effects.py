@@ -15,7 +15,8 @@ import pytest
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import CATALOGUE, Effect, ParasiticDrag, Quadrotor, State, begin, rollout, specific_force, step
-from cfb_mjx.model.effects import Reading, effect_from_mapping, effect_to_mapping
+from cfb_mjx.model.effects import Reading, RegressionDilution, ResidualFormula, effect_from_mapping, effect_to_mapping
+from cfb_mjx.model.effects.formula import TERMS
 from cfb_mjx.model.vector import Vec
 
 STEP = 1e-5
@@ -299,6 +300,31 @@ def test_unusable_mappings_are_refused_with_file_and_key(item, word):
     with pytest.raises(CfbError, match=r"drone\.yaml") as caught:
         effect_from_mapping(item, "drone.yaml")
     assert word in str(caught.value)
+
+
+@ONE_WORKER
+def test_a_predictor_answers_small_torques_by_less(guards):
+    """At rest alpha = torque / inertia: what a small and a large torque turn, with the effect and without."""
+    pushes = np.array([[2e-5, 1e-5, 3e-5], [4e-3, -3e-3, 2e-3]])
+    knee, dilution = 5e-4, 0.9
+    turned = []
+    for effects in ((), (RegressionDilution(dilution, knee),)):
+        found = []
+        for push in pushes:
+            constant = np.zeros((6, len(TERMS)))
+            constant[:3, list(TERMS).index("1")] = push
+            model = Quadrotor(guards, (ResidualFormula(constant, 0.0), *effects), dt=1e-4)
+            found.append(rollout(model, model.hover_state(), model.hover_command()[None]).body_rate[-1])
+        turned.append(np.array(found))
+    size = pushes[:, 0] ** 2 + pushes[:, 1] ** 2
+    kept = 1 - dilution * knee**2 / (knee**2 + size)
+    assert kept[0] < 0.11
+    assert kept[1] > 0.98
+    np.testing.assert_allclose(turned[1][:, :2], kept[:, None] * turned[0][:, :2], rtol=1e-4)
+    np.testing.assert_allclose(turned[1][:, 2], turned[0][:, 2], rtol=1e-6)
+    neutral = RegressionDilution.neutral()
+    assert effect_from_mapping(effect_to_mapping(neutral), "drone.yaml") == neutral
+    assert "regression_dilution" not in CATALOGUE
 
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "effects.md").read_text()

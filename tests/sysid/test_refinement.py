@@ -129,6 +129,12 @@ def test_what_is_plausible():
     assert free["inertia.relative[0]"].high > 1
     with pytest.raises(CfbError, match="warp"):
         plausible_numbers(GUARDS(), ("warp",))
+    with pytest.raises(CfbError, match="predictors only"):
+        plausible_numbers(GUARDS(), ("rotor_drag", "regression_dilution"))
+    assert {n.name for n in free_numbers(("regression_dilution",))} == {
+        "regression_dilution.dilution",
+        "regression_dilution.knee",
+    }
 
 
 def test_nothing_to_fit_and_nothing_to_fit_to_are_refused(campaign):

@@ -27,6 +27,7 @@ from cfb_mjx.model.effects.parasitic_drag import ParasiticDrag
 from cfb_mjx.model.effects.payload import Payload
 from cfb_mjx.model.effects.payload_swing import PayloadSwing
 from cfb_mjx.model.effects.position_moment import PositionMoment
+from cfb_mjx.model.effects.regression_dilution import RegressionDilution
 from cfb_mjx.model.effects.rotor_drag import RotorDrag
 from cfb_mjx.model.effects.thrust_scale import ThrustScale
 from cfb_mjx.model.effects.thrust_tilt import ThrustTilt
@@ -60,6 +61,7 @@ __all__ = [
     "PayloadSwing",
     "PositionMoment",
     "Reading",
+    "RegressionDilution",
     "ResidualFormula",
     "RotorDrag",
     "ThrustScale",

@@ -29,6 +29,7 @@ from cfb_mjx.model.effects.parasitic_drag import ParasiticDrag
 from cfb_mjx.model.effects.payload import Payload
 from cfb_mjx.model.effects.payload_swing import PayloadSwing
 from cfb_mjx.model.effects.position_moment import PositionMoment
+from cfb_mjx.model.effects.regression_dilution import RegressionDilution
 from cfb_mjx.model.effects.rotor_drag import RotorDrag
 from cfb_mjx.model.effects.thrust_scale import ThrustScale
 from cfb_mjx.model.effects.thrust_tilt import ThrustTilt
@@ -65,8 +66,9 @@ CATALOGUE: dict[str, type[Effect]] = {
 }
 
 
-KNOWN: dict[str, type[Effect]] = CATALOGUE | {ResidualFormula.name: ResidualFormula}
-"""The physics a model file may name: the catalogue, and formulas, which a search turns to only when it fails."""
+KNOWN: dict[str, type[Effect]] = CATALOGUE | {kind.name: kind for kind in (ResidualFormula, RegressionDilution)}
+"""What a model file may name: the catalogue; formulas, which a search turns to only when it fails; and what predictors
+do instead of physics."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.model.effects import KNOWN, Effect
+from cfb_mjx.model.effects import KNOWN, Effect, RegressionDilution
 from cfb_mjx.parameters import Parameters
 
 INERTIA = 0.25
@@ -52,8 +52,10 @@ def plausible_numbers(parameters: Parameters, effects: Sequence[str]) -> tuple[N
     """Every number of some effects within its prior range; inertia and rate damping within `INERTIA`, `RATE_DAMPING`.
 
     Raises:
-        CfbError: an effect the catalogue does not have.
+        CfbError: an effect the catalogue does not have, or one that is no physics.
     """
+    if RegressionDilution.name in effects:
+        raise CfbError(f"{RegressionDilution.name} is no physics: it is for predictors only (--predictor).")
     # Four rotors half a spacing from the axis: a rolling drone is damped by coefficient * spacing^2 / inertia.
     spacing, inertia = float(parameters.rotor_spacing), float(jnp.min(parameters.inertia[:2]))
     damping = RATE_DAMPING * inertia / spacing**2
