@@ -230,12 +230,16 @@ def tuned(plant: ModelFile, fit: list[FlightLog]) -> dict:
 
 
 def sums(models: dict[str, ModelFile], judged: list[FlightLog], observer: Observer) -> dict:
-    """The IDSIA benchmark's sums on the validation flights."""
+    """The IDSIA benchmark's sums on the validation flights, together and one by one."""
     built = {}
     for suffix, beside in (("", None), (", observer", observer)):
         built |= {name + suffix: Contestant.of(described, beside) for name, described in models.items()}
-    rows = benchmark(judged, built, 1, lambda *_: None)["rows"]
-    return {name: [row[f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for name, row in rows.items()}
+    found = benchmark(judged, built, 1, lambda *_: None)
+
+    def summed(rows: dict) -> dict:
+        return {name: [row[f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for name, row in rows.items()}
+
+    return {"together": summed(found["rows"])} | {n: summed(flight["rows"]) for n, flight in found["flights"].items()}
 
 
 def published(name: str, described: ModelFile, what: str, fit: list[FlightLog]) -> ModelFile:

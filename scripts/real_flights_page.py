@@ -122,8 +122,15 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "",
             "| | position | velocity | attitude | body rate |",
             "|---|---|---|---|---|",
-            *_sums(results["sums"]),
+            *_sums(results["sums"]["together"]),
             *_sums(PUBLISHED | {"goal": SUMS_GOAL}, "on those: "),
+            "",
+            "Flight by flight, physics and the predictor with observer, beside the published *physics* and the goal:",
+            "",
+            "| | position | velocity | attitude | body rate |",
+            "|---|---|---|---|---|",
+            *_by_flight(results["sums"]),
+            *_sums(PUBLISHED | {"goal": SUMS_GOAL}, "on those: ", ("physics", "goal")),
             "",
             "## Commands",
             "",
@@ -332,13 +339,20 @@ def _repeats(results: dict) -> list[str]:
     return rows
 
 
-def _sums(rows: dict, prefix: str = "") -> list[str]:
+def _by_flight(sums: dict[str, dict]) -> list[str]:
+    chosen = ("physics", "predictor, observer")
+    flights = {name: rows for name, rows in sums.items() if name != "together"}
+    return [line for name, rows in flights.items() for line in _sums(rows, f"{name}: ", chosen)]
+
+
+def _sums(rows: dict, prefix: str = "", chosen: tuple[str, ...] | None = None) -> list[str]:
     shares = list(zip(rows["naive"], rows["physics"], strict=True))
     return [
         f"| {prefix}{name} | "
         + " | ".join(f"{x:.3g} ({x / n:.2f} / {x / p:.2f})" for x, (n, p) in zip(row, shares, strict=True))
         + " |"
         for name, row in rows.items()
+        if chosen is None or name in chosen
     ]
 
 
