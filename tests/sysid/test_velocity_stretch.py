@@ -13,6 +13,8 @@ from cfb_mjx.sysid.velocity_band import with_band
 from cfb_mjx.sysid.velocity_stretch import VelocityStretch
 from cfb_mjx.sysid.windows import find_windows
 
+pytestmark = pytest.mark.xdist_group("stretch")
+
 RISE, FADE, SHARE = 0.3, 0.7, 0.14
 BAND = SensorFaults(velocity_scale=1 / (1 - SHARE), vertical_scale=1.0, velocity_rise=RISE, velocity_fade=FADE)
 
