@@ -229,11 +229,11 @@ def tuned(plant: ModelFile, fit: list[FlightLog]) -> dict:
     return asdict(tune_observer(Quadrotor.from_file(plant), groups, faults=faults, progress=say))
 
 
-def sums(models: dict[str, ModelFile], judged: list[FlightLog], observer: Observer) -> dict:
+def sums(models: dict[str, ModelFile], judged: list[FlightLog], observers: dict[str, Observer]) -> dict:
     """The IDSIA benchmark's sums on the validation flights, together and one by one."""
-    built = {}
-    for suffix, beside in (("", None), (", observer", observer)):
-        built |= {name + suffix: Contestant.of(described, beside) for name, described in models.items()}
+    built = {name: Contestant.of(described) for name, described in models.items()}
+    for name, described in models.items():
+        built[f"{name}, observer"] = Contestant.of(described, observers.get(name, observers["plant"]))
     found = benchmark(judged, built, 1, lambda *_: None)
 
     def summed(rows: dict) -> dict:
@@ -309,16 +309,19 @@ def main() -> None:
     scale = results["columns"]["stretch"][0]
     results["tilt"] = kept(work / "tilt.json", lambda: tilts(logs, scale))
     results["place"] = kept(work / "place.json", lambda: by_place(logs["fit"]))
-    results["observer"] = kept(work / "observer.json", lambda: tuned(made["plant"], logs["fit"]))
-    observer = Observer(**results["observer"])
+    results["observer"] = {
+        name: kept(work / f"observer-{name}.json", partial(tuned, made[name], logs["fit"])) for name in PRESETS
+    }
+    observers = {name: Observer(**levels) for name, levels in results["observer"].items()}
     results["errors"] = kept(
-        work / "errors.json", lambda: {name: errors(model, judged, observer) for name, model in models.items()}
+        work / "errors.json",
+        lambda: {n: errors(model, judged, observers.get(n, observers["plant"])) for n, model in models.items()},
     )
     results["without"] = kept(work / "without.json", lambda: without_each(made["plant"], logs["fit"], judged))
     both = {name: models[name] for name in ("declared", "plant")}
     results["repeats"] = kept(work / "repeats.json", lambda: repeats(both, logs["fit"] + judged))
     chosen = {"plant": made["plant"], "plant, stretch taken out": made["repaired"], "predictor": made["predictor"]}
-    results["sums"] = kept(work / "sums.json", lambda: sums(chosen, judged, observer))
+    results["sums"] = kept(work / "sums.json", lambda: sums(chosen, judged, observers))
     for name, (preset, what) in PRESETS.items():
         path = ROOT / "configs" / "parameters" / f"{preset}.yaml"
         save_model_file(published(preset, made[name], what, logs["fit"]), path)

@@ -99,7 +99,7 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "",
             "A torque, a force and, where rotor speed was measured, motor errors, estimated from data before each",
             "window's start; how much they may wander was chosen by predictions of the flights fitted to, gentle and",
-            "square alike (`cfb_mjx.sysid.observer_tuning`):",
+            "square alike (`cfb_mjx.sysid.observer_tuning`), with the plant and with the predictor:",
             "",
             *_levels(results["observer"]),
             "",
@@ -319,11 +319,15 @@ def _number(name: str, value, std) -> str:
     )
 
 
-def _levels(observer: dict) -> list[str]:
+def _levels(observers: dict[str, dict]) -> list[str]:
     def text(value) -> str:
         return " / ".join(f"{x:.3g}" for x in value) if isinstance(value, list | tuple) else f"{value:.3g}"
 
-    return ["| level | value |", "|---|---|", *(f"| `{name}` | {text(value)} |" for name, value in observer.items())]
+    rows = [
+        f"| `{level}` | " + " | ".join(text(o[level]) for o in observers.values()) + " |"
+        for level in observers["plant"]
+    ]
+    return [f"| level | {' | '.join(observers)} |", "|---|" + "---|" * len(observers), *rows]
 
 
 def _repeats(results: dict) -> list[str]:

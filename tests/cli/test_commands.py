@@ -62,6 +62,16 @@ def test_a_changed_parameter_changes_the_prediction(cfb, files, tmp_path):
     assert b["velocity_rmse_mps@0.5s"] > 1.05 * a["velocity_rmse_mps@0.5s"]
 
 
+def test_a_predictor_has_an_observer_of_its_own(cfb, files, tmp_path):
+    told = {}
+    for model in ("cfb-idsia", "cfb-idsia-predictor"):
+        path = tmp_path / f"{model}.json"
+        done = cfb("evaluate", files / "flight.mcap", "--model", model, "--observer", "--json", path)
+        assert done.returncode == 0, done.stderr
+        told[model] = json.loads(path.read_text())["observer"]
+    assert told["cfb-idsia"]["rate_share"] < told["cfb-idsia-predictor"]["rate_share"]
+
+
 def test_evaluate_draws_a_figure(cfb, files, tmp_path):
     done = cfb("evaluate", files / "flight.mcap", "--figure", tmp_path / "f.png")
     assert done.returncode == 0, done.stderr

@@ -46,10 +46,10 @@ def run_evaluate(
     from cfb_mjx.devices import Devices
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid import evaluate
-    from cfb_mjx.sysid.observer import Observer
+    from cfb_mjx.sysid.observer import usual_observer
     from cfb_mjx.sysid.sensor_faults import SensorFaults
 
-    settings = Observer() if observer else None
+    settings = usual_observer(described.kind) if observer else None
     faults = SensorFaults.from_mappings(described.effects, model)
     evaluation = evaluate(
         Quadrotor.from_file(described),

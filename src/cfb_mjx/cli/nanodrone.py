@@ -36,14 +36,14 @@ def run_nanodrone(folder: Path, model: str, json: Path | None, stride: int) -> N
     from cfb_mjx.logs.idsia import VEHICLE_MASS
     from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid.nanodrone import PUBLISHED, QUANTITIES, STEPS, Contestant, benchmark
-    from cfb_mjx.sysid.observer import Observer
+    from cfb_mjx.sysid.observer import usual_observer
 
     declared = load_model_file(DECLARED).with_values("the benchmark's description", mass=VEHICLE_MASS)
     contestants = {"declared": Contestant.of(declared)}
     for name, where in {"plant": PLANT, "model": model}.items():
         described = load_model_file(where)
         contestants[name] = Contestant.of(described, where=where)
-        contestants[f"{name}_observer"] = Contestant.of(described, Observer(), where=where)
+        contestants[f"{name}_observer"] = Contestant.of(described, usual_observer(described.kind), where=where)
     result = benchmark(logs, contestants, stride, Progress("benchmark"))
     published = {
         name: {f"{quantity}_sum_{unit}": x for (quantity, unit), x in zip(QUANTITIES.items(), sums, strict=True)}

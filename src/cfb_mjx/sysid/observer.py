@@ -81,6 +81,16 @@ class Observer(eqx.Module):
     """Its correlation time, s."""
 
 
+FORECASTER = Observer(rate_walk=0.8, rate_share=1.6, torque=(2.0, 4.0, 0.6), torque_time=0.125, rotor=5.0)
+"""Levels of largest use beside a predictor, found in the same way: it has learnt to expect its own errors, so less of
+what it misses of its own angular acceleration is a disturbance that lasts."""
+
+
+def usual_observer(kind: str) -> Observer:
+    """The levels to use beside a model of this kind (`ModelFile.kind`), if none were tuned for it."""
+    return FORECASTER if kind == "predictor" else Observer()
+
+
 class Observed(eqx.Module):
     """What an observer knows at each row from that row and earlier ones; or at each window's start."""
 
