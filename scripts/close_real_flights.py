@@ -16,6 +16,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from real_flights_page import GROUPS, figure, page
@@ -125,27 +126,23 @@ def columns(made: dict[str, ModelFile], logs: dict[str, list[FlightLog]]) -> dic
     fit = logs["fit"]
     even = check_sensors(fit, usual_delay(fit, made["repaired"].parameters())).faults
     band = SensorFaults.from_mappings(made["repaired"].effects, "repaired")
-    explains = {
-        f"{PARTS[part]}, {group}": [
-            float(np.mean([explained(faults, log) for log in some if group_of(log.name) == group]))
-            for faults in (even, band)
-        ]
-        for part, some in logs.items()
-        for group in GROUPS
-    }
+
+    def explains(some: list[FlightLog]) -> list[float]:
+        return [float(np.mean([explained(faults, log) for log in some])) for faults in (even, band)]
+
     return {
         "stretch": even.stretch.scale.tolist(),
         "band": [band.velocity_scale, band.velocity_rise, band.velocity_fade],
-        "explained": explains,
+        "explained": by_kind(logs, explains),
         "bands": {f"{low:g} to {high:g} Hz": stretched(fit, low, high) for low, high in BANDS},
         "errors": {name: errors(made[name], fit) for name in ("repaired", "plant")},
     }
 
 
-def tilts(logs: dict[str, list[FlightLog]], scale: float) -> dict[str, dict]:
-    """`tilted` of every group of the flights fitted to and judged on."""
+def by_kind(logs: dict[str, list[FlightLog]], measure: Callable[[list[FlightLog]], Any]) -> dict[str, Any]:
+    """What is measured of every group of the flights fitted to and judged on."""
     return {
-        f"{PARTS[part]}, {group}": tilted([log for log in some if group_of(log.name) == group], scale)
+        f"{PARTS[part]}, {group}": measure([log for log in some if group_of(log.name) == group])
         for part, some in logs.items()
         for group in GROUPS
     }
@@ -307,7 +304,7 @@ def main() -> None:
     results = {part: [log.name for log in some] for part, some in logs.items()} | {"mass": MASS, "slow": SLOW}
     results["columns"] = kept(work / "columns.json", lambda: columns(made, logs))
     scale = results["columns"]["stretch"][0]
-    results["tilt"] = kept(work / "tilt.json", lambda: tilts(logs, scale))
+    results["tilt"] = kept(work / "tilt.json", lambda: by_kind(logs, partial(tilted, scale=scale)))
     results["place"] = kept(work / "place.json", lambda: by_place(logs["fit"]))
     results["observer"] = {
         name: kept(work / f"observer-{name}.json", partial(tuned, made[name], logs["fit"])) for name in PRESETS

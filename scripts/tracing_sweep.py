@@ -36,7 +36,8 @@ def run(wanted: list[Case], results: Path, from_end: bool) -> None:
     base = load_model_file("cfb-guards")
     while True:
         # Read anew: another process may be at the other end.
-        rest = [case for case in wanted if case.name not in traced(results)]
+        done = traced(results)
+        rest = [case for case in wanted if case.name not in done]
         batch = rest[-BATCH:] if from_end else rest[:BATCH]
         if not batch:
             return

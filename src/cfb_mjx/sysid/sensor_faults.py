@@ -147,11 +147,9 @@ class SensorFaults:
             windows: of the repaired log.
             delay: declared age of pose and velocity, s.
         """
-        memory = np.zeros((len(windows), 2, 3))
-        if len(windows) and not self.stretch.constant:
-            carried = self.stretch.memory(log.time, log.velocity).reshape(len(log), 6)
-            memory = interpolate(log.time, carried, windows.start + delay + self.delay).reshape(memory.shape)
-        return windows.velocity, memory
+        carried = self.stretch.memory(log.time, log.velocity).reshape(len(log), 6)
+        memory = interpolate(log.time, carried, windows.start + delay + self.delay)
+        return windows.velocity, memory.reshape(len(windows), 2, 3)
 
     def as_recorded(self, predicted: State, horizons: tuple[float, ...], began: tuple[np.ndarray, np.ndarray]) -> State:
         """What this chain records at the horizons, from predictions (W, H) at `reached` times and how they `began`."""
@@ -202,7 +200,11 @@ class SensorFaults:
             for key in dict.fromkeys([SENSOR_FAULTS[name].parameter, *values]):
                 value = values.get(key)
                 number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-                wrong = name == "sensor_velocity_scale" and number and (value <= 0 or (key == FORMS[-1] and value != 1))
+                wrong = (
+                    name == "sensor_velocity_scale"
+                    and number
+                    and (value <= 0 or (key == "with_attitude" and value != 1))
+                )
                 if key not in known or not number or wrong:
                     raise CfbError(
                         f"{where}: effects.{name}.parameters.{key} = {value!r} must be a number that makes sense"

@@ -71,10 +71,12 @@ def with_band(faults: SensorFaults, logs: Sequence[FlightLog]) -> SensorFaults:
     if gains.mean() < BETTER or gains.mean() < SURE * gains.std(ddof=1) / np.sqrt(len(gains)):
         return faults
     share, rise, fade = _fit(seen)
-    vertical = faults.velocity_scale if faults.vertical_scale is None else faults.vertical_scale
-    scale = float(1 / (1 - share))
     return replace(
-        faults, velocity_scale=scale, vertical_scale=vertical, velocity_rise=float(rise), velocity_fade=float(fade)
+        faults,
+        velocity_scale=float(1 / (1 - share)),
+        vertical_scale=float(faults.stretch.scale[2]),
+        velocity_rise=float(rise),
+        velocity_fade=float(fade),
     )
 
 

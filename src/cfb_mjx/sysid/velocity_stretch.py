@@ -38,9 +38,10 @@ class VelocityStretch:
     def memory(self, time: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """What the estimator carries at every row, (N, 2, 3), from times (N,) and logged velocities (N, 3); its
         history before the first row was like that row."""
-        step = np.diff(time, prepend=time[0])
-        slow = lagged(step, velocity, self.rise)
-        return np.stack([slow, np.zeros_like(slow) if self.fade is None else lagged(step, slow, self.fade)], axis=1)
+        if self.constant:
+            return np.zeros((len(time), 2, 3))
+        first = velocity[0], np.zeros(3) if self.fade is None else velocity[0]
+        return self.carried(np.stack(first)[None], np.diff(time), velocity[None])[0]
 
     def undone(self, time: np.ndarray, velocity: np.ndarray) -> np.ndarray:
         """True velocities, (N, 3), of logged ones; every row rests on itself and earlier ones."""
@@ -104,18 +105,6 @@ class VelocityStretch:
     @property
     def _share(self) -> np.ndarray:
         return 1.0 - 1.0 / self.scale
-
-
-def lagged(step: np.ndarray, values: np.ndarray, time: float) -> np.ndarray:
-    """Values (N, ...) after a first-order lag; linear between rows, steps (N,) before each of them, s."""
-    if time == 0.0:
-        return values
-    found = np.empty_like(values)
-    found[0] = values[0]
-    for i in range(1, len(values)):
-        keep, last, now = lag_weights(step[i], time)
-        found[i] = keep * found[i - 1] + last * values[i - 1] + now * values[i]
-    return found
 
 
 def lag_weights(step: float, time: float) -> tuple[float, float, float]:
