@@ -35,7 +35,7 @@ from cfb_mjx.sysid.flight import usual_delay
 from cfb_mjx.sysid.flow_estimator import fit_flow_estimator
 from cfb_mjx.sysid.nanodrone import QUANTITIES, Contestant, benchmark
 from cfb_mjx.sysid.observer import Observer
-from cfb_mjx.sysid.observer_tuning import tune_observer
+from cfb_mjx.sysid.observer_tuning import benchmark_score, score, tune_observer
 from cfb_mjx.sysid.repeatability import repeated
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.sensors import check_sensors
@@ -55,11 +55,15 @@ BODY = (
     *("blade_flapping", "inflow_thrust", "rotor_drag", "thrust_scale"),
     *("inertia", "cog_offset", "torque_scale", "thrust_tilt", "position_moment"),
 )
+FORECAST = (*BODY, "regression_dilution")
+"""Of the predictor."""
 GENTLE = 7
 """Gentle flights among those fitted: the square counts as much as all of them, for the two are judged side by side."""
 PREDICTOR_SQUARE = 3
-"""The same for the predictor: of 1, 3 and `GENTLE` what makes its shares of the benchmark's sums smallest, with the
-observer, on the flights fitted to."""
+"""The same for the predictor: of 1, 3 and `GENTLE` what makes `benchmark_score` smallest, with the observer, on the
+flights fitted to."""
+JUDGES = {"plant": score, "predictor": benchmark_score}
+"""By what the observer's levels are chosen, on the flights fitted to."""
 SLOW = 2.0
 """Hz; below it what hangs on the place is looked for in velocity and acceleration."""
 STEP = 0.01
@@ -77,7 +81,7 @@ def steps(folder: Path, work: Path) -> dict[str, list[str]]:
     made = {name: str(work / f"{name}.yaml") for name in ("rotors", "motors", "repaired", "plant", "predictor")}
     refine = ["refine", *fit, "--weight", f"square={GENTLE}"]
     body = ["--effects", ",".join(BODY)]
-    forecast = ["--weight", f"square={PREDICTOR_SQUARE}", "--effects", ",".join((*BODY, "regression_dilution"))]
+    forecast = ["--weight", f"square={PREDICTOR_SQUARE}", "--effects", ",".join(FORECAST)]
     kept_numbers = {name: ["--json", str(work / f"{name}.json")] for name in ("plant", "predictor")}
     together = ",".join(MOTORS + BESIDE)
     options = {
@@ -206,9 +210,14 @@ def by_place(logs: list[FlightLog]) -> dict[str, dict[str, list[float]]]:
     return found
 
 
+def weighing(square: float, fit: list[FlightLog]) -> dict[str, float]:
+    """Square flights count so many times as much as others."""
+    return {log.name: float(square) for log in fit if group_of(log.name) == "square"}
+
+
 def without_each(plant: ModelFile, fit: list[FlightLog], judged: list[FlightLog]) -> dict:
     """Errors with one effect taken out and the others fitted again."""
-    weights = {log.name: float(GENTLE) for log in fit if group_of(log.name) == "square"}
+    weights = weighing(GENTLE, fit)
     found = {}
     for name in (*BODY, *MOTORS):
         less = replace(plant, effects=tuple(e for e in plant.effects if e["name"] != name))
@@ -218,12 +227,12 @@ def without_each(plant: ModelFile, fit: list[FlightLog], judged: list[FlightLog]
     return found
 
 
-def tuned(plant: ModelFile, fit: list[FlightLog]) -> dict:
-    """Levels of the observer that predict the fit flights best."""
+def tuned(plant: ModelFile, fit: list[FlightLog], judge: Callable[..., float]) -> dict:
+    """Levels of the observer that predict the fit flights best, says ``judge``."""
     groups = {group: [log for log in fit if group_of(log.name) == group] for group in GROUPS}
     faults = SensorFaults.from_mappings(plant.effects, plant.name)
     say = partial(print, flush=True)
-    return asdict(tune_observer(Quadrotor.from_file(plant), groups, faults=faults, progress=say))
+    return asdict(tune_observer(Quadrotor.from_file(plant), groups, faults=faults, progress=say, judge=judge))
 
 
 def sums(models: dict[str, ModelFile], judged: list[FlightLog], observers: dict[str, Observer]) -> dict:
@@ -232,11 +241,25 @@ def sums(models: dict[str, ModelFile], judged: list[FlightLog], observers: dict[
     for name, described in models.items():
         built[f"{name}, observer"] = Contestant.of(described, observers.get(name, observers["plant"]))
     found = benchmark(judged, built, 1, lambda *_: None)
-
-    def summed(rows: dict) -> dict:
-        return {name: [row[f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for name, row in rows.items()}
-
     return {"together": summed(found["rows"])} | {n: summed(flight["rows"]) for n, flight in found["flights"].items()}
+
+
+def summed(rows: dict) -> dict[str, list[float]]:
+    """The four sums of every row of the benchmark."""
+    return {name: [row[f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for name, row in rows.items()}
+
+
+def unseen(plant: ModelFile, logs: dict[str, list[FlightLog]], observer: Observer) -> dict[str, dict]:
+    """The benchmark's sums on flights of a kind of reference that the predictor was not fitted to."""
+    found = {}
+    for kind in ("multisine", "random"):
+        others = [log for log in logs["fit"] if not log.name.startswith(kind)]
+        own = [log for log in logs["validation"] if log.name.startswith(kind)]
+        print(f"predictor without {kind}", flush=True)
+        model, _ = by_predictions(plant, others, [*FORECAST], True, weighing(PREDICTOR_SQUARE, others))
+        built = {"predictor": Contestant.of(model), "predictor, observer": Contestant.of(model, observer)}
+        found[kind] = summed(benchmark(own, built, 1, lambda *_: None)["rows"])
+    return found
 
 
 def published(name: str, described: ModelFile, what: str, fit: list[FlightLog]) -> ModelFile:
@@ -307,7 +330,8 @@ def main() -> None:
     results["tilt"] = kept(work / "tilt.json", lambda: by_kind(logs, partial(tilted, scale=scale)))
     results["place"] = kept(work / "place.json", lambda: by_place(logs["fit"]))
     results["observer"] = {
-        name: kept(work / f"observer-{name}.json", partial(tuned, made[name], logs["fit"])) for name in PRESETS
+        name: kept(work / f"observer-{name}.json", partial(tuned, made[name], logs["fit"], judge))
+        for name, judge in JUDGES.items()
     }
     observers = {name: Observer(**levels) for name, levels in results["observer"].items()}
     results["errors"] = kept(
@@ -319,6 +343,7 @@ def main() -> None:
     results["repeats"] = kept(work / "repeats.json", lambda: repeats(both, logs["fit"] + judged))
     chosen = {"plant": made["plant"], "plant, stretch taken out": made["repaired"], "predictor": made["predictor"]}
     results["sums"] = kept(work / "sums.json", lambda: sums(chosen, judged, observers))
+    results["unseen"] = kept(work / "unseen.json", lambda: unseen(made["plant"], logs, observers["predictor"]))
     for name, (preset, what) in PRESETS.items():
         path = ROOT / "configs" / "parameters" / f"{preset}.yaml"
         save_model_file(published(preset, made[name], what, logs["fit"]), path)

@@ -3,10 +3,11 @@
 from pathlib import Path
 from statistics import mean, stdev
 
+from real_flights_benchmark import benchmark_section
+
 from cfb_mjx.cli.runtime import environment
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.flow_estimator import SPAN
-from cfb_mjx.sysid.nanodrone import PUBLISHED
 
 GROUPS = {"gentle": ("random1", "random2", "multisine"), "square": ("square",)}
 TARGETS = {
@@ -20,8 +21,6 @@ TARGETS = {
     ("rotor_speed_in_observer", "square"): (0.24, None),
 }
 """What the project set itself: mean errors after 0.5 s, attitude rad and velocity m/s."""
-SUMS_GOAL = (1.91, 8.86, 3.94, 20.8)
-"""The same on the benchmark's test flights, as the sums of `PUBLISHED`."""
 TITLES = {
     "commands_in": "commands in",
     "rotor_speed_in": "rotor speeds in",
@@ -68,9 +67,10 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "  does not bias.",
             "- *plant*: the same effects and a few more fitted to predictions; inertia within 25 %, damping within",
             "  2 per second.",
-            "- *predictor*: inertia left free, and small torques answered by less than their size",
-            "  (`regression_dilution`, no physics). It predicts gentle flights better, square ones after half a second",
-            "  worse, and is a wrong plant: `cfb refine` marks it so.",
+            "- *predictor*: inertia left free, and small torques of gentle flights answered by less than their size,",
+            "  the body rate expected to return instead (`regression_dilution`, no physics).",
+            *_over_plant(results["errors"]),
+            "  It is a wrong plant: `cfb refine` marks it so.",
             *_dilution(models["predictor"]),
             "",
             "Plant and predictor are shipped as the presets `cfb-idsia` and `cfb-idsia-predictor`:",
@@ -99,7 +99,8 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "",
             "A torque, a force and, where rotor speed was measured, motor errors, estimated from data before each",
             "window's start; how much they may wander was chosen by predictions of the flights fitted to, gentle and",
-            "square alike (`cfb_mjx.sysid.observer_tuning`), with the plant and with the predictor:",
+            "square alike (`cfb_mjx.sysid.observer_tuning`): with the plant after half a second, with the predictor by",
+            "the sums of the benchmark below:",
             "",
             *_levels(results["observer"]),
             "",
@@ -113,24 +114,7 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "|---|---|---|---:|",
             *_repeats(results),
             "",
-            "## The nano-drone benchmark on these flights",
-            "",
-            "Sums of mean errors over 50 steps of 10 ms, rotor speeds in ([rules](nanodrone.md)): position m, velocity",
-            "m/s, attitude rad, body rate rad/s, and beside each its share of the rows *naive* and *physics*.",
-            "Published rows are on the benchmark's own test flights, which are easier to predict from how the drone",
-            "moves: *physics*, one and the same rule, errs a smaller share of *naive* there. Compare shares of both.",
-            "",
-            "| | position | velocity | attitude | body rate |",
-            "|---|---|---|---|---|",
-            *_sums(results["sums"]["together"]),
-            *_sums(PUBLISHED | {"goal": SUMS_GOAL}, "on those: "),
-            "",
-            "Flight by flight, physics and the predictor with observer, beside the published *physics* and the goal:",
-            "",
-            "| | position | velocity | attitude | body rate |",
-            "|---|---|---|---|---|",
-            *_by_flight(results["sums"]),
-            *_sums(PUBLISHED | {"goal": SUMS_GOAL}, "on those: ", ("physics", "goal")),
+            *benchmark_section(results),
             "",
             "## Commands",
             "",
@@ -168,12 +152,23 @@ def _story(results: dict) -> list[str]:
     return text
 
 
+def _over_plant(errors: dict[str, dict]) -> list[str]:
+    shares = [
+        f"{group} " + " / ".join(f"{errors['predictor'][key][0] / errors['plant'][key][0]:.2f}" for key in keys)
+        for group in GROUPS
+        for keys in [[f"{variant} {group} 0.5" for variant in TITLES]]
+    ]
+    return ["  Its errors of attitude above are of the plant's, row by row: " + "; ".join(shares) + "."]
+
+
 def _dilution(predictor: ModelFile) -> list[str]:
     numbers = {e["name"]: e["parameters"] for e in predictor.effects}
     diluted, inertia = numbers["regression_dilution"], numbers["inertia"]["relative"]
     return [
-        f"  Of a torque far below {diluted['knee']:.2g} N m it answers {100 * (1 - diluted['dilution']):.0f} %. Beside "
-        "that, inertia left free",
+        f"  Of a torque far below {1e3 * diluted['knee']:.2g} mN m it answers "
+        f"{100 * (1 - diluted['dilution']):.0f} % while the drone turns far less than {diluted['turning']:.2g} rad/s",
+        f"  (rms, the last {diluted['time_constant']:.2g} s), and expects the body rate to fade at "
+        f"{diluted['dilution'] * diluted['reversion']:.2g} per second. Inertia left free",
         f"  comes out {', '.join(f'{100 * x:+.0f}' for x in inertia[:2])} % from the declared one.",
     ]
 
@@ -341,23 +336,6 @@ def _repeats(results: dict) -> list[str]:
         names = " and ".join(f"{n.split('_')[0]} {n[-1]}" for n in pair.split())
         rows.append(f"| {names} | {cells[0]} | {cells[1]} | {1 - after / before:.0%} |")
     return rows
-
-
-def _by_flight(sums: dict[str, dict]) -> list[str]:
-    chosen = ("physics", "predictor, observer")
-    flights = {name: rows for name, rows in sums.items() if name != "together"}
-    return [line for name, rows in flights.items() for line in _sums(rows, f"{name}: ", chosen)]
-
-
-def _sums(rows: dict, prefix: str = "", chosen: tuple[str, ...] | None = None) -> list[str]:
-    shares = list(zip(rows["naive"], rows["physics"], strict=True))
-    return [
-        f"| {prefix}{name} | "
-        + " | ".join(f"{x:.3g} ({x / n:.2f} / {x / p:.2f})" for x, (n, p) in zip(row, shares, strict=True))
-        + " |"
-        for name, row in rows.items()
-        if chosen is None or name in chosen
-    ]
 
 
 def figure(results: dict, path: Path) -> None:

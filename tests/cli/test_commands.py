@@ -69,7 +69,7 @@ def test_a_predictor_has_an_observer_of_its_own(cfb, files, tmp_path):
         done = cfb("evaluate", files / "flight.mcap", "--model", model, "--observer", "--json", path)
         assert done.returncode == 0, done.stderr
         told[model] = json.loads(path.read_text())["observer"]
-    assert told["cfb-idsia"]["rate_share"] < told["cfb-idsia-predictor"]["rate_share"]
+    assert told["cfb-idsia"]["torque_time"] > told["cfb-idsia-predictor"]["torque_time"]
 
 
 def test_evaluate_draws_a_figure(cfb, files, tmp_path):

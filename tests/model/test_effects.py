@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import helpers
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import CATALOGUE, Effect, ParasiticDrag, Quadrotor, State, begin, rollout, specific_force, step
@@ -308,12 +310,10 @@ def test_a_predictor_answers_small_torques_by_less(guards):
     pushes = np.array([[2e-5, 1e-5, 3e-5], [4e-3, -3e-3, 2e-3]])
     knee, dilution = 5e-4, 0.9
     turned = []
-    for effects in ((), (RegressionDilution(dilution, knee),)):
+    for effects in ((), (RegressionDilution(dilution, knee, reversion=0.0, turning=1e3, time_constant=1.0),)):
         found = []
         for push in pushes:
-            constant = np.zeros((6, len(TERMS)))
-            constant[:3, list(TERMS).index("1")] = push
-            model = Quadrotor(guards, (ResidualFormula(constant, 0.0), *effects), dt=1e-4)
+            model = Quadrotor(guards, (pushed(push), *effects), dt=1e-4)
             found.append(rollout(model, model.hover_state(), model.hover_command()[None]).body_rate[-1])
         turned.append(np.array(found))
     size = pushes[:, 0] ** 2 + pushes[:, 1] ** 2
@@ -325,6 +325,42 @@ def test_a_predictor_answers_small_torques_by_less(guards):
     neutral = RegressionDilution.neutral()
     assert effect_from_mapping(effect_to_mapping(neutral), "drone.yaml") == neutral
     assert "regression_dilution" not in CATALOGUE
+
+
+@ONE_WORKER
+def test_a_predictor_expects_the_body_rate_to_return(guards):
+    """Without a torque a roll fades as exp(-dilution reversion t); a yaw, which is spared, does not."""
+    model = Quadrotor(guards, (RegressionDilution(0.8, 1.0, reversion=5.0, turning=1e3, time_constant=1.0),), dt=1e-3)
+    for axis, kept in ((0, np.exp(-0.8 * 5.0 * 0.3)), (2, 1.0)):
+        start = replace(model.hover_state(), body_rate=0.5 * jnp.eye(3)[axis])
+        flown = rollout(model, start, jnp.tile(model.hover_command(), (300, 1))).body_rate[-1]
+        assert flown[axis] == pytest.approx(0.5 * kept, rel=5e-3)
+
+
+@ONE_WORKER
+def test_a_predictor_answers_more_the_harder_a_flight_has_turned(guards):
+    """A constant torque, by an adaptive integrator of SciPy: the same push counts for more as the flight goes on."""
+    inertia, push = float(guards.inertia[0]), 2e-4
+    dilution, reversion, turning, lasting = 0.95, 4.0, 0.2, 0.5
+
+    def roll(_, x):
+        rate, turned = x
+        unanswered = dilution / (1 + (push / 1e-3) ** 2 + turned / turning**2)
+        return [(1 - unanswered) * push / inertia - unanswered * reversion * rate, (rate**2 - turned) / lasting]
+
+    expected = solve_ivp(roll, (0, 1), [0.0, 0.0], rtol=1e-9, t_eval=[0.1, 0.5, 1.0]).y[0]
+    effect = RegressionDilution(dilution, 1e-3, reversion, turning, lasting)
+    model = Quadrotor(guards, (pushed([push, 0.0, 0.0]), effect), dt=1e-3)
+    flown = rollout(model, model.hover_state(), jnp.tile(model.hover_command(), (1000, 1))).body_rate[:, 0]
+    np.testing.assert_allclose(flown[np.array([99, 499, 999])], expected, rtol=1e-2)
+    assert expected[2] - expected[1] > 3 * (expected[1] - expected[0])
+
+
+def pushed(torque) -> ResidualFormula:
+    """A constant torque, N m, as an effect."""
+    constant = np.zeros((6, len(TERMS)))
+    constant[:3, list(TERMS).index("1")] = torque
+    return ResidualFormula(constant, 0.0)
 
 
 PAGE = (Path(__file__).resolve().parents[2] / "docs" / "effects.md").read_text()

@@ -14,8 +14,9 @@ from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import BladeFlapping
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid import evaluate
+from cfb_mjx.sysid.nanodrone import QUANTITIES, Contestant, benchmark
 from cfb_mjx.sysid.observer import Observer, fit_observer, observe
-from cfb_mjx.sysid.observer_tuning import levels_of, scaled, score, tune_observer
+from cfb_mjx.sysid.observer_tuning import STRIDE, benchmark_score, levels_of, scaled, score, tune_observer
 
 # They share fixtures and compiled programs.
 pytestmark = pytest.mark.xdist_group("observer")
@@ -204,6 +205,18 @@ def test_tuning_finds_what_predicts_and_leaves_the_rest(disturbed):
     assert steps[0].startswith("torque x 4")
 
 
+def test_tuning_may_be_judged_by_the_benchmark(disturbed):
+    every = disturbed.rows(np.arange(0, len(disturbed), 2))
+    hundred = every.replace(time=0.01 * np.arange(len(every)))
+    groups, deaf = {"disturbed": [hundred]}, dataclasses.replace(PLANT, torque=(0.5, 0.5, 0.2))
+    found = tune_observer(GUARDS, groups, deaf, levels=[("torque", None)], factors=(4.0,), judge=benchmark_score)
+    rows = benchmark([hundred], {"tuned": Contestant(GUARDS, found), "deaf": Contestant(GUARDS, deaf)}, STRIDE)["rows"]
+    sums = {n: [rows[n][f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for n in ("tuned", "deaf")}
+    assert benchmark_score(GUARDS, groups, found) == pytest.approx(np.mean(np.log(sums["tuned"])))
+    assert found.torque != deaf.torque
+    assert np.prod(sums["tuned"]) < np.prod(sums["deaf"])
+
+
 def test_one_axis_of_a_level_moves_alone():
     found = scaled(LIKELY, ("torque", 2), 2.0)
     assert found.torque == (5.0, 5.0, 3.0)
@@ -214,6 +227,8 @@ def test_one_axis_of_a_level_moves_alone():
 def test_tuning_without_flights_is_refused():
     with pytest.raises(CfbError, match="needs flights"):
         tune_observer(GUARDS, {})
+    with pytest.raises(CfbError, match="needs flights"):
+        tune_observer(GUARDS, {}, judge=benchmark_score)
 
 
 @pytest.mark.skipif(not VALIDATION.is_dir(), reason="needs the real flights in ../shared/real")

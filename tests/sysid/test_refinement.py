@@ -81,6 +81,16 @@ def test_trims_of_healthy_flights_are_small_and_have_no_mean(refined):
     assert np.abs(trims.mean(axis=0)).max() < 0.01 * TRIM
 
 
+def test_without_trims_the_numbers_stand_for_flights_whose_trim_nobody_knows(campaign):
+    drag = plausible_numbers(GUARDS(), ("rotor_drag",))
+    found = refine(Quadrotor(GUARDS()), campaign.fit, drag, trimmed=False)
+    assert all(not np.any(trim) for trim in found.trims.values())
+    beside = refine(Quadrotor(GUARDS()), campaign.fit, drag)
+    assert any(np.any(trim) for trim in beside.trims.values())
+    np.testing.assert_allclose(found.values, beside.values, rtol=0.05)
+    assert found.cost[1] > beside.cost[1]
+
+
 def test_the_gradient_is_that_of_the_loss(campaign):
     numbers = plausible_numbers(GUARDS(), ("rotor_drag", "inertia"))
     model = _prepared(Quadrotor(GUARDS()), numbers)
@@ -132,8 +142,7 @@ def test_what_is_plausible():
     with pytest.raises(CfbError, match="predictors only"):
         plausible_numbers(GUARDS(), ("rotor_drag", "regression_dilution"))
     assert {n.name for n in free_numbers(("regression_dilution",))} == {
-        "regression_dilution.dilution",
-        "regression_dilution.knee",
+        f"regression_dilution.{field}" for field in ("dilution", "knee", "reversion", "turning", "time_constant")
     }
 
 

@@ -116,7 +116,8 @@ def by_predictions(
     start = Quadrotor.from_file(base)
     numbers = free_numbers(names) if predictor else plausible_numbers(start.parameters, names)
     faults = SensorFaults.from_mappings(base.effects, f"model {base.name}")
-    found = refine(start, logs, numbers, faults, weights=weights, progress=progress)
+    # What a predictor is for is the next flight, and nobody knows that one's trim.
+    found = refine(start, logs, numbers, faults, weights=weights, trimmed=not predictor, progress=progress)
     rows, uncertainty = {}, {}
     for number, value, std in zip(found.numbers, found.values, found.deviations, strict=True):
         known = float(std) if np.isfinite(std) else None

@@ -16,6 +16,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.sysid.evaluation import OBSERVED, evaluate
+from cfb_mjx.sysid.nanodrone import QUANTITIES, Contestant, benchmark
 from cfb_mjx.sysid.observer import Observer
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 
@@ -25,6 +26,8 @@ LEAST = 1e-3
 """A step must lower the score by this."""
 HORIZON = 0.5
 """Seconds ahead at which levels are judged."""
+STRIDE = 10
+"""Rows from window to window where the benchmark's rules judge."""
 
 Level = tuple[str, int | None]
 
@@ -69,6 +72,24 @@ def score(
     return float(np.mean(np.log(logs)))
 
 
+def benchmark_score(
+    model: Quadrotor, groups: Mapping[str, Sequence[FlightLog]], observer: Observer, faults: SensorFaults = HEALTHY
+) -> float:
+    """Mean logarithm of the nano-drone benchmark's sums (`cfb_mjx.sysid.nanodrone`), every group and quantity alike.
+
+    Raises:
+        CfbError: no group, or a flight that is not of the benchmark.
+    """
+    if not groups:
+        raise CfbError("Tuning an observer needs flights.")
+    contestant = Contestant(model, observer, faults)
+    logs = []
+    for flights in groups.values():
+        row = benchmark(flights, {"tuned": contestant}, STRIDE)["rows"]["tuned"]
+        logs += [row[f"{quantity}_sum_{unit}"] for quantity, unit in QUANTITIES.items()]
+    return float(np.mean(np.log(logs)))
+
+
 def tune_observer(
     model: Quadrotor,
     groups: Mapping[str, Sequence[FlightLog]],
@@ -77,6 +98,7 @@ def tune_observer(
     levels: Sequence[Level] | None = None,
     factors: Sequence[float] = FACTORS,
     progress: Callable[[str], None] = lambda _: None,
+    judge: Callable[..., float] = score,
 ) -> Observer:
     """Move the levels one after another, again and again, until no step makes predictions better.
 
@@ -88,18 +110,19 @@ def tune_observer(
         levels: which may be moved; by default all.
         factors: steps, the largest first.
         progress: told about every step taken.
+        judge: what to make small, `score` or `benchmark_score`.
 
     Raises:
         CfbError: no flights, or a group in which no prediction window fits.
     """
     best = observer or Observer()
-    lowest = score(model, groups, best, faults)
+    lowest = judge(model, groups, best, faults)
     moving = levels_of(best) if levels is None else levels
 
     def moved(level: Level, step: float) -> bool:
         nonlocal best, lowest
         before = lowest
-        while (other := score(model, groups, tried := scaled(best, level, step), faults)) < lowest - LEAST:
+        while (other := judge(model, groups, tried := scaled(best, level, step), faults)) < lowest - LEAST:
             best, lowest = tried, other
             progress(f"{level[0]}{'' if level[1] is None else f'[{level[1]}]'} x {step:.3g}: {lowest:.4f}")
         return lowest < before

@@ -8,7 +8,8 @@ it (`plausible_numbers`); without them the result is a predictor, not a plant (`
 
 Every flight has a trim torque of its own, a nuisance: a battery is never put back in quite the same place. It is
 estimated beside the rest, with a prior, and not part of the model that comes out. Trims have no mean: what all flights
-share belongs to the model, and is fitted if an effect for it (`cog_offset`) is.
+share belongs to the model, and is fitted if an effect for it (`cog_offset`) is. A predictor is fitted without: what it
+is for is a flight whose trim nobody knows.
 """
 
 from cfb_mjx.sysid.refinement.fitting import Refinement, refine

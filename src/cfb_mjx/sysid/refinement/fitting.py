@@ -43,6 +43,7 @@ def refine(
     numbers: Sequence[Number],
     faults: SensorFaults = HEALTHY,
     weights: Mapping[str, float] | None = None,
+    trimmed: bool = True,
     iterations: int = 12,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Refinement:
@@ -60,6 +61,8 @@ def refine(
         numbers: what may move (`plausible_numbers`, `free_numbers`); values outside their bounds are brought inside.
         faults: of the recording, taken out first.
         weights: of flights by name, where not 1.
+        trimmed: estimate a trim torque of every flight beside the numbers. Without it the numbers are those that serve
+            best on a flight whose trim nobody knows.
         iterations: steps at most.
         progress: told what happens.
 
@@ -79,7 +82,7 @@ def refine(
     start, damping = values.copy(), 1e-2
     first = cost = data.cost(with_values(model, numbers, values), trims)
     for step in range(iterations):
-        normal = data.normal_equations(model, numbers, values, trims)
+        normal = data.normal_equations(model, numbers, values, trims, trimmed)
         better = None
         while damping < 1e6:
             change, turn = normal.step(damping, (values - start) / scale, trims / TRIM, values, low, high)
@@ -96,7 +99,7 @@ def refine(
         progress(f"step {step + 1}: mean loss {cost:.4f}")
         if gained < 1e-4 * cost:
             break
-    normal = data.normal_equations(model, numbers, values, trims)
+    normal = data.normal_equations(model, numbers, values, trims, trimmed)
     deviations = normal.deviations(values, low, high, scale)
     found = with_values(model, numbers, values)
     found = Quadrotor(found.parameters, found.effects[:-1], body=found.body)

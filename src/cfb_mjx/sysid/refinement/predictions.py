@@ -63,6 +63,8 @@ class Normal:
     """Of shared numbers."""
     share: np.ndarray
     """(F,) what flights count."""
+    trimmed: bool
+    """Whether every flight has a trim of its own; else they stay where they are."""
 
     def _whole(self, offset: np.ndarray, trims: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # A prior of one scale (one TRIM), as strong as a single window: it decides where flights say nothing.
@@ -73,7 +75,7 @@ class Normal:
         return self.matrix + prior, self.gradient + prior @ at
 
     def _free(self, gradient: np.ndarray, values: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        free = np.ones(len(gradient), dtype=bool)
+        free = np.full(len(gradient), self.trimmed)
         own = gradient[: self.count]
         free[: self.count] = ~((values <= low) & (own > 0) | (values >= high) & (own < 0))
         return free
@@ -148,7 +150,12 @@ class Predictions:
         return mean if np.isfinite(mean) else np.inf
 
     def normal_equations(
-        self, model: Quadrotor, numbers: tuple[Number, ...], values: np.ndarray, trims: np.ndarray
+        self,
+        model: Quadrotor,
+        numbers: tuple[Number, ...],
+        values: np.ndarray,
+        trims: np.ndarray,
+        trimmed: bool = True,
     ) -> Normal:
         """Of the loss at some values, without priors."""
         count, flights = len(numbers), len(trims)
@@ -175,7 +182,7 @@ class Predictions:
                 gradient[at] += each.sum(axis=0)
                 sums = np.add.reduceat(each, np.arange(0, len(mine), BLOCK))
                 scatter[np.ix_(at, at)] += sums.T @ sums
-        return Normal(matrix, gradient, scatter, count, self.share)
+        return Normal(matrix, gradient, scatter, count, self.share, trimmed)
 
 
 def _part(flights: list[tuple], share: np.ndarray, measured: bool) -> _Part | None:
