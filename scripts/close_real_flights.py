@@ -1,4 +1,5 @@
-"""Close the loop on real flights in the IDSIA layout, and write docs/closing-real-flights.md with its figure.
+"""Close the loop on real flights in the IDSIA layout; write docs/closing-real-flights.md with its figure, and what
+docs/closing-the-loop.md says of it.
 
     python scripts/close_real_flights.py FOLDER [--work out/real]
 
@@ -19,7 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from real_flights_page import GROUPS, figure, page
+from marked_block import write_block
+from real_flights_page import GROUPS, figure, page, summary
 from scipy.signal import butter, sosfiltfilt
 
 from cfb_mjx.cli.refining import by_predictions
@@ -43,6 +45,7 @@ from cfb_mjx.sysid.velocity_band import explained
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "closing-real-flights.md"
+GUIDE = ROOT / "docs" / "closing-the-loop.md"
 PRESETS = {
     "plant": ("cfb-idsia", "a plant"),
     "predictor": ("cfb-idsia-predictor", "a predictor, with inertia left free, no plant"),
@@ -349,6 +352,7 @@ def main() -> None:
         save_model_file(published(preset, made[name], what, logs["fit"]), path)
     figure(results, PAGE.with_suffix(".png"))
     write_text(PAGE, page(models, results, commands))
+    write_block(GUIDE, "real flights", summary(made["plant"], results))
     print(PAGE)
 
 

@@ -20,14 +20,13 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests" / "logs"))
 import foreign_logs  # noqa: E402
+from marked_block import write_block  # noqa: E402
 from synthetic_logs import make_flight  # noqa: E402
 
 from cfb_mjx.errors import CfbError  # noqa: E402
-from cfb_mjx.files import write_text  # noqa: E402
 from cfb_mjx.logs import read_log  # noqa: E402
 from cfb_mjx.logs.flight_log import OPTIONAL, REQUIRED  # noqa: E402
 
-BEGIN, END = "<!-- damage: begin -->", "<!-- damage: end -->"
 SHARES = {"usd_card": 0.5, "crazyswarm": 0.25, "radio_csv": 0.25}
 CHECKED = ("usd_card", "crazyswarm")  # formats with a checksum
 
@@ -131,10 +130,7 @@ def main() -> int:
     line = report(arguments, counts, failures)
     print(line)
     print("\n".join(failures[:20]))
-    text = arguments.output.read_text(encoding="utf-8")
-    before, _, rest = text.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    write_text(arguments.output, f"{before}{BEGIN}\n{line}\n{END}{after}")
+    write_block(arguments.output, "damage", line)
     return 1 if failures else 0
 
 

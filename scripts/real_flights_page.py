@@ -287,13 +287,43 @@ ARGUMENTS = {
     "cog_offset": "the mean place of the batteries; every flight has its own besides",
     "torque_scale": "less reactive torque; yaw only",
     "thrust_tilt": "rotors a few milliradians off the vertical",
-    "position_moment": "a velocity column that leans towards the middle, and perhaps air that moves there; see below",
+    "position_moment": "a velocity column that leans towards the middle, and perhaps air that moves there",
     "battery_sag": "rotor speed follows the charge of the battery, little its dips under load (hence the lag)",
     "motor_asymmetry": "motors are driven up and coast down",
 }
 
 
+def summary(plant: ModelFile, results: dict) -> str:
+    """The effects of the plant in the order of what they buy, and what it predicts: for closing-the-loop.md."""
+    errors = results["errors"]
+
+    def at(name: str, group: str) -> str:
+        return f"{errors[name][f'rotor_speed_in_observer {group} 0.5'][0]:.2f}"
+
+    told = (f"{group} flights {at('declared', group)} -> {at('plant', group)} rad" for group in GROUPS)
+    return "\n".join(
+        [
+            "| effect | error without it | argument |",
+            "|---|---:|---|",
+            *(f"| `{name}` | {growth:+.0%} | {ARGUMENTS[name]} |" for growth, name, _ in _ordered(plant, results)),
+            "",
+            "Attitude half a second ahead, rotor speeds in, with observer, declared model -> corrected one:",
+            f"{'; '.join(told)}. Errors over the horizon:",
+            "",
+            "![Errors over the horizon](closing-real-flights.png)",
+        ]
+    )
+
+
 def _effects(plant: ModelFile, results: dict) -> list[str]:
+    return [
+        f"| {name} | {numbers} | {growth:+.0%} | {ARGUMENTS[name]} |"
+        for growth, name, numbers in _ordered(plant, results)
+    ]
+
+
+def _ordered(plant: ModelFile, results: dict) -> list[tuple[float, str, str]]:
+    """How much an error grows without each effect, its name and numbers; what buys most first."""
     keys = [f"{variant} {group} 0.5" for variant in ("commands_in", "rotor_speed_in") for group in GROUPS]
     own, rows = results["errors"]["plant"], []
     for name, less in results["without"].items():
@@ -302,8 +332,8 @@ def _effects(plant: ModelFile, results: dict) -> list[str]:
         numbers = "; ".join(
             _number(k, v, (effect.get("uncertainty") or {}).get(k)) for k, v in effect["parameters"].items()
         )
-        rows.append((growth, f"| {name} | {numbers} | {growth:+.0%} | {ARGUMENTS[name]} |"))
-    return [row for _, row in sorted(rows, key=lambda pair: -pair[0])]
+        rows.append((growth, name, numbers))
+    return sorted(rows, reverse=True)
 
 
 def _number(name: str, value, std) -> str:
