@@ -101,8 +101,9 @@ def same(one: Path, other: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def cache(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("programs")
+def cache(pytestconfig) -> Path:
+    """Of compiled programs, kept beside pytest's own."""
+    return pytestconfig.cache.mkdir("jax_hosts")
 
 
 @pytest.fixture(scope="module")

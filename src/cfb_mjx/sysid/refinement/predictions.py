@@ -139,9 +139,9 @@ class Predictions:
 
     def cost(self, model: Quadrotor, trims: np.ndarray) -> float:
         """Mean loss of a window and horizon; the trims' prior belongs to it."""
-        own, total, count = jnp.asarray(trims), 0.0, 0
+        total, count = 0.0, 0
         for part in self.parts:
-            found = [np.asarray(_scaled(model, c, own, self.sizes, part.measured)) for c in part.chunks]
+            found = [np.asarray(_scaled(model, c, _own(trims, c), self.sizes, part.measured)) for c in part.chunks]
             norm = np.linalg.norm(np.concatenate(found)[: len(part.flight)], axis=-1)
             loss = np.where(norm < HUBER, 0.5 * norm**2 / HUBER, norm - 0.5 * HUBER)
             total, count = total + np.sum(part.weight[:, None, None] * loss), count + loss.size
@@ -166,7 +166,7 @@ class Predictions:
         numbers = tuple(replace(n, low=-1.0, high=1.0) for n in numbers)
         for part in self.parts:
             found = [
-                _linearised(model, numbers, *here, chunk, jnp.asarray(trims), self.sizes, part.measured)
+                _linearised(model, numbers, *here, chunk, _own(trims, chunk), self.sizes, part.measured)
                 for chunk in part.chunks
             ]
             error, slope = (np.concatenate([np.asarray(f[k]) for f in found])[: len(part.flight)] for k in (0, 1))
@@ -227,6 +227,11 @@ def _inputs(windows: Windows, start: np.ndarray, memory: tuple, measured: bool) 
     }
 
 
+def _own(trims: np.ndarray, chunk: dict) -> Array:
+    """(W, 3) trim of the flight each window of a chunk is of: other flights are no reason to compile anew."""
+    return jnp.asarray(trims[np.asarray(chunk["flight"])])
+
+
 def _norms(predicted: State, windows: Windows) -> np.ndarray:
     """(W, H, 2) errors of attitude, rad, and velocity, m/s."""
     found = errors(windows, predicted)
@@ -254,8 +259,7 @@ def _error(model: Quadrotor, window: dict, trim: Array, sizes: Array, measured: 
 @eqx.filter_jit
 def _scaled(model: Quadrotor, chunk: dict, trims: Array, sizes: Array, measured: bool) -> Array:
     """(W, H, 2, 3) errors of all windows of a chunk."""
-    own = trims[chunk["flight"]]
-    return jax.vmap(lambda window, trim: _error(model, window, trim, sizes, measured))(chunk, own)
+    return jax.vmap(lambda window, trim: _error(model, window, trim, sizes, measured))(chunk, trims)
 
 
 @eqx.filter_jit
@@ -281,4 +285,4 @@ def _linearised(
         here = jnp.zeros(len(numbers) + 3)
         return moved(here), jax.jacfwd(moved)(here)
 
-    return jax.vmap(one)(chunk, trims[chunk["flight"]])
+    return jax.vmap(one)(chunk, trims)
