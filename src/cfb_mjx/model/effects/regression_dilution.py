@@ -59,7 +59,7 @@ class RegressionDilution(Effect):
     turning: Float[Array, "*batch"] = eqx.field(converter=number)
     """Rms body rate about x and y of a flight in which half of that share of a small torque is."""
     time_constant: Float[Array, "*batch"] = eqx.field(converter=number)
-    """How long the flight is remembered."""
+    """How long the flight is remembered: within `prior`, what it does; longer, which flight it is."""
 
     @classmethod
     def neutral(cls) -> RegressionDilution:
