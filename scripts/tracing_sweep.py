@@ -1,9 +1,11 @@
 """Trace labelled plants nobody tuned to, and write docs/tracing.md: confusion, false positives, recovered improvement.
 
     python scripts/tracing_sweep.py [--null 100] [--results benchmarks/tracing.jsonl] [--page-only] [--from-end]
+    python scripts/tracing_sweep.py --null 10 --seed 98000 --results benchmarks/tracing-98000.jsonl
 
 The plants (cfb_mjx.labelled_plants) are an independent simulator with effects of other functional forms than the
-catalogue's. Results are kept campaign by campaign: an interrupted sweep goes on where it was.
+catalogue's. Results are kept campaign by campaign: an interrupted sweep goes on where it was. What lies beside
+benchmarks/tracing.jsonl as tracing-SEED.jsonl is the same on other seeds; the page sums it up.
 """
 
 import argparse
@@ -23,6 +25,8 @@ from cfb_mjx.sysid.tracing.fits import ERRORS
 
 ROOT = Path(__file__).resolve().parents[1]
 
+RESULTS = ROOT / "benchmarks" / "tracing.jsonl"
+NULLS = 100
 BATCH = 8
 
 
@@ -68,6 +72,8 @@ def run(wanted: list[Case], results: Path, from_end: bool) -> None:
 
                 twin = evaluate(Quadrotor.from_file(base), perfect[campaign.case.name].held_out)
                 line["perfect"] = _pick(twin.metrics("commands_in"))
+            if campaign.case.name in traced(results):  # by the other process, meanwhile
+                continue
             with results.open("a") as file:
                 file.write(json.dumps(line, default=float) + "\n")
             names = [item.name for item in outcome.reported]
@@ -93,13 +99,10 @@ def recovered(line: dict) -> float:
     return float(np.mean(np.minimum(shares, 1.0))) if shares else float("nan")
 
 
-def page(results: Path, planned: int) -> str:
-    """The page, from the results of so many planned campaigns."""
+def page(results: Path, planned: int, again: dict[str, Path]) -> str:
+    """The page, from the results of so many planned campaigns, and those of other seeds."""
     lines = [json.loads(line) for line in results.read_text().splitlines()]
-    clean = [line for line in lines if not line["labels"]]
-    outside = [line for line in lines if "outside" in line["labels"]]
-    single = [line for line in lines if len(line["labels"]) == 1 and line not in outside]
-    mixed = [line for line in lines if len(line["labels"]) > 1]
+    _, outside, single, mixed = _sorts(lines)
     text = [
         "# Tracing labelled plants",
         "",
@@ -117,6 +120,55 @@ def page(results: Path, planned: int) -> str:
         "velocity, attitude, rate; 0.2 and 0.5 s), measured on the same flights flown without the effect; *recovered*",
         "is the share of that improvement the corrected model reaches.",
         "",
+        *_summary(lines),
+        "",
+        "## What was found for what was there (single effects)",
+        "",
+        "| effect | strength | buys | found | recovered | unexplained |",
+        "|---|---|---|---|---|---|",
+    ]
+    for line in sorted(single + outside, key=lambda x: (x["labels"][0], -x["strengths"][0], x["name"])):
+        text.append(_detail(line, line["labels"][0] if line not in outside else line["name"]))
+    text += [
+        "",
+        "## Mixtures",
+        "",
+        "| effects | strengths | buys | found | recovered | unexplained |",
+        "|---|---|---|---|---|---|",
+    ]
+    text += [_detail(line, ", ".join(line["labels"])) for line in mixed]
+    text += ["", "## Confusion (strong and weak single effects)", "", *_confusion(single)]
+    for seed, path in again.items():
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        text += ["", f"## Again: {len(lines)} campaigns on seed {seed}", ""]
+        text += [
+            "Traced after the above by the same configuration; nothing was changed for them.",
+            "",
+            *_summary(lines),
+        ]
+        text += ["", "Not as it should be there:", "", "| there | strengths | buys | found | recovered | unexplained |"]
+        text += ["|---|---|---|---|---|---|", *(_detail(x, x["name"]) for x in lines if not _right(x))]
+    return "\n".join([*text, ""])
+
+
+def _sorts(lines: list[dict]) -> tuple[list[dict], list[dict], list[dict], list[dict]]:
+    """Campaigns of clean drones, of what the catalogue lacks, of one effect and of more."""
+    outside = [line for line in lines if "outside" in line["labels"]]
+    single = [line for line in lines if len(line["labels"]) == 1 and line not in outside]
+    return [x for x in lines if not x["labels"]], outside, single, [x for x in lines if len(x["labels"]) > 1]
+
+
+def _right(line: dict) -> bool:
+    """Whether all that was there was found, and nothing else."""
+    outside = line["labels"] == ["outside"]
+    names = {item["name"] for item in line["found"]}
+    return names == (set() if outside else set(line["labels"])) and (line["unexplained"] is not None) == outside
+
+
+def _summary(lines: list[dict]) -> list[str]:
+    """How often the search was right, kind by kind."""
+    clean, outside, single, mixed = _sorts(lines)
+    text = [
         "| kind | campaigns | strongest right | every effect found | wrong names | recovered, mean | median | least |",
         "|---|---|---|---|---|---|---|---|",
     ]
@@ -138,31 +190,15 @@ def page(results: Path, planned: int) -> str:
     wrong = sum(bool(line["found"]) or line["unexplained"] is not None for line in clean)
     flagged = sum(line["unexplained"] is not None for line in outside)
     false_flags = sum(line["unexplained"] is not None for line in single + mixed)
-    text += [
+    return [
+        *text,
         "",
         f"**Clean drones**: {wrong} of {len(clean)} campaigns reported anything.",
         f"**Outside the catalogue**: {flagged} of {len(outside)} flagged as unexplained; {false_flags} of "
         f"{len(single + mixed)} campaigns with effects of the catalogue were flagged too.",
         f"**Time**: median {np.median([x['seconds'] for x in lines]):.0f} s a campaign, longest "
         f"{max(x['seconds'] for x in lines):.0f} s.",
-        "",
-        "## What was found for what was there (single effects)",
-        "",
-        "| effect | strength | buys | found | recovered | unexplained |",
-        "|---|---|---|---|---|---|",
     ]
-    for line in sorted(single + outside, key=lambda x: (x["labels"][0], -x["strengths"][0], x["name"])):
-        text.append(_detail(line, line["labels"][0] if line not in outside else line["name"]))
-    text += [
-        "",
-        "## Mixtures",
-        "",
-        "| effects | strengths | buys | found | recovered | unexplained |",
-        "|---|---|---|---|---|---|",
-    ]
-    text += [_detail(line, ", ".join(line["labels"])) for line in mixed]
-    text += ["", "## Confusion (strong and weak single effects)", "", *_confusion(single), ""]
-    return "\n".join(text)
 
 
 def _hard(line: dict) -> bool:
@@ -212,10 +248,10 @@ def _confusion(single: list[dict]) -> list[str]:
 def main() -> None:
     """Run what is missing, then write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--null", type=int, default=100)
+    parser.add_argument("--null", type=int, default=NULLS)
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--only", default="", help="campaigns whose name contains this")
-    parser.add_argument("--results", type=Path, default=ROOT / "benchmarks" / "tracing.jsonl")
+    parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--page-only", action="store_true")
     parser.add_argument("--from-end", action="store_true", help="begin at the other end: two processes share a sweep")
     arguments = parser.parse_args()
@@ -223,7 +259,10 @@ def main() -> None:
     planned = cases(arguments.null, arguments.seed)
     if not arguments.page_only:
         run([case for case in planned if arguments.only in case.name], arguments.results, arguments.from_end)
-    write_text(ROOT / "docs" / "tracing.md", page(arguments.results, len(planned)))
+    if arguments.results.resolve() != RESULTS:
+        planned = cases(NULLS, SEED)
+    again = {path.stem.removeprefix("tracing-"): path for path in sorted(RESULTS.parent.glob("tracing-*.jsonl"))}
+    write_text(ROOT / "docs" / "tracing.md", page(RESULTS, len(planned), again))
 
 
 if __name__ == "__main__":
