@@ -142,7 +142,8 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
         lines = [json.loads(line) for line in path.read_text().splitlines()]
         text += ["", f"## Again: {len(lines)} campaigns on seed {seed}", ""]
         text += [
-            "Traced after the above by the same configuration; nothing was changed for them.",
+            "Traced after the above by the same configuration. What is not as it should be there may have led to",
+            "changes since (CHANGELOG.md); it is not traced anew, for a change is not judged by what it was made for.",
             "",
             *_summary(lines),
         ]

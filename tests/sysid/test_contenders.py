@@ -52,6 +52,13 @@ def test_of_those_that_gain_nearly_the_same_the_better_predictor_comes_first(con
     assert contest(delay=(100, 1, 2600.0, 0.95, True), lag=(98, 1, 2000.0, 0.85, True))[0] == ["delay", "lag"]
 
 
+def test_where_all_explain_less_than_what_is_there_the_search_goes_on(contest):
+    made = {"delay": (100, 1, -20.0, 1.0, True), "lag": (98, 1, -50.0, 1.1, True)}
+    assert contest(**made)[0] == ["delay", "lag"]
+    diverged = {"delay": (100, 1, 20.0, np.inf, True), "lag": (98, 1, 19.0, np.inf, True)}
+    assert contest(**diverged)[0][0] == "delay"
+
+
 def test_of_those_that_predict_alike_too_the_one_with_fewer_numbers_comes_first(contest):
     assert contest(gains=(100, 4, 1000.0, 0.8, True), level=(98, 1, 990.0, 0.8, True))[0] == ["level", "gains"]
 

@@ -39,6 +39,7 @@ CASES = [
     Case("stretched", 9004, (("sensor_velocity_scale", 1.0),)),
     Case("filtered", 9005, (("sensor_gyro_lowpass", 1.0),)),
     Case("periodic", 9006, (("outside_periodic", 1.0),)),
+    Case("limited", 98012, (("esc_rate_limit", 1.0),)),
 ]
 
 
@@ -242,6 +243,19 @@ def test_named_effects_are_fitted_to_innovations(campaigns, base):
     assert found.faults.healthy
     with pytest.raises(CfbError, match="warp"):
         fit_given(campaign.fit, base.parameters(), ("warp",))
+
+
+@pytest.mark.parametrize("guess", [0.1, 0.15, 0.2])
+def test_a_limit_is_not_taken_for_half_of_it_and_another(campaigns, base, guess):
+    """Of a limit on commands; from there a search goes on that only saw slopes at zero."""
+    campaign = campaigns["limited"]
+    flights = campaign.fit[:3]
+    search = Search.start(flights, base.parameters(), 0.008, check_sensors(flights, 0.008))
+    nothing = search.learned(search.nothing())
+    fitted = search.settled(nothing.having(CATALOGUE["esc_rate_limit"](slowness=guess)))
+    limit = fitted.effect("esc_rate_limit")
+    assert float(limit.slowness) * campaign.truth["effects"]["esc_rate_limit"]["esc_rate"] == pytest.approx(1, abs=0.1)
+    assert float(limit.rotor) < 0.05
 
 
 def test_what_no_search_looks_for_takes_part_where_it_is_named_or_declared(campaigns, base):

@@ -73,6 +73,11 @@ def shapes(effect: Effect) -> list[Column]:
     return columns_of(kind.name, tuple(f for f in kind.prior if f in moving), {})
 
 
+def coarse(name: str) -> bool:
+    """Whether an effect's slope at zero says little of its strength."""
+    return any(effect == name for effect, _ in _COARSE)
+
+
 def step_of(column: Column, present: bool) -> float:
     """Step of the finite difference by which a column is found."""
     share = 0.02 if present else _COARSE.get((column.effect, column.probe), 0.05)

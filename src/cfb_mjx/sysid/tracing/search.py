@@ -34,6 +34,8 @@ from cfb_mjx.sysid.tracing.whitening import FIRST, Blocks, Signals, fit_levels, 
 
 STILL = 0.3
 """Steps below this share of a standard deviation end a fit."""
+GUESSED = 2
+"""Steps of a fit in which strengths that slopes at zero say little of come near, before their shapes are free."""
 SAME_LEVELS = 0.5
 """Noise levels that change by less (their logarithms) do not make it worth while to fit again."""
 LEAD_RANGE, LEAD_USUAL, LEAD_SPREAD = (0.0, 0.5), 0.25, 0.1
@@ -228,14 +230,15 @@ class Search:
         """Columns of every effect and probe."""
         return [[cols.shift_column()]] + [variant for name in self.names for variant in cols.strengths(name)]
 
-    def own_columns(self, hypothesis: Hypothesis) -> list[Column]:
-        """Columns of what is there: strengths and shapes."""
+    def own_columns(self, hypothesis: Hypothesis, guessed: bool = False) -> list[Column]:
+        """Columns of what is there: strengths and shapes, but no shapes where the strength may be a mere guess."""
         found = []
         for name in hypothesis.present:
             if name == cols.SHIFT:
                 found.append(cols.shift_column())
                 continue
-            found += cols.strengths(name)[0] + cols.shapes(hypothesis.effect(name))
+            found += cols.strengths(name)[0]
+            found += [] if guessed and cols.coarse(name) else cols.shapes(hypothesis.effect(name))
         return [replace(c, probe=()) for c in found] + list(hypothesis.terms)
 
     def whole(self, hypothesis: Hypothesis) -> Linear:
@@ -251,7 +254,8 @@ class Search:
     def settled(self, hypothesis: Hypothesis, rounds: int = 5, lead_free: bool = True) -> Hypothesis:
         """Fit everything that is there together, the lead of the commands too unless it is to stay."""
         for attempt in range(rounds - 1):
-            own = self.own_columns(hypothesis)
+            # With half a limit's strength another shape of it seems to be what is missing.
+            own = self.own_columns(hypothesis, guessed=attempt < GUESSED)
             linear = self.linearise(hypothesis, own)
             index = [1, *linear.index(own)]
             lead = linear.scale[1]
@@ -263,7 +267,7 @@ class Search:
                 fixed = 0, (kept - hypothesis.lead) / lead, 1e9
                 values = solve(linear.blocks.sum(0), index, linear.scale, fixed)
             deviation = np.sqrt(np.diag(covariance(linear.blocks, index, linear.scale, values, pull[2])))
-            still = np.max(np.abs(values) / deviation) < STILL
+            still = np.max(np.abs(values) / deviation) < STILL and own == self.own_columns(hypothesis)
             if attempt and still:
                 break
             hypothesis = self.moved(hypothesis, own, values * linear.scale[index])

@@ -197,10 +197,12 @@ def contenders(
         return [(name, fits[name])], stretched
     numbers = {variant[0].effect: len(variant) for _, variant in ranking}
     most = max(gains[name] for name in plausible)
-    rivals = [name for name in plausible if gains[name] >= (1 - CLOSE) * most]
+    # All may explain less than what is there, where a fit does not converge.
+    rivals = [name for name in plausible if gains[name] >= most - CLOSE * abs(most)]
     if len(rivals) > 1:
         # Innovations hardly tell a lag from a delay beside the unknown age of commands; half a second of flight does.
         errors = {name: _without_lead(search, fits[name].hypothesis) for name in rivals}
+        # Where all predictions diverge none is the better.
         rivals = [name for name in rivals if errors[name] <= min(errors.values()) + SAME_ERRORS]
     most = max(gains[name] for name in rivals)
     close = [name for name in rivals if gains[name] >= most - PARSIMONY * abs(most)]
@@ -220,7 +222,8 @@ def _without_lead(search: Search, hypothesis: Hypothesis) -> float:
     A delay is longer by what a lead takes back, and a lag that wants no lead would seem to predict better.
     """
     held = search.settled(replace(hypothesis, lead=0.0), lead_free=False)
-    return float(np.log(prediction_errors(search, held)).mean())
+    found = float(np.log(prediction_errors(search, held)).mean())
+    return found if np.isfinite(found) else np.inf
 
 
 def needed(search: Search, less: LeftOut, fit: Fit, nothing: Fit) -> bool:
