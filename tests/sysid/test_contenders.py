@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from cfb_mjx.sysid.tracing import trace as tracing
+from cfb_mjx.sysid.tracing import contenders
 from cfb_mjx.sysid.tracing.evidence import Evidence
 from cfb_mjx.sysid.tracing.fits import ERRORS, Fit
+from cfb_mjx.sysid.tracing.search import Hypothesis
 
 NOTHING = Fit(SimpleNamespace(present=()), None, np.ones(len(ERRORS)), np.ones((1, len(ERRORS))))
 
@@ -29,14 +30,14 @@ def contest(monkeypatch):
             for name, (_, _, _, error, _) in made.items()
         }
         search = SimpleNamespace(with_candidate=lambda hypothesis, variant, found: variant[0].effect)
-        monkeypatch.setattr(tracing, "fitted", lambda search, name, whole: fits[name])
-        monkeypatch.setattr(tracing, "implausible", lambda hypothesis, name: not made[name][4])
+        monkeypatch.setattr(contenders, "fitted", lambda search, name, whole: fits[name])
+        monkeypatch.setattr(contenders, "implausible", lambda hypothesis, name: not made[name][4])
         monkeypatch.setattr(
-            tracing, "confirm", lambda search, poorer, richer: SimpleNamespace(gain=made[richer.name][2])
+            contenders, "confirm", lambda search, poorer, richer: SimpleNamespace(gain=made[richer.name][2])
         )
-        monkeypatch.setattr(tracing, "_without_lead", lambda search, hypothesis: np.log(made[hypothesis.name][3]))
+        monkeypatch.setattr(contenders, "_without_lead", lambda search, hypothesis: np.log(made[hypothesis.name][3]))
         ranking = _ranking({name: (gain, numbers) for name, (gain, numbers, *_) in made.items()})
-        options, stretched = tracing.contenders(search, NOTHING, ranking, lambda _: None)
+        options, stretched = contenders.contenders(search, NOTHING, ranking, lambda _: None)
         return [name for name, _ in options], stretched
 
     return run
@@ -57,6 +58,13 @@ def test_where_all_explain_less_than_what_is_there_the_search_goes_on(contest):
     assert contest(**made)[0] == ["delay", "lag"]
     diverged = {"delay": (100, 1, 20.0, np.inf, True), "lag": (98, 1, 19.0, np.inf, True)}
     assert contest(**diverged)[0][0] == "delay"
+
+
+def test_predictions_that_diverge_are_worse_than_all_others(monkeypatch):
+    search = SimpleNamespace(settled=lambda hypothesis, lead_free: hypothesis)
+    for error, expected in ((np.nan, np.inf), (np.inf, np.inf), (1.0, 0.0)):
+        monkeypatch.setattr(contenders, "prediction_errors", lambda search, held, e=error: np.array([1.0, e]))
+        assert contenders._without_lead(search, Hypothesis(())) == expected
 
 
 def test_of_those_that_predict_alike_too_the_one_with_fewer_numbers_comes_first(contest):
