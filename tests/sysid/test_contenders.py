@@ -8,7 +8,7 @@ import pytest
 from cfb_mjx.sysid.tracing import contenders
 from cfb_mjx.sysid.tracing.evidence import Evidence
 from cfb_mjx.sysid.tracing.fits import ERRORS, Fit
-from cfb_mjx.sysid.tracing.search import Hypothesis
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 
 NOTHING = Fit(SimpleNamespace(present=()), None, np.ones(len(ERRORS)), np.ones((1, len(ERRORS))))
 

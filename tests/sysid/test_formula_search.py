@@ -10,7 +10,7 @@ import pytest
 
 from cfb_mjx.sysid.tracing import formula
 from cfb_mjx.sysid.tracing.columns import neutral_effects, term_columns
-from cfb_mjx.sysid.tracing.search import Hypothesis
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 from cfb_mjx.sysid.tracing.terms import Selection
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from cfb_mjx.model.effects.formula import PLACES
 from cfb_mjx.sysid.tracing.columns import LEAD, Column, term_columns
-from cfb_mjx.sysid.tracing.search import Linear
+from cfb_mjx.sysid.tracing.hypothesis import Linear
 from cfb_mjx.sysid.tracing.terms import select
 
 BLOCKS, ROWS, AXIS = 60, 200, 3

@@ -11,7 +11,7 @@ from cfb_mjx.sysid.tracing import rare
 from cfb_mjx.sysid.tracing.columns import neutral_effects, strengths
 from cfb_mjx.sysid.tracing.evidence import Evidence
 from cfb_mjx.sysid.tracing.fits import Fit
-from cfb_mjx.sysid.tracing.search import Hypothesis
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 from cfb_mjx.sysid.tracing.trace import Found, Trace
 
 NAMES = ("rotor_drag", "torque_scale", "gyroscopic")

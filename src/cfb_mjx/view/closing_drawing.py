@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
 from cfb_mjx.sysid.tracing.residuals import aligned, residual_rows
-from cfb_mjx.sysid.tracing.search import Hypothesis
 from cfb_mjx.sysid.tracing.spectra import sensor_spectra, spectra
 from cfb_mjx.sysid.tracing.structure import BINS, Pooled, explained, pool
 from cfb_mjx.view.closing_figures import Panel, binned_figure, errors_figure, matrix_figure, spectra_figure

@@ -8,7 +8,7 @@ from cfb_mjx.model.effects import KNOWN
 from cfb_mjx.sysid.tracing.columns import SHIFT
 from cfb_mjx.sysid.tracing.evidence import Evidence
 from cfb_mjx.sysid.tracing.fits import Fit
-from cfb_mjx.sysid.tracing.search import Hypothesis
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 
 ALPHA = 1e-2
 """An effect's p-value, times the number of effects tried, must be below this."""

@@ -16,7 +16,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_json
 from cfb_mjx.model.effects import effect_from_mapping, effect_to_mapping
 from cfb_mjx.parameters import ModelFile
-from cfb_mjx.sysid.tracing.search import Hypothesis
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 
 
 @dataclass

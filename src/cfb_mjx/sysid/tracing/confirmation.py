@@ -10,7 +10,8 @@ import numpy as np
 from scipy.stats import norm
 
 from cfb_mjx.sysid.flight import Flight, prepare_flight
-from cfb_mjx.sysid.tracing.search import Hypothesis, Search
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.whitening import Blocks, Signals, innovations, levels_from
 
 

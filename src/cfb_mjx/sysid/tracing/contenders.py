@@ -12,7 +12,8 @@ from cfb_mjx.sysid.tracing.columns import SHIFT, Column
 from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.evidence import Evidence
 from cfb_mjx.sysid.tracing.fits import Fit, fitted, prediction_errors
-from cfb_mjx.sysid.tracing.search import Hypothesis, Search
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.search import Search
 
 CONTENDERS, CONTENDER = 3, 0.5
 """So many effects of a ranking are fitted, if they gain this share of the first."""

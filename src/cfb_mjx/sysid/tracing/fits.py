@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
-from cfb_mjx.sysid.tracing.search import Hypothesis, Linear, Search
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, Linear
+from cfb_mjx.sysid.tracing.search import Search
 
 ERRORS = tuple(
     f"{q}@{h}s"

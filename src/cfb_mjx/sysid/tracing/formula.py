@@ -13,7 +13,8 @@ from cfb_mjx.sysid.tracing.columns import FORMULA, Column, term_columns
 from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.evidence import covariance, solve
 from cfb_mjx.sysid.tracing.fits import prediction_errors
-from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Search
+from cfb_mjx.sysid.tracing.hypothesis import LEAD_SPREAD, Hypothesis
+from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.terms import Selection, select, with_library
 from cfb_mjx.sysid.tracing.trace import Trace
 

@@ -19,10 +19,11 @@ from cfb_mjx.sysid.tracing.columns import FORMULA
 from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
 from cfb_mjx.sysid.tracing.fits import prediction_errors
 from cfb_mjx.sysid.tracing.formula import SURE, Proposal, Term, explain, only_there
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 from cfb_mjx.sysid.tracing.lines import Line, find_lines
 from cfb_mjx.sysid.tracing.rare import with_rare
 from cfb_mjx.sysid.tracing.residuals import residual_rows
-from cfb_mjx.sysid.tracing.search import Hypothesis, Search
+from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.trace import Found, Trace, numbers_of, trace
 

@@ -18,7 +18,8 @@ from cfb_mjx.logs.rotation import to_body
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.sysid.flight import Flight, delay_of, prepare_flight
 from cfb_mjx.sysid.tracing.gram import driven_by, residual_blocks
-from cfb_mjx.sysid.tracing.search import Hypothesis, Search
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.whitening import Blocks
 
 WIDTH = 0.02

@@ -13,7 +13,6 @@ from jaxtyping import Array
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import CATALOGUE, KNOWN, Effect
-from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.sensor_faults import SensorFaults
@@ -28,9 +27,10 @@ from cfb_mjx.sysid.tracing.gram import (
     term_squares,
     with_slopes,
 )
+from cfb_mjx.sysid.tracing.hypothesis import LEAD_RANGE, LEAD_SPREAD, LEAD_USUAL, Hypothesis, Linear
 from cfb_mjx.sysid.tracing.noise import sensor_noise
 from cfb_mjx.sysid.tracing.sensors import SensorCheck
-from cfb_mjx.sysid.tracing.whitening import FIRST, Blocks, Signals, fit_levels, levels_from
+from cfb_mjx.sysid.tracing.whitening import Blocks, Signals, fit_levels, levels_from
 
 STILL = 0.3
 """Steps below this share of a standard deviation end a fit."""
@@ -38,9 +38,6 @@ GUESSED = 2
 """Steps of a fit in which strengths that slopes at zero say little of come near, before their shapes are free."""
 SAME_LEVELS = 0.5
 """Noise levels that change by less (their logarithms) do not make it worth while to fit again."""
-LEAD_RANGE, LEAD_USUAL, LEAD_SPREAD = (0.0, 0.5), 0.25, 0.1
-"""Share of the next command in the mean over an interval: a quarter if every second command is logged, half at most.
-Beyond this a lead would be a time shift, so what is known of it beforehand has to decide between the two."""
 FILTERED_GYRO = 0.1
 """Level given to a low-pass filtered gyro, rad/s: only what it shows slowly is believed."""
 LEAST_RELATIVE = -0.8
@@ -48,72 +45,6 @@ SAMPLE = 32
 """Blocks from which noise levels are learned: about a minute, many times longer than what wanders."""
 PAD = 16
 """Columns are padded to a multiple of this with copies of the lead, so that one compiled program serves all rounds."""
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """A model: which effects are there, and the values of all."""
-
-    effects: tuple[Effect, ...]
-    present: tuple[str, ...] = ()
-    lead: float = LEAD_USUAL
-    shift: float = 0.0
-    """How late the motor columns are, s."""
-    terms: tuple[Column, ...] = ()
-    """Of a formula, where the catalogue has failed."""
-    origin: tuple[Effect, ...] = ()
-    """The effects of the declared model: what an absent effect goes back to."""
-    levels: np.ndarray = field(default_factory=lambda: FIRST, compare=False)
-    """Noise levels that fit what this hypothesis leaves (the vector of `whitening.levels_from`)."""
-
-    def effect(self, name: str) -> Effect:
-        """The effect of that name."""
-        return next(e for e in self.effects if type(e).name == name)
-
-    def model(self, parameters: Parameters) -> Quadrotor:
-        """The drone of this hypothesis, with every effect of the catalogue (most of them neutral)."""
-        return Quadrotor(parameters, self.effects)
-
-    @property
-    def faults(self) -> SensorFaults:
-        """What is wrong with the recording beyond what the sensors say of each other."""
-        return SensorFaults(motor_shift=self.shift)
-
-    def having(self, effect: Effect) -> Hypothesis:
-        """The same with an effect that was absent."""
-        name = type(effect).name
-        effects = tuple(effect if type(e).name == name else e for e in self.effects)
-        return replace(self, effects=effects, present=(*self.present, name))
-
-    def without(self, name: str) -> Hypothesis:
-        """The same with one effect back at neutral."""
-        pairs = zip(self.effects, self.origin, strict=True)
-        effects = tuple(declared if type(e).name == name else e for e, declared in pairs)
-        shift = 0.0 if name == cols.SHIFT else self.shift
-        return replace(self, effects=effects, present=tuple(p for p in self.present if p != name), shift=shift)
-
-
-@dataclass
-class Linear:
-    """A residual and its derivatives at a hypothesis, as inner products.
-
-    Attributes:
-        columns: one fewer than c: the residual itself comes first. Of columns that occur twice the first counts.
-        blocks: (b, c, c).
-        scale: (c,) unit of each.
-    """
-
-    columns: list[Column]
-    blocks: np.ndarray
-    scale: np.ndarray = field(init=False)
-
-    def __post_init__(self):
-        self.scale = np.array([1.0] + [c.scale for c in self.columns])
-
-    def index(self, wanted: list[Column]) -> list[int]:
-        """Positions of columns in the inner products."""
-        where = {c: i + 1 for i, c in reversed(list(enumerate(self.columns)))}
-        return [where[c] for c in wanted]
 
 
 @dataclass
@@ -238,7 +169,8 @@ class Search:
                 found.append(cols.shift_column())
                 continue
             found += cols.strengths(name)[0]
-            found += [] if guessed and cols.coarse(name) else cols.shapes(hypothesis.effect(name))
+            if not (guessed and cols.coarse(name)):
+                found += cols.shapes(hypothesis.effect(name))
         return [replace(c, probe=()) for c in found] + list(hypothesis.terms)
 
     def whole(self, hypothesis: Hypothesis) -> Linear:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 from cfb_mjx.model.effects.formula import PLACES, TERMS, ResidualFormula
 from cfb_mjx.sysid.tracing.columns import FORMULA, Column, term_columns
 from cfb_mjx.sysid.tracing.evidence import Evidence, evidence
-from cfb_mjx.sysid.tracing.search import Hypothesis, Linear, Search
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, Linear
+from cfb_mjx.sysid.tracing.search import Search
 
 PER_AXIS = 3
 """Terms or families along one axis at most."""

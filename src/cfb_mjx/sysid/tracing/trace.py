@@ -18,7 +18,8 @@ from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.contenders import CLOSE, contenders
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
 from cfb_mjx.sysid.tracing.fits import ERRORS, Fit, completed, fitted
-from cfb_mjx.sysid.tracing.search import LEAD_SPREAD, Hypothesis, Linear, Search
+from cfb_mjx.sysid.tracing.hypothesis import LEAD_SPREAD, Hypothesis, Linear
+from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
 
 RIVALS, AS_GOOD = 3, 0.03
