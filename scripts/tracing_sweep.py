@@ -1,6 +1,7 @@
 """Trace labelled plants nobody tuned to, and write docs/tracing.md: confusion, false positives, recovered improvement.
 
     python scripts/tracing_sweep.py [--null 100] [--results benchmarks/tracing.jsonl] [--page-only] [--from-end]
+    python scripts/tracing_sweep.py --only esc_rate_limit --again
     python scripts/tracing_sweep.py --null 10 --seed 98000 --results benchmarks/tracing-98000.jsonl
 
 The plants (cfb_mjx.labelled_plants) are an independent simulator with effects of other functional forms than the
@@ -30,8 +31,8 @@ NULLS = 100
 BATCH = 8
 
 
-def run(wanted: list[Case], results: Path, from_end: bool) -> None:
-    """Fly, trace and append one line per campaign."""
+def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
+    """Fly, trace and append one line per campaign; those traced before too if ``again``."""
     import jax
 
     from cfb_mjx.sysid.evaluation import evaluate
@@ -40,7 +41,7 @@ def run(wanted: list[Case], results: Path, from_end: bool) -> None:
     base = load_model_file("cfb-guards")
     while True:
         # Read anew: another process may be at the other end.
-        done = traced(results)
+        done = traced(results, again)
         rest = [case for case in wanted if case.name not in done]
         batch = rest[-BATCH:] if from_end else rest[:BATCH]
         if not batch:
@@ -52,7 +53,7 @@ def run(wanted: list[Case], results: Path, from_end: bool) -> None:
         # Programs of every shape met would pile up until the process may map no more memory; they are kept on disk.
         jax.clear_caches()
         for campaign in flown[: len(batch)]:
-            if campaign.case.name in traced(results):
+            if campaign.case.name in traced(results, again):
                 continue
             began = time.perf_counter()
             outcome = close_loop(campaign.fit, campaign.held_out, base)
@@ -66,13 +67,14 @@ def run(wanted: list[Case], results: Path, from_end: bool) -> None:
                 "before": _pick(outcome.before.metrics("commands_in")),
                 "after": _pick(outcome.after.metrics("commands_in")),
                 "seconds": seconds,
+                "again": again,
             }
             if campaign.case.name in perfect:
                 from cfb_mjx.model import Quadrotor
 
                 twin = evaluate(Quadrotor.from_file(base), perfect[campaign.case.name].held_out)
                 line["perfect"] = _pick(twin.metrics("commands_in"))
-            if campaign.case.name in traced(results):  # by the other process, meanwhile
+            if campaign.case.name in traced(results, again):  # by the other process, meanwhile
                 continue
             with results.open("a") as file:
                 file.write(json.dumps(line, default=float) + "\n")
@@ -80,9 +82,15 @@ def run(wanted: list[Case], results: Path, from_end: bool) -> None:
             print(f"{campaign.case.name}: {names} unexplained={bool(outcome.unexplained)} {seconds:.0f} s", flush=True)
 
 
-def traced(results: Path) -> set[str]:
-    """Names of the campaigns that are done."""
-    return {json.loads(line)["name"] for line in results.read_text().splitlines()} if results.exists() else set()
+def traced(results: Path, again: bool) -> set[str]:
+    """Names of the campaigns that are done, or done ``again``."""
+    return {line["name"] for line in read(results) if line.get("again") or not again}
+
+
+def read(results: Path) -> list[dict]:
+    """One entry per campaign that is done, the last where it was traced again."""
+    lines = [json.loads(line) for line in results.read_text().splitlines()] if results.exists() else []
+    return list({line["name"]: line for line in lines}.values())
 
 
 def _pick(metrics: dict) -> dict:
@@ -101,7 +109,7 @@ def recovered(line: dict) -> float:
 
 def page(results: Path, planned: int, again: dict[str, Path]) -> str:
     """The page, from the results of so many planned campaigns, and those of other seeds."""
-    lines = [json.loads(line) for line in results.read_text().splitlines()]
+    lines = read(results)
     _, outside, single, mixed = _sorts(lines)
     text = [
         "# Tracing labelled plants",
@@ -113,6 +121,7 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
         if len(lines) == planned
         else f"{len(lines)} of {planned} campaigns of the sweep have been traced so far, in an order of no meaning; "
         "the command goes on with the rest.",
+        *_traced_again(lines),
         "",
         "Campaigns of 10 to 11 flights by an independent simulator (`cfb_mjx.labelled_plants`, NumPy, closed loop)",
         "whose effects have other functional forms than the catalogue's. The search was developed on other seeds.",
@@ -139,7 +148,7 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
     text += [_detail(line, ", ".join(line["labels"])) for line in mixed]
     text += ["", "## Confusion (strong and weak single effects)", "", *_confusion(single)]
     for seed, path in again.items():
-        lines = [json.loads(line) for line in path.read_text().splitlines()]
+        lines = read(path)
         text += ["", f"## Again: {len(lines)} campaigns on seed {seed}", ""]
         text += [
             "Traced after the above by the same configuration. What is not as it should be there may have led to",
@@ -150,6 +159,11 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
         text += ["", "Not as it should be there:", "", "| there | strengths | buys | found | recovered | unexplained |"]
         text += ["|---|---|---|---|---|---|", *(_detail(x, x["name"]) for x in lines if not _right(x))]
     return "\n".join([*text, ""])
+
+
+def _traced_again(lines: list[dict]) -> list[str]:
+    names = sorted(line["name"] for line in lines if line.get("again"))
+    return [f"Once more after a change of the search (CHANGELOG.md): {', '.join(names)}."] if names else []
 
 
 def _sorts(lines: list[dict]) -> tuple[list[dict], list[dict], list[dict], list[dict]]:
@@ -253,13 +267,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--only", default="", help="campaigns whose name contains this")
     parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--again", action="store_true", help="after a change: also those that are done, once more")
     parser.add_argument("--page-only", action="store_true")
     parser.add_argument("--from-end", action="store_true", help="begin at the other end: two processes share a sweep")
     arguments = parser.parse_args()
     configure_jax(x64=True)
     planned = cases(arguments.null, arguments.seed)
     if not arguments.page_only:
-        run([case for case in planned if arguments.only in case.name], arguments.results, arguments.from_end)
+        wanted = [case for case in planned if arguments.only in case.name]
+        run(wanted, arguments.results, arguments.from_end, arguments.again)
     if arguments.results.resolve() != RESULTS:
         planned = cases(NULLS, SEED)
     again = {path.stem.removeprefix("tracing-"): path for path in sorted(RESULTS.parent.glob("tracing-*.jsonl"))}
