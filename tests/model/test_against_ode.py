@@ -49,7 +49,14 @@ def _fly_in_steps(models, state, commands, dt, hold):
 # Measured orders. Constant mean loads in a step leave the correlation of thrust with attitude, hence 2 with "mean".
 @pytest.mark.parametrize(
     ("integrator", "rotor_loads", "order"),
-    [("euler", "instant", 1), ("euler", "mean", 1), ("rk4", "instant", 4), ("rk4", "mean", 2)],
+    [
+        ("leapfrog", "instant", 2),
+        ("leapfrog", "mean", 2),
+        ("euler", "instant", 1),
+        ("euler", "mean", 1),
+        ("rk4", "instant", 4),
+        ("rk4", "mean", 2),
+    ],
 )
 def test_error_falls_at_the_integrators_order(integrator, rotor_loads, order, coarse, coarse_truth, fleet):
     y, commands = coarse

@@ -99,10 +99,10 @@ class _Problem:
 @pytest.mark.parametrize(
     ("body", "integrator", "rotor_loads"),
     [
-        (RigidBody(), "euler", "mean"),
+        (RigidBody(), "leapfrog", "mean"),
         (RigidBody(), "rk4", "instant"),
         # With XLA's multi-output fusion, which the suite runs with, jaxlib aborts while it compiles these.
-        pytest.param(MjxBody(floor=False), "euler", "mean", marks=pytest.mark.long),
+        pytest.param(MjxBody(floor=False), "leapfrog", "mean", marks=pytest.mark.long),
         pytest.param(MjxBody(floor=False), "rk4", "instant", marks=pytest.mark.long),
     ],
     ids=lambda value: repr(value) if not isinstance(value, str) else value,
@@ -133,7 +133,7 @@ def test_gradients(body, integrator, rotor_loads, guards):
 
 
 def test_gradients_of_the_mjx_body_in_a_process_of_its_own():
-    chosen = ["-m", "long", "-k", "MjxBody and euler", "-p", "no:cacheprovider", __file__]
+    chosen = ["-m", "long", "-k", "MjxBody and leapfrog", "-p", "no:cacheprovider", __file__]
     plain = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"} | {"PLAIN_XLA": "1"}
     command = [sys.executable, "-m", "pytest", *chosen]
     done = subprocess.run(command, env=plain, capture_output=True, text=True, check=False)

@@ -181,7 +181,7 @@ def test_precision_follows_the_setting(x64, body):
     dtype = jnp.float64 if x64 else jnp.float32
     choices = {} if body == "rigid" else {"body": MjxBody(floor=body == "mjx floor")}
     with jax.enable_x64(x64):
-        for integrator in ("euler", "rk4") if body == "rigid" else ("euler",):
+        for integrator in ("leapfrog", "euler", "rk4") if body == "rigid" else ("leapfrog",):
             model = Quadrotor.from_file("cf21b-500", integrator=integrator, **choices)
             state, commands = model.hover_state(), jnp.full((4, 4), 0.5)
             line = DelayLine.filled(state, 0.004, 0.008)

@@ -138,7 +138,7 @@ def test_measured_steps_keep_the_quaternion_unit_and_end_at_the_measurement(end,
     assert np.linalg.norm(helpers.part(after, "quaternion")) == pytest.approx(1.0, abs=1e-12)
 
 
-@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+@pytest.mark.parametrize("integrator", ["leapfrog", "euler", "rk4"])
 def test_quaternions_stay_unit_in_aggressive_flight(integrator, fleet, fly_fleet):
     y, commands = helpers.aggressive_manoeuvre(2.0, seed=9)
     flown = helpers.pack(fly_fleet(Quadrotor(fleet, integrator=integrator), helpers.state_of(y), jnp.asarray(commands)))

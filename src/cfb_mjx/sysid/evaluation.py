@@ -89,6 +89,7 @@ def evaluate(
     observer: Observer | None = None,
     faults: SensorFaults = HEALTHY,
     over: Devices | None = None,
+    keep_diverged: bool = False,
 ) -> Evaluation:
     """Predict every window of every log, open loop, and compare with what was measured.
 
@@ -101,14 +102,18 @@ def evaluate(
     recorded, and its predictions are compared with what this one records. The windows of every log are divided ``over``
     devices; the replay of the log before them is not, which is one walk along its rows.
 
+    With ``keep_diverged`` errors are NaN where the model diverged, for a search that passes such a model over.
+
     Raises:
-        CfbError: two logs of one name, or no log allows a window.
+        CfbError: two logs of one name, no log allows a window, or a prediction that is no number.
     """
     require_own_names(logs)
     precise = Quadrotor(model.parameters, model.effects, body=model.body, integrator="rk4", rotor_loads="instant")
     results = []
     for index, log in enumerate(logs):
         results.append(_evaluate_log(precise, log, horizons, observer, faults, over))
+        if not keep_diverged:
+            _refuse_diverged(results[-1])
         if progress is not None:
             progress(index + 1, len(logs))
     if not any(len(result.windows) for result in results):
@@ -116,6 +121,17 @@ def evaluate(
         raise CfbError(f"{names}: no prediction window fits; a log must fly at least 1.2 s without a gap in its data.")
     variants = VARIANTS if observer is None else VARIANTS + OBSERVED
     return Evaluation(tuple(results), tuple(horizons), variants)
+
+
+def _refuse_diverged(result: LogEvaluation) -> None:
+    for variant, errors in result.errors.items():
+        lost = [] if errors is None else ~np.isfinite(list(errors.values())).all(axis=(0, 2))
+        if np.any(lost):
+            of = result.windows.start[result.measured] if variant.startswith("rotor") else result.windows.start
+            raise CfbError(
+                f"{result.log.name}: the model diverges: {np.sum(lost)} of {len(lost)} predictions ({variant}) are no "
+                f"numbers, the first from {of[lost][0]:.2f} s on; check its parameters and effects."
+            )
 
 
 def _evaluate_log(

@@ -66,7 +66,7 @@ def score(
         raise CfbError("Tuning an observer needs flights.")
     logs = []
     for flights in groups.values():
-        found = evaluate(model, flights, horizons=(HORIZON,), observer=observer, faults=faults)
+        found = evaluate(model, flights, horizons=(HORIZON,), observer=observer, faults=faults, keep_diverged=True)
         for metrics in filter(None, map(found.metrics, OBSERVED)):
             logs += [metrics[f"{q}@{HORIZON:g}s"] for q in ("attitude_mean_deg", "velocity_mean_mps")]
     return float(np.mean(np.log(logs)))

@@ -20,7 +20,7 @@ ERRORS = tuple(
 
 def predicted(search: Search, hypothesis: Hypothesis) -> Evaluation:
     """The flights of the search, predicted."""
-    return evaluate(hypothesis.model(search.parameters), search.logs, faults=hypothesis.faults)
+    return evaluate(hypothesis.model(search.parameters), search.logs, faults=hypothesis.faults, keep_diverged=True)
 
 
 def errors_of(evaluation: Evaluation) -> np.ndarray:
