@@ -3,8 +3,10 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from cfb_mjx.cli.flying import summary
 from cfb_mjx.parameters import load_model_file, save_model_file
 
 pytestmark = pytest.mark.xdist_group("training")
@@ -167,3 +169,19 @@ def test_training_on_a_predictor_must_be_insisted_on(cfb, tmp_path):
     assert "predictor" in done.stderr
     assert "--force" in done.stderr
     assert [p.name for p in tmp_path.iterdir()] == ["p.yaml"]
+
+
+def test_a_drone_that_diverged_failed_and_is_in_no_mean():
+    measured = {
+        "mean_distance_m": np.array([0.01, np.nan, 0.03]),
+        "command_std": np.array([0.1, np.nan, 0.3]),
+        "failed": np.array([False, False, False]),
+    }
+    found = summary("hover", measured, diverged=np.array([False, True, False]))
+    assert found["mean_distance_mm"] == pytest.approx(20.0)
+    assert found["failed"] is True
+    assert found["diverged"] == 1
+    assert found["success_rate"] == pytest.approx(2 / 3)
+    alone = summary("hover", {k: v[1:2] for k, v in measured.items()}, diverged=np.array([True]))
+    assert alone == {"mean_distance_mm": None, "command_std": None, "failed": True, "diverged": 1}
+    assert "diverged" not in summary("hover", {k: v[:1] for k, v in measured.items()})

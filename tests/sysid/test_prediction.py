@@ -1,5 +1,7 @@
 """Predictions against SciPy, exact data predicted exactly, and the metrics against hand calculations."""
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -123,6 +125,14 @@ def test_two_logs_of_one_name_and_no_window_are_refused(exact_log):
         evaluate(model, [exact_log, exact_log])
     with pytest.raises(CfbError, match=r"exact.*window"):
         evaluate(model, [exact_log.slice(0.0, 0.9)])
+
+
+def test_a_model_that_diverges_is_refused_by_flight_and_window(exact_log):
+    model = eqx.tree_at(lambda m: m.parameters.mass, Quadrotor.from_file("cfb-guards"), jnp.asarray(1e-200))
+    with pytest.raises(CfbError, match=r"exact: the model diverges: (\d+) of \1 predictions .* from 0\.60 s on"):
+        evaluate(model, [exact_log])
+    kept = evaluate(model, [exact_log], keep_diverged=True).metrics("commands_in")
+    assert not np.isfinite(kept["velocity_rmse_mps@0.5s"])
 
 
 def test_geodesic_angle_matches_scipy_and_ignores_sign():

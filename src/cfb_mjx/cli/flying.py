@@ -128,7 +128,8 @@ def run_fly(
         else:
             measured, flown = test(pilot, course, drone, keys)
         good = None if rotations is None else np.asarray(measured.completed(rotations))
-        return summary(task, {k: np.asarray(v) for k, v in measured._asdict().items()}, good), flown
+        diverged = ~np.isfinite(np.asarray(flown.position)).all(axis=(1, 2))
+        return summary(task, {k: np.asarray(v) for k, v in measured._asdict().items()}, good, diverged), flown
 
     result = {"controller": controller, "task": task, "model": model, "plants": plants, "magnitude": magnitude}
     if rotations is not None:
@@ -160,17 +161,21 @@ def asks_for_setpoints(pilot) -> bool:
     return bool(getattr(getattr(pilot, "layout", None), "setpoint_scales", ()))
 
 
-def summary(task: str, measured: dict, completed=None) -> dict:
+def summary(task: str, measured: dict, completed=None, diverged=None) -> dict:
     """JSON of a test: means over the flights, and over many also quantiles and the rate of success.
+
+    Flights that diverged failed; they are counted, and no mean is taken of them.
 
     Args:
         task: what was flown.
         measured: arrays, one number per flight.
         completed: for flips, who completed them.
+        diverged: whose state is no number at the end; nobody's by default.
     """
     import numpy as np
 
-    failed = measured["failed"]
+    diverged = np.zeros_like(measured["failed"]) if diverged is None else diverged
+    failed = measured["failed"] | diverged
     if task == "hover":
         values = {"mean_distance_mm": 1e3 * measured["mean_distance_m"], "command_std": measured["command_std"]}
         good = ~failed
@@ -179,13 +184,16 @@ def summary(task: str, measured: dict, completed=None) -> dict:
         good = ~failed & np.isfinite(measured["arrival_s"])
     elif task == "recover":
         values = {key: measured[key] for key in ("lost_height_m", "final_distance_m")}
-        good = measured["recovered"]
+        good = measured["recovered"] & ~diverged
     else:
         values = {key: value for key, value in measured.items() if key != "failed"}
-        good = completed
+        good = completed & ~diverged
     # A lost flip's numbers say nothing, and some are infinite.
-    counted = good if completed is not None and good.any() else np.ones_like(good)
-    result = {key: _finite(np.mean(value[counted])) for key, value in values.items()} | {"failed": bool(failed.any())}
+    counted = good if completed is not None and good.any() else ~diverged
+    result = {key: _finite(np.mean(value[counted])) if counted.any() else None for key, value in values.items()}
+    result["failed"] = bool(failed.any())
+    if diverged.any():
+        result["diverged"] = int(diverged.sum())
     if len(failed) > 1:
         result |= {"failure_rate": float(failed.mean()), "success_rate": float(good.mean())}
         result["quantiles"] = {
@@ -216,7 +224,7 @@ def _print(result: dict) -> None:
     print(f"{result['controller']}, {result['task']}: {result['plants']} {drones}, {result['model']}")
     quantiles = result.get("quantiles", {})
     for key, value in result.items():
-        if key in ("controller", "task", "model", "plants", "magnitude", "quantiles", "knobs"):
+        if key in ("controller", "task", "model", "plants", "magnitude", "quantiles", "knobs", "diverged"):
             continue
         shown = value if isinstance(value, bool) else "never" if value is None else f"{value:.4g}"
         spread = quantiles.get(key)
@@ -224,6 +232,12 @@ def _print(result: dict) -> None:
             "" if not spread or spread["0.5"] is None else f"   median {spread['0.5']:.4g}, 95 % {spread['0.95']:.4g}"
         )
         print(f"  {_label(key):<24}{shown}{more}")
+    if "diverged" in result:
+        print(f"  {_diverged(result)}")
+
+
+def _diverged(measured: dict) -> str:
+    return f"{measured['diverged']} diverged: their states are no numbers, they failed and are in no mean"
 
 
 def _print_row(name: str, measured: dict, width: int) -> None:
@@ -235,4 +249,5 @@ def _print_row(name: str, measured: dict, width: int) -> None:
     lost = "   failed" if measured["failed"] and "failure_rate" not in measured else ""
     if measured.get("failure_rate"):
         lost = f"   {measured['failure_rate']:.0%} failed"
+    lost += f"   {_diverged(measured)}" if "diverged" in measured else ""
     print(f"  {name:<{width}}  {'   '.join(shown)}{lost}", flush=True)

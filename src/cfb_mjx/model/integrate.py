@@ -15,8 +15,8 @@ from cfb_mjx.model.vector import Vec, exponential, multiply, renormalise
 
 START, MIDDLE, END = 0, 1, 2
 Accelerations = Callable[..., tuple[Vec, Vec]]
-"""(state, stage, gyroscopic=True) to linear (world) and angular (body) acceleration. ``gyroscopic`` False leaves out what
-the angular velocity of a free body does by itself, -J^-1 (omega x J omega)."""
+"""(state, stage, gyroscopic=True) to linear (world) and angular (body) acceleration. ``gyroscopic`` False leaves out
+what the angular velocity of a free body does by itself, -J^-1 (omega x J omega)."""
 
 
 def leapfrog(accelerations: Accelerations, state: Components, dt, inertia: Vec) -> Components:

@@ -20,7 +20,15 @@ BLOCK = 4
 
 
 def errors(windows: Windows, predicted: State) -> dict[str, np.ndarray]:
-    """Error of each window at each horizon, (W, H): vector norms, attitude as geodesic angle in degrees."""
+    """Error of each window at each horizon, (W, H): vector norms, attitude as geodesic angle in degrees.
+
+    Not finite where the prediction diverged.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _errors(windows, predicted)
+
+
+def _errors(windows: Windows, predicted: State) -> dict[str, np.ndarray]:
     return {
         "position": np.linalg.norm(predicted.position - windows.true_position, axis=-1),
         "velocity": np.linalg.norm(predicted.velocity - windows.true_velocity, axis=-1),
