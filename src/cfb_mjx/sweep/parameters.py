@@ -12,7 +12,7 @@ from typing import Any, Literal
 import yaml
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.sweep.kinds import CHOSEN_HERE, Kind
+from cfb_mjx.sweep.kinds import CHOSEN_HERE, REPEATED, Kind
 
 Shape = Literal["flag", "pairs", "files", "file", "texts", "text"]
 
@@ -81,7 +81,8 @@ class Parameters:
             return [] if value == self.defaults.get(name) else [said]
         if isinstance(value, list | dict) and shape not in ("files", "texts"):
             raise CfbError(f"{where} takes one value, found {value!r}; what varies belongs under 'over' or 'each'.")
-        return [option, *_texts(value, where)]
+        texts = _texts(value, where)
+        return [word for one in texts for word in (option, one)] if name in REPEATED else [option, *texts]
 
     def _changed(self, value: Any) -> str:
         """The right side of NAME=VALUE: trainings take YAML there, models numbers with commas."""
