@@ -14,7 +14,7 @@ import pytest
 
 from cfb_mjx.cli import SUMMARY, main
 from cfb_mjx.cli.commands import COMMANDS
-from cfb_mjx.model.effects import CATALOGUE, KNOWN
+from cfb_mjx.plugins import plugged
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -37,11 +37,8 @@ page_outputs = _script("page_outputs")
 @pytest.fixture
 def _as_before():
     """Pages may register an effect; the other tests must not notice."""
-    known = dict(CATALOGUE), dict(KNOWN)
-    yield
-    for now, before in zip((CATALOGUE, KNOWN), known, strict=True):
-        now.clear()
-        now.update(before)
+    with plugged():
+        yield
 
 
 def _same(found: str, said: str) -> bool:
