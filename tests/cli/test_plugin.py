@@ -98,5 +98,5 @@ def test_a_model_with_it_predicts_flies_and_trains(folder, closed, tmp_path, cap
 def test_without_the_plugin_a_model_with_it_is_refused_by_a_sentence_that_says_how(folder, capsys):
     assert main(["fly", "pid", "--model", str(folder / "mine.yaml")]) == 2
     said = capsys.readouterr().err
-    assert "mine.yaml: unknown effect 'air_drag'" in said
+    assert "mine: unknown effect 'air_drag'" in said
     assert "one of your own needs --plugin FILE.py" in said

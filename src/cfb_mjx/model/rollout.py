@@ -90,7 +90,7 @@ def fits_one_kernel(model: Quadrotor) -> bool:
     given = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if a else x for x, a in zip(leaves, arrays, strict=True))
     try:
         hash((structure, given))
-    except TypeError:  # an effect holds what is no number, and can be no part of a program's name
+    except TypeError:  # an effect holds something that can be no part of a program's name
         return False
     return _fits(structure, given)
 

@@ -134,7 +134,7 @@ SENSOR_FAULTS: dict[str, SensorFault] = {
 """What a model file may name beside physics: it changes what is recorded, not how the drone flies."""
 
 
-def register(kind: type[Effect]) -> type[Effect]:
+def register(kind: Any) -> Any:
     """Make an effect of your own known: to model files, fits, the search, reports and trainings. Also a decorator.
 
     Known until the process ends, or the block of `cfb_mjx.plugins.plugged` around it. A class defined anew, as by a
