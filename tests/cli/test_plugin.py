@@ -16,7 +16,10 @@ from cfb_mjx.logs import write_mcap
 from cfb_mjx.model import CATALOGUE, Quadrotor
 from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.plugins import plugged
+from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.search import Search
+from cfb_mjx.train.config import load_config
+from cfb_mjx.train.run import Training
 from tests.helpers import SMALL_TRAINING
 from tests.own_effect import AIR_DRAG
 from tests.simulated_log import noisy, simulated_log
@@ -100,3 +103,20 @@ def test_without_the_plugin_a_model_with_it_is_refused_by_a_sentence_that_says_h
     said = capsys.readouterr().err
     assert "mine: unknown effect 'air_drag'" in said
     assert "one of your own needs --plugin FILE.py" in said
+
+
+def test_a_search_and_a_training_do_not_go_on_with_another_text_of_the_effect(folder, tmp_path):
+    """Half of it would be computed with one physics and half with another."""
+    plugin, base = tmp_path / "my_effects.py", load_model_file("cfb-guards")
+    plugin.write_text(AIR_DRAG)
+    keys, identities = [Checkpoint.open(tmp_path / "search.json", [], base).key], []
+    for text in (AIR_DRAG, AIR_DRAG, AIR_DRAG.replace("* -self", "* -2.0 * self")):
+        plugin.write_text(text)
+        with plugged(plugin):
+            keys.append(Checkpoint.open(tmp_path / "search.json", [], base).key)
+            training = Training.prepare(load_config("target", (f"model={folder / 'mine.yaml'}",)), {})
+            identities.append(training.identity()["effects"])
+    assert keys[1] == keys[2]
+    assert len(set(keys)) == 3
+    assert identities[0] == identities[1] != identities[2]
+    assert "effects" not in Training.prepare(load_config("target"), {}).identity()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import re
+import sys
 from collections.abc import Iterator, Mapping
+from hashlib import sha256
 from types import ModuleType
 from typing import Any
 
@@ -157,6 +160,21 @@ def register(kind: Any) -> Any:
     return kind
 
 
+def written(name: str) -> str:
+    """Hash of the text that defines an effect: what was begun with another one must not be gone on with."""
+    kind = KNOWN[name]
+    try:
+        text = inspect.getsource(sys.modules[kind.__module__])
+    except (OSError, TypeError, KeyError):  # typed into a shell
+        text = kind.__qualname__
+    return sha256(text.encode()).hexdigest()
+
+
+def outside(name: str) -> bool:
+    """Whether an effect is not the library's own."""
+    return KNOWN[name] not in (*_PHYSICS, *_OTHERS)
+
+
 def _take(found: object) -> None:
     """Register what an entry point names or a file holds."""
     if not isinstance(found, ModuleType):
@@ -200,8 +218,12 @@ def _complaint(kind: type[Effect]) -> str | None:
 
 
 def _complaint_about_neutral(kind: type[Effect]) -> str | None:
-    if not any(overrides(kind, hook) for hook in ("change", "command", "motors", "rotors", "body")):
-        return "it changes nothing; override change, command, motors, rotors or body"
+    functions = {
+        hook for hook in vars(Effect) if not hook.startswith("_") and inspect.isfunction(getattr(Effect, hook))
+    }
+    changing = sorted(functions - {"start", "sense", "advance", "follow"})
+    if not any(overrides(kind, hook) for hook in changing):
+        return f"it changes nothing; override one of {', '.join(changing)}"
     if kind.neutral.__func__ is Effect.neutral.__func__:
         return "'neutral' is missing, a classmethod that returns the effect at the values where it vanishes"
     neutral = kind.neutral()
