@@ -23,13 +23,6 @@ from cfb_mjx.plugins import files, plugged
 from tests.own_effect import AIR_DRAG
 
 
-@pytest.fixture(autouse=True)
-def _nothing_is_left_behind():
-    with plugged():
-        yield
-    assert "own" not in KNOWN
-
-
 class Own(Effect):
     """F = -coefficient v."""
 

@@ -218,9 +218,7 @@ def _complaint(kind: type[Effect]) -> str | None:
 
 
 def _complaint_about_neutral(kind: type[Effect]) -> str | None:
-    functions = {
-        hook for hook in vars(Effect) if not hook.startswith("_") and inspect.isfunction(getattr(Effect, hook))
-    }
+    functions = {name for name in vars(Effect) if name[0] != "_" and inspect.isfunction(getattr(Effect, name))}
     changing = sorted(functions - {"start", "sense", "advance", "follow"})
     if not any(overrides(kind, hook) for hook in changing):
         return f"it changes nothing; override one of {', '.join(changing)}"
