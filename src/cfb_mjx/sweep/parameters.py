@@ -68,6 +68,8 @@ class Parameters:
                 continue
             elif name == self.kind.positional:
                 first += _texts(value, f"{where}: {name}")
+            elif name in REPEATED:
+                rest += [word for one in _texts(value, f"{where}: {name}") for word in (f"--{_dashed(name)}", one)]
             else:
                 rest += self._option(name, shape, value, f"{where}: {name}")
         return first + rest
@@ -81,8 +83,7 @@ class Parameters:
             return [] if value == self.defaults.get(name) else [said]
         if isinstance(value, list | dict) and shape not in ("files", "texts"):
             raise CfbError(f"{where} takes one value, found {value!r}; what varies belongs under 'over' or 'each'.")
-        texts = _texts(value, where)
-        return [word for one in texts for word in (option, one)] if name in REPEATED else [option, *texts]
+        return [option, *_texts(value, where)]
 
     def _changed(self, value: Any) -> str:
         """The right side of NAME=VALUE: trainings take YAML there, models numbers with commas."""

@@ -61,29 +61,25 @@ class Reading(eqx.Module):
 class Effect(eqx.Module):
     """One physical effect. Subclasses hold their parameters as fields and override what they change.
 
-    Every subclass sets ``name`` (DESIGN names), ``units`` (per field), ``prior`` (per field, the plausible range as low
-    and high), ``strengths`` (the fields that measure its strength; the others describe its shape) and has a
-    ``neutral()`` at which it vanishes. The first paragraph of its docstring is the line that documents it in reports.
-
-    Attributes:
-        meaning: what it is, half a sentence for reports; the documentation line by default.
-        experiment: flights that tell about it, for reports; "flights that excite" it by default.
-        source: where its formula comes from.
-        probes: for tracing, values of the shape at which it is looked for first.
-        coarse: probes, by their number, at which the slope at zero says little of the strength, each with the share of
-            the prior range at which the effect is looked for there.
-        searched: whether a search looks for it at all, or only who names it gets it fitted.
+    Every subclass sets ``name`` (DESIGN names), ``units`` (per field), ``source``, ``prior`` (per field, the plausible
+    range as low and high) and has a ``neutral()`` at which it vanishes. For tracing it says which fields measure its
+    strength (``strengths``; the others describe its shape), at which values it is looked for first (``probes``) and
+    whether a search looks for it at all or only who names it gets it fitted (``searched``).
     """
 
     name: ClassVar[str]
     meaning: ClassVar[str] = ""
+    """What it is, half a sentence for reports; by default the docstring's first paragraph, which documents it there."""
     experiment: ClassVar[str] = ""
+    """Flights that tell about it, for reports; by default those that excite it."""
+    coarse: ClassVar[dict[int, float]] = {}
+    """Probes, by their number, at which the slope at zero says little of the strength: each with the share of the prior
+    range at which the effect is looked for there."""
     units: ClassVar[dict[str, str]]
     source: ClassVar[str] = "not given"
     prior: ClassVar[dict[str, tuple[float, float]]]
     strengths: ClassVar[tuple[str, ...]]
     probes: ClassVar[tuple[dict[str, float], ...]] = ({},)
-    coarse: ClassVar[dict[int, float]] = {}
     searched: ClassVar[bool] = True
 
     @classmethod
@@ -133,7 +129,6 @@ class Effect(eqx.Module):
         return self.advance(condition, acceleration, dt)
 
 
-def overrides(effect: Effect | type[Effect], hook: str) -> bool:
+def overrides(effect: Effect, hook: str) -> bool:
     """Whether the effect does anything in one of the functions above."""
-    kind = effect if isinstance(effect, type) else type(effect)
-    return getattr(kind, hook) is not getattr(Effect, hook)
+    return getattr(type(effect), hook) is not getattr(Effect, hook)

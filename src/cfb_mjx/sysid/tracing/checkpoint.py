@@ -14,8 +14,8 @@ import numpy as np
 from cfb_mjx import __version__
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_json
-from cfb_mjx.model.effects import CATALOGUE, effect_from_mapping, effect_to_mapping
-from cfb_mjx.model.effects.catalogue import written
+from cfb_mjx.model.effects import effect_from_mapping, effect_to_mapping
+from cfb_mjx.model.effects.catalogue import CATALOGUE, written
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 
