@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 from cfb_mjx.cli.runtime import set_up_xla
+from cfb_mjx.plugins import plugged
 
 # As the commands do: large programs compile in half the time. Not for derivatives of MJX (`make test-long`): there
 # jaxlib aborts as soon as the option is named, whatever its value.
@@ -47,9 +48,11 @@ SETTINGS = (
 
 @pytest.fixture(autouse=True)
 def settings_as_before():
-    """Commands that a test runs in this process set up jax as they need it; the next test must not notice."""
+    """Commands that a test runs in this process set up jax as they need it, and a test may register effects; the next
+    one must not notice."""
     before = {name: getattr(jax.config, name) for name in SETTINGS}
-    yield
+    with plugged():
+        yield
     for name, value in before.items():
         if getattr(jax.config, name) != value:
             jax.config.update(name, value)

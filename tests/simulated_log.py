@@ -9,14 +9,14 @@ from cfb_mjx.logs import FlightLog
 MODEL = "cfb-guards"
 
 
-def simulated_log(seconds: float = 4.0) -> FlightLog:
-    """A flight of the declared model itself, without noise: a hover with gentle swings about all axes."""
+def simulated_log(seconds: float = 4.0, drone=None) -> FlightLog:
+    """A flight of the declared model itself or another `Quadrotor`, without noise: a hover with gentle swings."""
     import jax
     import jax.numpy as jnp
 
-    from cfb_mjx.model import Quadrotor, step, thrust
+    from cfb_mjx.model import Quadrotor, specific_force, step
 
-    drone = Quadrotor.from_file(MODEL)
+    drone = drone or Quadrotor.from_file(MODEL)
     delay = round(float(drone.parameters.observation_delay) / drone.dt)
     signs = jnp.array([[-1.0, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
 
@@ -33,8 +33,7 @@ def simulated_log(seconds: float = 4.0) -> FlightLog:
 
     instants = drone.dt * jnp.arange(round(seconds / drone.dt) + delay)
     _, (flown, sent) = jax.jit(lambda state: jax.lax.scan(fly, state, instants))(drone.hover_state())
-    force = jax.vmap(lambda speed: thrust(drone.parameters, speed).sum())(flown.rotor_speed)
-    specific = (force / drone.parameters.mass)[:, None] * jnp.array([0.0, 0.0, 1.0])
+    specific = jax.jit(jax.vmap(lambda state: specific_force(drone, state)))(flown)
     late, now = slice(0, len(instants) - delay), slice(delay, None)
     return FlightLog(
         time=drone.dt * np.arange(len(instants) - delay),
@@ -46,4 +45,20 @@ def simulated_log(seconds: float = 4.0) -> FlightLog:
         command=sent[now],
         rotor_speed=flown.rotor_speed[now],
         metadata={"name": "simulated", "source": "tests", "observation_delay": delay * drone.dt},
+    )
+
+
+def noisy(log: FlightLog, seed: int, name: str) -> FlightLog:
+    """The log as sensors would have it."""
+    rng = np.random.default_rng(seed)
+
+    def some(values, size):
+        return values + size * rng.standard_normal(values.shape)
+
+    return log.replace(
+        position=some(log.position, 4e-4),
+        velocity=some(log.velocity, 4e-3),
+        body_rate=some(log.body_rate, 0.015),
+        specific_force=some(log.specific_force, 0.2),
+        metadata=dict(log.metadata) | {"name": name},
     )

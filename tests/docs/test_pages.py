@@ -14,7 +14,6 @@ import pytest
 
 from cfb_mjx.cli import SUMMARY, main
 from cfb_mjx.cli.commands import COMMANDS
-from cfb_mjx.model.effects import CATALOGUE, KNOWN
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -34,16 +33,6 @@ def _script(name: str):
 page_outputs = _script("page_outputs")
 
 
-@pytest.fixture
-def _as_before():
-    """Pages may register an effect; the other tests must not notice."""
-    known = dict(CATALOGUE), dict(KNOWN)
-    yield
-    for now, before in zip((CATALOGUE, KNOWN), known, strict=True):
-        now.clear()
-        now.update(before)
-
-
 def _same(found: str, said: str) -> bool:
     if NUMBER.sub("#", found).split() != NUMBER.sub("#", said).split():
         return False
@@ -53,7 +42,6 @@ def _same(found: str, said: str) -> bool:
 
 @pytest.mark.xdist_group("pages")  # they share what one worker compiled
 @pytest.mark.parametrize("name", page_outputs.PAGES)
-@pytest.mark.usefixtures("_as_before")
 def test_python_on_a_page_runs_and_prints_what_the_page_says(name, tmp_path, monkeypatch):
     page = DOCS / f"{name}.md"
     monkeypatch.chdir(tmp_path)

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from cfb_mjx.cli import main
 from cfb_mjx.cli.commands import COMMANDS
 from cfb_mjx.cli.sweeping import complaint_of
 from cfb_mjx.documents import shipped_names
@@ -209,3 +210,24 @@ def test_days_are_names_not_dates(tasks):
     Path("drones/2026-01-31/1.mcap").write_text("")
     found = tasks(command="fit", arguments={"logs": "drones/{day}"}, each=[{"day": date(2026, 1, 31)}])
     assert lines(found)["day=2026-01-31"].startswith("cfb fit drones/2026-01-31/1.mcap")
+
+
+def test_every_task_is_given_the_plugins_of_the_sweep_and_of_its_file(tasks, tmp_path):
+    for name in ("a.py", "b.py"):
+        (tmp_path / name).write_text("")
+    found = tasks(command="fly", arguments={"controller": "pid", "plugin": "b.py"}, over={"seed": [0, 1]})
+    assert [task.line for task in found] == [f"cfb fly pid --seed {i} --plugin b.py --json result.json" for i in (0, 1)]
+    found = tasks_of(load_sweep("sweep.yaml", COMMANDS, [Path("a.py")]))
+    for task in found:
+        assert task.arguments[-4:] == ("--plugin", "a.py", "--plugin", "b.py")
+        assert complaint_of(task.words(Path(".")), COMMANDS["fly"]) is None
+    with pytest.raises(CfbError, match=r"plugin: nothing matches none\.py"):
+        tasks(command="fly", arguments={"controller": "pid", "plugin": "none.py"}, over={"seed": [0]})
+
+
+def test_a_sweep_hands_its_plugin_to_its_tasks(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text("")
+    Path("sweep.yaml").write_text(yaml.safe_dump({"format": "cfb_mjx sweep 1"} | FLY))
+    assert main(["sweep", "sweep.yaml", "--plugin", "mine.py", "-o", "out", "--dry-run"]) == 0
+    assert capsys.readouterr().out.count("--plugin mine.py") == 2

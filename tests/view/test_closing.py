@@ -13,6 +13,7 @@ import pytest
 
 from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS, RotorDrag
 from cfb_mjx.parameters import load_model_file
+from cfb_mjx.plugins import plugged
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.floor import noise_floor, sensor_levels
@@ -23,11 +24,13 @@ from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.structure import BLOCK, OFFSET, binned, edges_of, explained
 from cfb_mjx.sysid.tracing.trace import Found, Trace
+from cfb_mjx.view import closing_sections as sections
 from cfb_mjx.view import closing_words as words
 from cfb_mjx.view.closing import write_report
 from cfb_mjx.view.closing_next import next_flights
+from tests.own_effect import AIR_DRAG
 from tests.rerun_command import rerun
-from tests.simulated_log import simulated_log
+from tests.simulated_log import noisy, simulated_log
 
 # They share fixtures and compiled programs.
 pytestmark = pytest.mark.xdist_group("view_closing")
@@ -35,26 +38,11 @@ pytestmark = pytest.mark.xdist_group("view_closing")
 DRAG = 0.01
 
 
-def _noisy(log, seed: int, name: str):
-    rng = np.random.default_rng(seed)
-
-    def some(values, size):
-        return values + size * rng.standard_normal(values.shape)
-
-    return log.replace(
-        position=some(log.position, 4e-4),
-        velocity=some(log.velocity, 4e-3),
-        body_rate=some(log.body_rate, 0.015),
-        specific_force=some(log.specific_force, 0.2),
-        metadata=dict(log.metadata) | {"name": name},
-    )
-
-
 @pytest.fixture(scope="module")
 def logs():
     """Two short flights of the declared drone and two to judge on, one of each without rotor speed."""
     flight = simulated_log(10.0)
-    found = [_noisy(flight, seed, f"flight {seed}") for seed in range(4)]
+    found = [noisy(flight, seed, f"flight {seed}") for seed in range(4)]
     return [found[0], found[1].replace(rotor_speed=None)], [found[2], found[3].replace(rotor_speed=None)]
 
 
@@ -108,7 +96,7 @@ def test_page_stands_alone_and_says_what_the_outcome_says(folder, outcome):
         assert expected in text
     # What looks alike is named together with the flight that would tell.
     assert "parasitic_drag" in text
-    assert words.EXPERIMENTS["parasitic_drag"][1:] in text
+    assert words.experiment("parasitic_drag")[1:] in text
     before, after = outcome.before.metrics("commands_in"), outcome.after.metrics("commands_in")
     low, high = outcome.after.intervals("commands_in")["velocity_rmse_mps@0.5s"]
     assert f"{before['velocity_rmse_mps@0.5s']:.3g} [" in text
@@ -233,11 +221,31 @@ def test_what_only_the_held_out_flights_show_is_flagged_and_asked_for(outcome):
 
 
 def test_every_effect_has_words():
-    names = {*CATALOGUE, *SENSOR_FAULTS}
-    assert names <= set(words.MEANING)
-    assert names <= set(words.EXPERIMENTS)
+    for item in (*CATALOGUE.values(), *SENSOR_FAULTS.values()):
+        assert item.meaning
+        assert item.experiment
     for signal in (OFFSET, *UNITS):
         assert any(signal.startswith(key) for key in words.FOLLOWS), signal
+
+
+def test_an_effect_from_outside_is_spoken_of_by_what_it_says_of_itself(outcome, tmp_path):
+    """Found and not known well, found and not confirmed, hardly told from another: each once ended in a KeyError."""
+    (tmp_path / "my effects.py").write_text(AIR_DRAG)
+    looked = SimpleNamespace(structure=(None, SimpleNamespace(strongest=lambda _: [])), judge=SimpleNamespace(logs=[]))
+    found = replace(outcome.reported[1].found, name="air_drag", confusable=["rotor_drag"])
+    item = Reported("air_drag", 1e-7, {"coefficient": DRAG}, {"coefficient": DRAG}, found)
+    own = replace(outcome, reported=[item], unconfirmed=[replace(item, found=None)])
+    line = "F = -coefficient v, with v the velocity in body axes"
+    with plugged(tmp_path / "my effects.py"):
+        assert f"air_drag the model lacks ({line}): coefficient 0.010 ± 0.010 N s/m" in words.verdict(own)
+        flights = "\n".join(next_flights(own, looked))
+        assert words.experiment("air_drag") == "flights that excite air_drag"
+        assert "Flights that excite air_drag. Why: this shows air_drag, and not rotor_drag; " in flights
+        assert "air_drag is known to 100 % only; air_drag was found, but not confirmed" in flights
+        assert f"--between air_drag,rotor_drag --model model.yaml --plugin '{tmp_path}/my effects.py' -o" in flights
+        sentence = sections._sentence(item)
+        assert sentence.count(line) == 1
+        assert "cannot tell which of this set it is: air_drag, rotor_drag" in sentence
 
 
 @pytest.mark.parametrize(

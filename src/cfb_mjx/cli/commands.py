@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat
+from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat, with_plugins
 from cfb_mjx.cli.deploying_commands import export
 from cfb_mjx.cli.learning_commands import fly, train
 from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce, view
@@ -380,6 +380,7 @@ COMMANDS = {
     "demo": demo,
     "version": version,
 }
+COMMANDS = {name: with_plugins(command) for name, command in COMMANDS.items()}
 
 
 def run(name: str, arguments: list[str]) -> None:

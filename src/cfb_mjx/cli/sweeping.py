@@ -14,6 +14,7 @@ from pathlib import Path
 
 import tyro
 
+from cfb_mjx import plugins
 from cfb_mjx.cli.runtime import Progress, say
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, require_no_file
@@ -39,7 +40,7 @@ def run_sweep(
         raise CfbError(f"--workers {workers}: at least one task must run at a time.")
     if retries < 0:
         raise CfbError(f"--retries {retries}: must be zero or positive.")
-    sweep = load_sweep(config, COMMANDS)
+    sweep = load_sweep(config, COMMANDS, plugins.files())
     tasks = tasks_of(sweep)
     for task in tasks:
         if (complaint := complaint_of(task.words(Path(".")), COMMANDS[task.command])) is not None:

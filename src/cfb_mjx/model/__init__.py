@@ -2,7 +2,7 @@
 
 from cfb_mjx.model.bodies import Body, RigidBody
 from cfb_mjx.model.delay import DelayLine
-from cfb_mjx.model.effects import CATALOGUE, Condition, Effect, ParasiticDrag, Wrench
+from cfb_mjx.model.effects import CATALOGUE, Condition, Effect, ParasiticDrag, Wrench, register
 from cfb_mjx.model.quadrotor import Quadrotor, begin, specific_force, step
 from cfb_mjx.model.rollout import in_chunks, rollout, rollout_final
 from cfb_mjx.model.rotors import hover_command, hover_rotor_speed, rotor_speed_history, thrust, torque
@@ -24,6 +24,7 @@ __all__ = [
     "hover_command",
     "hover_rotor_speed",
     "in_chunks",
+    "register",
     "rollout",
     "rollout_final",
     "rotor_speed_history",

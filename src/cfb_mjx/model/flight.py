@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from cfb_mjx.model import numberwise
+from cfb_mjx.model.one_kernel import HELD
 from cfb_mjx.model.quadrotor import Quadrotor, advance, prepare
 from cfb_mjx.model.state import Components
 from cfb_mjx.model.vector import Vec
@@ -67,7 +68,7 @@ class _Drones:
             return [jnp.asarray(x, dtype) for x in leaves]
 
         examples = [jax.ShapeDtypeStruct(x.shape, dtype) for x in self.model]
-        self.prepare = numberwise.trace(prepared, *examples)
+        self.prepare = numberwise.trace(prepared, *examples, elementwise=HELD)
         (self.structure,) = structure
         self.prepared = self.prepared_from(self.model)
         shapes = [x.shape for x in self.prepare.traced.out_avals]

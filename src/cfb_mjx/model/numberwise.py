@@ -77,15 +77,16 @@ class Program:
         return _run(self.traced.jaxpr, self.traced.consts, arguments)
 
 
-def trace(function: Callable, *examples) -> Program | None:
+def trace(function: Callable, *examples, elementwise: frozenset[str] = ELEMENTWISE) -> Program | None:
     """The program of ``function``, which takes arrays and returns a sequence of them; None if parts are unknown here.
 
     Args:
         function: works on arrays alone, closed over nothing that is traced.
         examples: arrays or `jax.ShapeDtypeStruct`, as many as there are arguments.
+        elementwise: operations known beside `MOVES`.
     """
     traced = jax.make_jaxpr(function)(*examples)
-    if not _known(traced.jaxpr):
+    if not consists_of(traced.jaxpr, elementwise):
         return None
     needed = _needed(traced.jaxpr)[1]
     return Program(traced, tuple(v in needed for v in traced.jaxpr.invars))
@@ -125,13 +126,14 @@ def _inner(equation) -> ClosedJaxpr:
     return equation.params["call_jaxpr" if "call_jaxpr" in equation.params else "jaxpr"]
 
 
-def _known(jaxpr) -> bool:
+def consists_of(jaxpr, elementwise: frozenset[str]) -> bool:
+    """Whether what the results depend on is calls, `MOVES` and these operations alone."""
     for equation in _needed(jaxpr)[0]:
         name = equation.primitive.name
         if name in CALLS:
-            if not _known(_inner(equation).jaxpr):
+            if not consists_of(_inner(equation).jaxpr, elementwise):
                 return False
-        elif name not in ELEMENTWISE and name not in MOVES:
+        elif name not in elementwise and name not in MOVES:
             return False
     return True
 

@@ -9,6 +9,16 @@ import jax
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array
 
+from cfb_mjx.model.numberwise import ELEMENTWISE
+
+_MORE = """
+    acos acosh and asin asinh atan atan2 atanh cbrt cosh erf erf_inv erfc exp2 logistic rem round shift_left
+    shift_right_arithmetic shift_right_logical sinh xor
+"""
+HELD = ELEMENTWISE | frozenset(_MORE.split())
+"""Operations that such a function holds as well as any other, beside moving numbers about and adding them up. Not known
+of the rest: matrix products are slow there, sorting and loops are other functions."""
+
 
 def one_kernel(function: Callable[..., Any], *arrays: Array) -> Any:
     """``function(*arrays)``, for CPU: compiled as one function with its loops inside.

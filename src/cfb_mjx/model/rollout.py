@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -11,15 +12,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.devices import Devices
-from cfb_mjx.model import acceleration, fleet
+from cfb_mjx.model import acceleration, fleet, numberwise
 from cfb_mjx.model.bodies import RigidBody
-from cfb_mjx.model.effects import CATALOGUE
+from cfb_mjx.model.one_kernel import HELD
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec
 
 _MANY = 10
 """Steps from which it pays to fly drones in groups (`cfb_mjx.model.fleet`)."""
+_MOST_NUMBERS = 200
+"""Of a model flown in groups, where each is computed on its own: with the 231 of a `ResidualFormula` that takes twice
+as long to compile, and flies no faster."""
 
 
 def rollout(
@@ -77,9 +81,44 @@ def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 
 
 def fits_one_kernel(model: Quadrotor) -> bool:
     """Whether this backend computes many steps of the model in one function (`cfb_mjx.model.one_kernel`)."""
-    # An effect of the user's own may do what XLA cannot put into one function: a matrix product, say.
-    known = all(type(effect) in CATALOGUE.values() for effect in model.effects)
-    return jax.default_backend() == "cpu" and isinstance(model.body, RigidBody) and known
+    if jax.default_backend() != "cpu" or not isinstance(model.body, RigidBody):
+        return False
+    if not model.effects:
+        return True
+    leaves, structure = jax.tree.flatten(model)
+    arrays = [isinstance(x, jax.Array | np.ndarray | np.generic) for x in leaves]
+    given = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if a else x for x, a in zip(leaves, arrays, strict=True))
+    try:
+        hash((structure, given))
+    except TypeError:  # an effect holds something that can be no part of a program's name
+        return False
+    return _fits(structure, given)
+
+
+@functools.lru_cache(maxsize=1024)
+def _fits(structure, given: tuple) -> bool:
+    """Whether steps of such a model consist of numbers and of what one function can hold, whoever wrote its effects."""
+    examples = [x for x in given if isinstance(x, jax.ShapeDtypeStruct)]
+
+    def model_of(arrays) -> Quadrotor:
+        left = iter(arrays)
+        return jax.tree.unflatten(structure, [next(left) if isinstance(x, jax.ShapeDtypeStruct) else x for x in given])
+
+    def begun(*arrays):
+        model = model_of(arrays)
+        return in_components(prepare(model), model.hover_state(), model.hover_command())
+
+    def step(command, state, *arrays):
+        return jax.tree.leaves(advance(prepare(model_of(arrays)), state, Vec.unstack(command)))
+
+    numbers = all(jnp.issubdtype(x.dtype, jnp.floating) for x in examples)
+    if not numbers or sum(x.size for x in examples) > _MOST_NUMBERS:
+        return False
+    state = jax.eval_shape(begun, *examples)
+    if any(x.shape for x in jax.tree.leaves(state)):
+        return False
+    command = jax.ShapeDtypeStruct((4,), jax.tree.leaves(state)[0].dtype)
+    return numberwise.consists_of(jax.make_jaxpr(step)(command, state, *examples).jaxpr, HELD)
 
 
 def fly_rows(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Components:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from glob import glob
 from pathlib import Path
@@ -50,12 +50,13 @@ class Sweep:
     gpus: float = 0.0
 
 
-def load_sweep(name_or_path: str | Path, functions: Mapping[str, Callable]) -> Sweep:
+def load_sweep(name_or_path: str | Path, functions: Mapping[str, Callable], files: Sequence[Path] = ()) -> Sweep:
     """Read a sweep of a YAML file, or a shipped one by its name.
 
     Args:
         name_or_path: of the sweep; its patterns are looked up from the current folder.
         functions: of the commands, by name; their signatures say what a task may be given.
+        files: plugins for every task, before those the sweep names.
 
     Raises:
         CfbError: one sentence on what is wrong and where.
@@ -67,6 +68,9 @@ def load_sweep(name_or_path: str | Path, functions: Mapping[str, Callable]) -> S
         raise CfbError(f"{path}: 'command' must be one of {', '.join(KINDS)}, found {command!r}.")
     parameters = Parameters.of(command, functions[command], KINDS[command])
     arguments = _flat(_mapping(raw, "arguments", path), parameters, f"{path}: arguments")
+    if files:
+        own = arguments.get("plugin", [])
+        arguments["plugin"] = [*map(str, files), *(own if isinstance(own, list) else [own])]
     over = _flat(_mapping(raw, "over", path), parameters, f"{path}: over")
     for key, values in over.items():
         if not isinstance(values, list) or not values:

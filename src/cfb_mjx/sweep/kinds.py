@@ -59,5 +59,7 @@ KINDS = {
 
 EXTRA_FILES = frozenset({"figure", "recording", "video", "log", "keep"})
 """Parameters that name one more file to write: it goes into the task's folder."""
+REPEATED = frozenset({"plugin"})
+"""Parameters that are named again for each of several values."""
 CHOSEN_HERE = frozenset({"output", "json", "resume"})
 """Parameters that the sweep gives."""

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import yaml
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.sweep.kinds import CHOSEN_HERE, Kind
+from cfb_mjx.sweep.kinds import CHOSEN_HERE, REPEATED, Kind
 
 Shape = Literal["flag", "pairs", "files", "file", "texts", "text"]
 
@@ -68,6 +68,8 @@ class Parameters:
                 continue
             elif name == self.kind.positional:
                 first += _texts(value, f"{where}: {name}")
+            elif name in REPEATED:
+                rest += [word for one in _texts(value, f"{where}: {name}") for word in (f"--{_dashed(name)}", one)]
             else:
                 rest += self._option(name, shape, value, f"{where}: {name}")
         return first + rest

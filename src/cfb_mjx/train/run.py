@@ -23,6 +23,8 @@ from cfb_mjx.envs.episode import longest_delay_s
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, write_text
 from cfb_mjx.hosts import as_first, first, from_first
+from cfb_mjx.model.effects import KNOWN
+from cfb_mjx.model.effects.catalogue import outside, written
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import hover_command
 from cfb_mjx.parameters import ModelFile, load_model_file
@@ -79,11 +81,13 @@ class Training:
 
     def identity(self) -> dict[str, Any]:
         """What a checkpoint must agree with to be gone on from."""
+        names = [item["name"] for item in self.described.effects]
+        own = {name: written(name) for name in names if name in KNOWN and outside(name)}
         return {
             "config": self.config.to_mapping(),
             "model": _described(self.described),
             "start": None if self.start is None else self.start.weights_sha256,
-        }
+        } | ({"effects": own} if own else {})
 
     def nominal(self) -> Quadrotor:
         """The drone about which the others are drawn."""

@@ -23,7 +23,7 @@ Figures = dict[str, list[tuple[Path, str]]]
 def draw(outcome: Outcome, looked: Looked, folder: Path) -> Figures:
     """Figures as files with alternative texts.
 
-    Under ``errors``, ``residuals``, ``left``, ``unexplained`` (the last two if there is anything) and effects' names.
+    Under ``errors``, ``residuals``, ``left``, ``unexplained`` (the last two if there is anything) and `key_of` effects.
 
     Args:
         outcome: of the closed loop.
@@ -35,10 +35,10 @@ def draw(outcome: Outcome, looked: Looked, folder: Path) -> Figures:
     for item in outcome.reported:
         panels, labels = _effect(outcome, looked, item)
         if panels:
-            path = folder / f"{item.name}.svg"
+            path = folder / f"{key_of(item.name)}.svg"
             binned_figure(panels, labels, path)
             what = ", ".join(f"{p.axis} against {p.signal}" for p in panels)
-            figures[item.name] = [(path, f"{item.name}: {what}, {labels[0]} and {labels[1]}")]
+            figures[key_of(item.name)] = [(path, f"{item.name}: {what}, {labels[0]} and {labels[1]}")]
     panels, labels = _terms(outcome, looked)
     if panels:
         binned_figure(panels, labels, folder / "unexplained.svg")
@@ -60,6 +60,11 @@ def draw(outcome: Outcome, looked: Looked, folder: Path) -> Figures:
         binned_figure(panels, ("", "after"), folder / "left.svg")
         figures["left"] = [(folder / "left.svg", "the strongest structure left in the residuals")]
     return figures
+
+
+def key_of(name: str) -> str:
+    """Under which an effect's figures stand, whatever it is called."""
+    return f"effect {name}"
 
 
 def _spectra(looked: Looked, path: Path) -> list[tuple[Path, str]]:

@@ -7,7 +7,7 @@ from cfb_mjx.sysid.tracing.acceptance import ALPHA, LEAST_GAIN, MATERIAL
 from cfb_mjx.sysid.tracing.outcome import Outcome
 from cfb_mjx.view.closing_figures import squared
 from cfb_mjx.view.closing_look import Looked
-from cfb_mjx.view.closing_words import EXPERIMENTS, FOLLOWS, numbers, probability, separating
+from cfb_mjx.view.closing_words import FOLLOWS, experiment, numbers, probability, separating
 
 UNSURE = 0.2
 """Relative standard deviation above which more flights of an effect's kind are asked for."""
@@ -62,16 +62,16 @@ def next_flights(outcome: Outcome, looked: Looked) -> list[str]:
         rivals = [] if item.found is None else item.found.confusable
         for name in [item.name, *rivals] if rivals else []:
             others = ", ".join(other for other in [item.name, *rivals] if other != name)
-            fly(EXPERIMENTS.get(name, "flights of another kind"), f"this shows {name}, and not {others}")
+            fly(experiment(name), f"this shows {name}, and not {others}")
         command = separating([item.name, *rivals], "model.yaml") if rivals else None
         if command is not None:
             fly(f"what `{command}` writes", f"it looks for the flight that tells {item.name} from {', '.join(rivals)}")
         main = max(numbers(item), key=lambda number: abs(number.value))
         if main.std > UNSURE * abs(main.value):
             share = 100 * main.std / max(abs(main.value), 1e-300)
-            fly(EXPERIMENTS[item.name], f"{item.name} is known to {share:.0f} % only")
+            fly(experiment(item.name), f"{item.name} is known to {share:.0f} % only")
     for item in outcome.unconfirmed:
-        fly(EXPERIMENTS[item.name], f"{item.name} was found, but not confirmed on held-out flights")
+        fly(experiment(item.name), f"{item.name} was found, but not confirmed on held-out flights")
     if outcome.unexplained is not None and outcome.unexplained.held_out_only:
         fly(
             "more flights like the held-out ones, some of them to fit to",

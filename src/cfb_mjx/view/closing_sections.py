@@ -7,16 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import CATALOGUE
 from cfb_mjx.sysid.evaluation import Evaluation
 from cfb_mjx.sysid.metrics import QUANTITIES
 from cfb_mjx.sysid.tracing.floor import noise_floor
 from cfb_mjx.sysid.tracing.outcome import Outcome, Reported, Unexplained
-from cfb_mjx.view.closing_drawing import Figures
+from cfb_mjx.view.closing_drawing import Figures, key_of
 from cfb_mjx.view.closing_figures import squared
 from cfb_mjx.view.closing_look import Looked
 from cfb_mjx.view.closing_next import next_flights, refused, what_is_left
-from cfb_mjx.view.closing_words import MEANING, change, is_fault, numbers, probability, strength, with_error
+from cfb_mjx.view.closing_words import change, documented, is_fault, meaning, numbers, probability, strength, with_error
 from cfb_mjx.view.page import Section
 
 Table = tuple[str, list[str], list[list[str]]]
@@ -81,7 +80,7 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
         "(of a sensor fault: from comparing the sensors with each other, without any model)."
     )
     head = ["effect", "parameter", "value", "95 % interval", "plausible", "p"]
-    shown = [figure for item in outcome.reported for figure in figures.get(item.name, [])]
+    shown = [figure for item in outcome.reported for figure in figures.get(key_of(item.name), [])]
     if shown:
         paragraphs.append(
             "Figures, one row each: mean residual (measured minus modelled) in bins of the signal it follows, with "
@@ -92,12 +91,11 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
 
 
 def _sentence(item: Reported) -> str:
-    text = f"{item.name}: {MEANING.get(item.name, '')}; {strength(item)}."
+    text = f"{item.name}: {meaning(item.name)}; {strength(item)}."
     if is_fault(item.name):
         text += " A fault of the recording, not of the drone: it is taken out before the physics is judged."
-    else:
-        formula = " ".join((CATALOGUE[item.name].__doc__ or "").split("\n\n")[0].split())
-        text += f" In the model: {formula}"
+    elif documented(item.name) not in ("", meaning(item.name)):
+        text += f" In the model: {documented(item.name)}."
     if item.found is not None:
         text += f" Without it one prediction error of the fit flights grows by {_grows(item.found.buys)}."
         if item.found.confusable:

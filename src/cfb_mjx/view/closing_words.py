@@ -2,87 +2,27 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 
 import numpy as np
 
-from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS
+from cfb_mjx import plugins
+from cfb_mjx.model.effects import CATALOGUE, KNOWN, SENSOR_FAULTS, CogOffset, Inertia, MotorTimeConstant, RotorDrag
 from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
 
-MEANING = {
-    "thrust_scale": "all rotors lift more or less than the declared thrust curve says",
-    "torque_scale": "the rotors' reaction torque differs from the declared torque curve",
-    "inertia": "the moments of inertia differ from the declared ones",
-    "cog_offset": "the centre of gravity does not lie in the middle of the rotors",
-    "payload": "the drone carries mass that was not declared",
-    "motor_gain_mismatch": "single motors turn faster or slower than their command says",
-    "motor_time_constant": "the motors answer slower or faster than declared",
-    "motor_asymmetry": "the motors spin up and down at different speed",
-    "motor_second_order": "the motors answer with a second lag",
-    "motor_thermal_drift": "the motors slow down as they warm up",
-    "battery_sag": "rotor speed follows the battery's voltage",
-    "command_delay": "commands reach the motors late",
-    "esc_rate_limit": "the motor controllers limit how fast a command, or the rotor, may change",
-    "inflow_thrust": "thrust falls in climb and grows in descent",
-    "ground_effect": "thrust grows near the ground",
-    "gyroscopic": "the spinning rotors resist being turned",
-    "thrust_tilt": "the thrust does not point along the body's z axis",
-    "rotor_drag": "the rotors drag against sideways motion, in proportion to speed",
-    "parasitic_drag": "the body drags against motion, with the square of speed",
-    "blade_flapping": "sideways motion tilts the rotor discs and turns the body",
-    "wind": "the air moves",
-    "position_moment": "a torque hangs on the position, as in air that moves towards the middle of a room",
-    "payload_swing": "a load swings below the drone",
-    "sensor_delay": "pose and velocity are older than the log declares",
-    "sensor_velocity_scale": "logged velocity is not in scale with logged position",
-    "sensor_gyro_lowpass": "the gyro is filtered and lags",
-    "sensor_time_shift": "command and rotor-speed columns are late or early against all others",
-}
-MOTORS = "cfb excite single-motor: steps of one motor at a time, rotor speed logged"
-TURNS = "cfb excite roll-pitch: doublets about roll and pitch, and yaw turns both ways"
-PASSES = "straight passes at constant speed, 0.5 to 3 m/s, forth and back and in both body axes"
-HOVERS = "long hovers with the heading turned by 90 degrees in between"
-EXPERIMENTS = {
-    "thrust_scale": "weigh the drone, then hover: mass and thrust cannot be told apart in flight",
-    "torque_scale": "yaw turns and stops at constant height (cfb excite single-motor)",
-    "inertia": TURNS,
-    "cog_offset": HOVERS,
-    "payload": "weigh the drone, then hover and cfb excite roll-pitch",
-    "motor_gain_mismatch": MOTORS,
-    "motor_time_constant": MOTORS,
-    "motor_asymmetry": "large command steps up and down, rotor speed logged (cfb excite single-motor)",
-    "motor_second_order": MOTORS,
-    "motor_thermal_drift": "hover for a minute from cold, twice: on a full and on a half-empty battery",
-    "battery_sag": "hover from a full battery to an empty one with the voltage logged",
-    "command_delay": "sharp command steps, rotor speed and every command logged (cfb excite single-motor)",
-    "esc_rate_limit": "command steps of several sizes, rotor speed logged: a limit shows in the large ones only",
-    "inflow_thrust": "climbs and dives at 0.5 to 2 m/s",
-    "ground_effect": "hover for five seconds each at 0.1, 0.15, 0.25, 0.5 and 1 m",
-    "gyroscopic": "fast roll and pitch while climbing hard: rates at high rotor speed",
-    "thrust_tilt": HOVERS,
-    "rotor_drag": PASSES,
-    "parasitic_drag": PASSES + ", the fastest as fast as there is room for",
-    "blade_flapping": PASSES + ", repeated while climbing",
-    "wind": "hover with the heading turned through 360 degrees: wind stays in the world, trim turns with the body",
-    "position_moment": "slow passes through the whole room, and the same passes in a larger one",
-    "payload_swing": "a sharp stop followed by a hover of five seconds: a load swings on",
-    "sensor_delay": "fast turns in yaw and hard stops: delay shows where signals change quickly",
-    "sensor_velocity_scale": "long straight passes",
-    "sensor_gyro_lowpass": "cfb excite roll-pitch: fast rates show a filter",
-    "sensor_time_shift": "sharp command steps with rotor speed logged",
-}
 FOLLOWS = {
-    "velocity": PASSES,
-    "rate": TURNS,
+    "velocity": RotorDrag.experiment,
+    "rate": Inertia.experiment,
     "rotor mean": "climbs, dives and hovers at several thrusts, rotor speed logged",
-    "rotor": MOTORS,
-    "command": MOTORS,
+    "rotor": MotorTimeConstant.experiment,
+    "command": MotorTimeConstant.experiment,
     "position": "the same manoeuvre at another place, away from walls, cables and other drones",
     "height": "hover at several heights, and the same heights over another floor",
-    "heading": HOVERS,
+    "heading": CogOffset.experiment,
     "voltage": "hover from a full battery to an empty one",
     "time": "hover for a minute from cold, twice",
-    "offset": HOVERS,
+    "offset": CogOffset.experiment,
 }
 _COMPONENTS = {2: ("x", "y"), 3: ("x", "y", "z"), 4: ("M1", "M2", "M3", "M4")}
 
@@ -91,7 +31,8 @@ def separating(names: list[str], model: str) -> str | None:
     """The command that finds the flight to tell some effects apart; None where flying does not."""
     if not set(names) <= set(CATALOGUE):
         return None
-    return f"cfb excite separate --between {','.join(names)} --model {model} -o next"
+    plugged = "".join(f" --plugin {shlex.quote(str(file))}" for file in plugins.files())
+    return f"cfb excite separate --between {','.join(names)} --model {model}{plugged} -o next"
 
 
 def is_fault(name: str) -> bool:
@@ -99,9 +40,26 @@ def is_fault(name: str) -> bool:
     return name in SENSOR_FAULTS
 
 
+def meaning(name: str) -> str:
+    """What an effect or fault is, in half a sentence."""
+    if is_fault(name):
+        return SENSOR_FAULTS[name].meaning
+    return KNOWN[name].meaning or documented(name) or name.replace("_", " ")
+
+
+def documented(name: str) -> str:
+    """The line that documents an effect: its docstring's first paragraph."""
+    return " ".join((KNOWN[name].__doc__ or "").split("\n\n")[0].split()).rstrip(".")
+
+
+def experiment(name: str) -> str:
+    """Flights that tell about an effect or fault."""
+    return (SENSOR_FAULTS if is_fault(name) else KNOWN)[name].experiment or f"flights that excite {name}"
+
+
 def unit_of(name: str, field: str) -> str:
     """Unit of a parameter of an effect or fault; empty for plain ratios."""
-    unit = SENSOR_FAULTS[name].unit if is_fault(name) else CATALOGUE[name].units.get(field, "1")
+    unit = SENSOR_FAULTS[name].unit if is_fault(name) else KNOWN[name].units.get(field, "1")
     return "" if unit == "1" else unit.replace("^2", "²")
 
 
@@ -123,7 +81,7 @@ class Number:
 def numbers(item: Reported) -> list[Number]:
     """Every number of an effect or fault."""
     found = []
-    prior = {} if is_fault(item.name) else CATALOGUE[item.name].prior
+    prior = {} if is_fault(item.name) else KNOWN[item.name].prior
     for field, value in item.parameters.items():
         several = isinstance(value, list)
         each = np.atleast_1d(np.asarray(value, dtype=float))
@@ -179,14 +137,14 @@ def verdict(outcome: Outcome) -> str:
     if len(physics) == 1:
         (item,) = physics
         parts.append(
-            f"The drone flies with {item.name} the model lacks ({MEANING.get(item.name, 'no description')}): "
+            f"The drone flies with {item.name} the model lacks ({meaning(item.name)}): "
             f"{strength(item)}{_interval(item)}."
         )
     elif physics:
         named = "; ".join(f"{item.name} ({strength(item)})" for item in physics)
         parts.append(f"The drone flies with {len(physics)} effects the model lacks: {named}.")
     if faults:
-        named = "; ".join(f"{item.name}, {MEANING[item.name]}: {strength(item)}" for item in faults)
+        named = "; ".join(f"{item.name}, {meaning(item.name)}: {strength(item)}" for item in faults)
         parts.append(f"The recording is at fault, not the physics: {named}.")
         if not physics and outcome.unexplained is None:
             parts.append("Of the physics nothing is missing beyond chance.")

@@ -9,6 +9,7 @@ from cfb_mjx.model.effects.catalogue import (
     SENSOR_FAULTS,
     effect_from_mapping,
     effect_to_mapping,
+    register,
 )
 from cfb_mjx.model.effects.cog_offset import CogOffset
 from cfb_mjx.model.effects.command_delay import CommandDelay
@@ -72,4 +73,5 @@ __all__ = [
     "effect_from_mapping",
     "effect_to_mapping",
     "overrides",
+    "register",
 ]

@@ -68,8 +68,15 @@ class Effect(eqx.Module):
     """
 
     name: ClassVar[str]
+    meaning: ClassVar[str] = ""
+    """What it is, half a sentence for reports; by default the docstring's first paragraph, which documents it there."""
+    experiment: ClassVar[str] = ""
+    """Flights that tell about it, for reports; by default those that excite it."""
+    coarse: ClassVar[dict[int, float]] = {}
+    """Probes, by their number, at which the slope at zero says little of the strength: each with the share of the prior
+    range at which the effect is looked for there."""
     units: ClassVar[dict[str, str]]
-    source: ClassVar[str]
+    source: ClassVar[str] = "not given"
     prior: ClassVar[dict[str, tuple[float, float]]]
     strengths: ClassVar[tuple[str, ...]]
     probes: ClassVar[tuple[dict[str, float], ...]] = ({},)

@@ -30,6 +30,8 @@ class BatterySag(Effect):
     """Steady rotor speed *= 1 + level + slope (V - 3.7) / 3.7."""
 
     name: ClassVar[str] = "battery_sag"
+    meaning: ClassVar[str] = "rotor speed follows the battery's voltage"
+    experiment: ClassVar[str] = "hover from a full battery to an empty one with the voltage logged"
     units: ClassVar[dict[str, str]] = {"level": "1", "slope": "1", "lag": "s"}
     source: ClassVar[str] = (
         "Q. Quan, Introduction to Multicopter Design and Control, 2017, ch. 4 (motor and ESC model: speed against "

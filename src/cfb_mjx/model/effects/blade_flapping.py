@@ -28,6 +28,10 @@ class BladeFlapping(Effect):
     """tau = coefficient (Omega / 1594) exp(climb v_z) (-(1 - anisotropy) v_y, (1 + anisotropy) v_x, 0)."""
 
     name: ClassVar[str] = "blade_flapping"
+    meaning: ClassVar[str] = "sideways motion tilts the rotor discs and turns the body"
+    experiment: ClassVar[str] = (
+        "straight passes at constant speed, 0.5 to 3 m/s, forth and back and in both body axes, repeated while climbing"
+    )
     units: ClassVar[dict[str, str]] = {"coefficient": "N s", "climb": "s/m", "anisotropy": "1"}
     source: ClassVar[str] = (
         "R. Mahony, V. Kumar, P. Corke, Multirotor aerial vehicles, IEEE RAM 19(3), 2012; G. Hoffmann, H. Huang, S."

@@ -1,13 +1,21 @@
-"""Every effect by name. Adding one is one module and one line here."""
+"""Every effect by name: shipped ones, one line each here, and those from outside (`register`, `cfb_mjx.plugins`)."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import inspect
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from hashlib import sha256
+from types import ModuleType
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from cfb_mjx import plugins
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.effects.base import Effect
 from cfb_mjx.model.effects.battery_sag import BatterySag
@@ -36,7 +44,7 @@ from cfb_mjx.model.effects.thrust_tilt import ThrustTilt
 from cfb_mjx.model.effects.torque_scale import TorqueScale
 from cfb_mjx.model.effects.wind import Wind
 
-CATALOGUE: dict[str, type[Effect]] = {
+_PHYSICS: dict[str, type[Effect]] = {
     effect.name: effect
     for effect in (
         ThrustScale,
@@ -66,25 +74,71 @@ CATALOGUE: dict[str, type[Effect]] = {
 }
 
 
-KNOWN: dict[str, type[Effect]] = CATALOGUE | {kind.name: kind for kind in (ResidualFormula, RegressionDilution)}
+_SHIPPED = _PHYSICS | {kind.name: kind for kind in (ResidualFormula, RegressionDilution)}
+COMMAND_LEAD = "command_lead"
+"""What a search calls a nuisance of logs: no effect's name."""
+
+
+class Kinds(Mapping[str, type[Effect]]):
+    """Effects by name, as they are now: shipped ones first, then those from outside. To add one: `register`."""
+
+    def __init__(self, shipped: Mapping[str, type[Effect]]):
+        self._shipped = shipped
+
+    def _all(self) -> dict[str, type[Effect]]:
+        return {**self._shipped, **plugins.kinds(_take)}
+
+    def __getitem__(self, name: str) -> type[Effect]:
+        return self._all()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._all())
+
+    def __len__(self) -> int:
+        return len(self._all())
+
+
+CATALOGUE = Kinds(_PHYSICS)
+KNOWN = Kinds(_SHIPPED)
 """What a model file may name: the catalogue; formulas, which a search turns to only when it fails; and what predictors
 do instead of physics."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SensorFault:
-    """One thing that can be wrong with a recording: its parameter in a model file, unit and value when healthy."""
+    """One thing that can be wrong with a recording.
+
+    Its parameter in a model file, unit and value when healthy; what it is, and flights that tell about it.
+    """
 
     parameter: str
     unit: str
     healthy: float
+    meaning: str
+    experiment: str
 
 
 SENSOR_FAULTS: dict[str, SensorFault] = {
-    "sensor_delay": SensorFault("delay", "s", 0.0),
-    "sensor_velocity_scale": SensorFault("scale", "1", 1.0),
-    "sensor_gyro_lowpass": SensorFault("lag", "s", 0.0),
-    "sensor_time_shift": SensorFault("shift", "s", 0.0),
+    "sensor_delay": SensorFault(
+        "delay",
+        "s",
+        0.0,
+        "pose and velocity are older than the log declares",
+        "fast turns in yaw and hard stops: delay shows where signals change quickly",
+    ),
+    "sensor_velocity_scale": SensorFault(
+        "scale", "1", 1.0, "logged velocity is not in scale with logged position", "long straight passes"
+    ),
+    "sensor_gyro_lowpass": SensorFault(
+        "lag", "s", 0.0, "the gyro is filtered and lags", "cfb excite roll-pitch: fast rates show a filter"
+    ),
+    "sensor_time_shift": SensorFault(
+        "shift",
+        "s",
+        0.0,
+        "command and rotor-speed columns are late or early against all others",
+        "sharp command steps with rotor speed logged",
+    ),
 }
 """What a model file may name beside physics: it changes what is recorded, not how the drone flies."""
 
@@ -97,7 +151,8 @@ def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
     """
     name = item.get("name")
     if not isinstance(name, str) or name not in KNOWN:
-        raise CfbError(f"{where}: unknown effect {name!r}; known are {', '.join(sorted([*KNOWN, *SENSOR_FAULTS]))}.")
+        known = ", ".join(sorted([*KNOWN, *SENSOR_FAULTS]))
+        raise CfbError(f"{where}: unknown effect {name!r}; known are {known}; one of your own needs --plugin FILE.py.")
     kind = KNOWN[name]
     fields = {field.name for field in dataclasses.fields(kind)}
     values = item.get("parameters") or {}
@@ -129,3 +184,105 @@ def effect_to_mapping(effect: Effect) -> dict[str, Any]:
     """The inverse of `effect_from_mapping`."""
     values = {field.name: np.asarray(getattr(effect, field.name)).tolist() for field in dataclasses.fields(effect)}
     return {"name": effect.name, "parameters": values, "source": effect.source}
+
+
+def register(kind: Any) -> Any:
+    """Make an effect of your own known: to model files, fits, the search, reports and trainings. Also a decorator.
+
+    Known until the process ends, or the block of `cfb_mjx.plugins.plugged` around it. A class defined anew, as by a
+    notebook's cell that runs again, replaces itself.
+
+    Args:
+        kind: the class.
+
+    Returns:
+        The class.
+
+    Raises:
+        CfbError: it lacks something, said in a sentence, or its name is taken.
+    """
+    if not (isinstance(kind, type) and issubclass(kind, Effect)):
+        raise CfbError(f"{kind!r} is no effect; register a class derived from cfb_mjx.model.Effect.")
+    if (complaint := _complaint(kind)) is not None:
+        raise CfbError(f"effect {kind.__qualname__}: {complaint}.")
+    plugins.add(kind.name, kind)
+    return kind
+
+
+def written(name: str) -> str:
+    """Hash of the text that defines an effect: what was begun with another one must not be gone on with."""
+    kind = KNOWN[name]
+    try:
+        text = inspect.getsource(sys.modules[kind.__module__])
+    except (OSError, TypeError, KeyError):  # typed into a shell
+        text = kind.__qualname__
+    return sha256(text.encode()).hexdigest()
+
+
+def outside(name: str) -> bool:
+    """Whether an effect is not the library's own."""
+    return name not in _SHIPPED
+
+
+def _take(found: object) -> None:
+    """Register what an entry point names or a file holds."""
+    if not isinstance(found, ModuleType):
+        register(found)
+        return
+    shipped = {Effect, *_SHIPPED.values()}
+    kinds = [v for v in vars(found).values() if isinstance(v, type) and issubclass(v, Effect) and v not in shipped]
+    # Others derive from it: what they share, and no effect itself.
+    kinds = [kind for kind in kinds if "name" in vars(kind) or not kind.__subclasses__()]
+    if not kinds:
+        raise CfbError("defines no effect, a class derived from cfb_mjx.model.Effect.")
+    for kind in kinds:
+        register(kind)
+
+
+def _complaint(kind: type[Effect]) -> str | None:
+    """What is missing or wrong about an effect from outside."""
+    name = getattr(kind, "name", None)
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        return f"'name' must be a word of small letters, digits and underscores, found {name!r}"
+    shipped = {key: each.__name__ for key, each in _SHIPPED.items()} | {COMMAND_LEAD: "the search"}
+    if (owner := (shipped | dict.fromkeys(SENSOR_FAULTS, "a sensor fault")).get(name)) is not None:
+        return f"{owner} has the name {name!r} already"
+    fields = [item.name for item in dataclasses.fields(kind)]
+    for attribute in ("units", "prior"):
+        given = getattr(kind, attribute, None)
+        if not isinstance(given, Mapping) or set(given) != set(fields):
+            return f"'{attribute}' must say something of each field ({', '.join(fields)}), found {given!r}"
+    for field, span in kind.prior.items():
+        if not (np.shape(span) == (2,) and np.all(np.isfinite(span)) and span[0] < span[1]):
+            return f"'prior' of {field} must be two numbers, low and high, found {span!r}"
+    strengths = getattr(kind, "strengths", None)
+    if not isinstance(strengths, tuple) or not strengths or not set(strengths) <= set(fields):
+        return f"'strengths' must be a tuple of the fields that are zero at neutral, found {strengths!r}"
+    shape = set(fields) - set(strengths)
+    if not kind.probes or not all(isinstance(p, Mapping) and set(p) <= shape for p in kind.probes):
+        return f"'probes' must be a tuple of mappings that give values to fields of the shape, found {kind.probes!r}"
+    if not set(kind.coarse) <= set(range(len(kind.probes))):
+        return f"'coarse' must number probes, from 0, found {kind.coarse!r}"
+    return _complaint_about_neutral(kind)
+
+
+def _complaint_about_neutral(kind: type[Effect]) -> str | None:
+    functions = {name for name in vars(Effect) if name[0] != "_" and inspect.isfunction(getattr(Effect, name))}
+    changing = sorted(functions - {"start", "sense", "advance", "follow"})
+    if not any(getattr(kind, hook) is not getattr(Effect, hook) for hook in changing):
+        return f"it changes nothing; override one of {', '.join(changing)}"
+    if kind.neutral.__func__ is Effect.neutral.__func__:
+        return "'neutral' is missing, a classmethod that returns the effect at the values where it vanishes"
+    neutral = kind.neutral()
+    if type(neutral) is not kind:
+        return f"'neutral' must return a {kind.__name__}, found {neutral!r}"
+    for field in kind.prior:
+        value, (low, high) = getattr(neutral, field), kind.prior[field]
+        if not isinstance(value, jax.Array) or not jnp.issubdtype(value.dtype, jnp.floating) or value.ndim > 1:
+            return (
+                f"field {field} must be an array of one number or a row of them, as the converters 'number' and "
+                f"'vector' of cfb_mjx.model.effects.fields make it, found {value!r}"
+            )
+        if field in kind.strengths and (np.any(np.asarray(value) != 0) or not low <= 0 <= high):
+            return f"strength {field} must be zero at neutral, and its prior hold zero, found {value}, {low} to {high}"
+    return None

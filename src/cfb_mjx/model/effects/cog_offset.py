@@ -17,6 +17,8 @@ class CogOffset(Effect):
     """center_of_gravity += (offset_x, offset_y, 0)."""
 
     name: ClassVar[str] = "cog_offset"
+    meaning: ClassVar[str] = "the centre of gravity does not lie in the middle of the rotors"
+    experiment: ClassVar[str] = "long hovers with the heading turned by 90 degrees in between"
     units: ClassVar[dict[str, str]] = {"offset": "m"}
     source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, domain randomisation (centre of gravity)"
     prior: ClassVar[dict[str, tuple[float, float]]] = {"offset": (-0.01, 0.01)}

@@ -29,6 +29,9 @@ class CommandDelay(Effect):
     """The motors receive u(t - delay)."""
 
     name: ClassVar[str] = "command_delay"
+    meaning: ClassVar[str] = "commands reach the motors late"
+    experiment: ClassVar[str] = "sharp command steps, rotor speed and every command logged (cfb excite single-motor)"
+    coarse: ClassVar[dict[int, float]] = {0: 0.2}
     units: ClassVar[dict[str, str]] = {"delay": "s"}
     source: ClassVar[str] = (
         "K. J. Astrom, B. Wittenmark, Computer-Controlled Systems, 3rd ed. 1997, ch. 2 (sampling a system with time"

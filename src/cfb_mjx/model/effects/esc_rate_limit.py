@@ -25,6 +25,12 @@ class EscRateLimit(Effect):
     """|du/dt| <= 1 / ((1 - rotor) slowness), |dOmega/dt| <= K / (rotor slowness)."""
 
     name: ClassVar[str] = "esc_rate_limit"
+    meaning: ClassVar[str] = "the motor controllers limit how fast a command, or the rotor, may change"
+    experiment: ClassVar[str] = (
+        "command steps of several sizes, rotor speed logged: a limit shows in the large ones only"
+    )
+    # No rotor comes near the limits that are tried for commands.
+    coarse: ClassVar[dict[int, float]] = {1: 0.8}
     units: ClassVar[dict[str, str]] = {"slowness": "s", "rotor": "1"}
     source: ClassVar[str] = (
         "B. Stevens, F. Lewis, E. Johnson, Aircraft Control and Simulation, 3rd ed. 2016 (rate-limited actuator)"

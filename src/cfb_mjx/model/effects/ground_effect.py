@@ -29,6 +29,8 @@ class GroundEffect(Effect):
     """f_i *= 1 + strength (height^2 + d^2) / (height^2 + z_i^2), d = 0.1 m."""
 
     name: ClassVar[str] = "ground_effect"
+    meaning: ClassVar[str] = "thrust grows near the ground"
+    experiment: ClassVar[str] = "hover for five seconds each at 0.1, 0.15, 0.25, 0.5 and 1 m"
     units: ClassVar[dict[str, str]] = {"strength": "1", "height": "m"}
     source: ClassVar[str] = (
         "I. Cheeseman, W. Bennett, The effect of the ground on a helicopter rotor in forward flight, ARC R&M 3021, "

@@ -23,6 +23,8 @@ class Gyroscopic(Effect):
     """tau = -omega x h with h the angular momentum of the rotors."""
 
     name: ClassVar[str] = "gyroscopic"
+    meaning: ClassVar[str] = "the spinning rotors resist being turned"
+    experiment: ClassVar[str] = "fast roll and pitch while climbing hard: rates at high rotor speed"
     units: ClassVar[dict[str, str]] = {"rotor_inertia": "kg m^2"}
     source: ClassVar[str] = (
         "S. Bouabdallah, Design and control of quadrotors with application to autonomous flying, EPFL thesis 3727, 2007"

@@ -20,6 +20,8 @@ class Inertia(Effect):
     """J_k *= 1 + relative_k."""
 
     name: ClassVar[str] = "inertia"
+    meaning: ClassVar[str] = "the moments of inertia differ from the declared ones"
+    experiment: ClassVar[str] = "cfb excite roll-pitch: doublets about roll and pitch, and yaw turns both ways"
     units: ClassVar[dict[str, str]] = {"relative": "1"}
     source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, eq. 4"
     prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.5, 0.5)}

@@ -22,6 +22,8 @@ class InflowThrust(Effect):
     """f_i -= coefficient (Omega_i / 1594) v_i,z."""
 
     name: ClassVar[str] = "inflow_thrust"
+    meaning: ClassVar[str] = "thrust falls in climb and grows in descent"
+    experiment: ClassVar[str] = "climbs and dives at 0.5 to 2 m/s"
     units: ClassVar[dict[str, str]] = {"coefficient": "N s/m"}
     source: ClassVar[str] = (
         "J. G. Leishman, Principles of Helicopter Aerodynamics, 2nd ed. 2006, ch. 3; H. Huang, G. Hoffmann, S. "

@@ -24,6 +24,8 @@ class MotorAsymmetry(Effect):
     """T *= 1 + spin_up (spin_down) while spinning up (down)."""
 
     name: ClassVar[str] = "motor_asymmetry"
+    meaning: ClassVar[str] = "the motors spin up and down at different speed"
+    experiment: ClassVar[str] = "large command steps up and down, rotor speed logged (cfb excite single-motor)"
     units: ClassVar[dict[str, str]] = {"spin_up": "1", "spin_down": "1", "width": "rad/s"}
     source: ClassVar[str] = (
         "F. Furrer, M. Burri, M. Achtelik, R. Siegwart, RotorS - a modular Gazebo MAV simulator framework, 2016 (a "

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect
 from cfb_mjx.model.effects.fields import vector
+from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -16,6 +17,8 @@ class MotorGainMismatch(Effect):
     """K_i *= 1 + relative_i."""
 
     name: ClassVar[str] = "motor_gain_mismatch"
+    meaning: ClassVar[str] = "single motors turn faster or slower than their command says"
+    experiment: ClassVar[str] = MotorTimeConstant.experiment
     units: ClassVar[dict[str, str]] = {"relative": "1"}
     source: ClassVar[str] = (
         "Q. Quan, Introduction to Multicopter Design and Control, 2017, ch. 4 (steady speed is affine in throttle, "

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect, Memory, Motors
 from cfb_mjx.model.effects.fields import number
+from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.parameters import Parameters
 
@@ -23,6 +24,9 @@ class MotorSecondOrder(Effect):
     """lag y' = K u - y, T Omega' = y - Omega."""
 
     name: ClassVar[str] = "motor_second_order"
+    meaning: ClassVar[str] = "the motors answer with a second lag"
+    experiment: ClassVar[str] = MotorTimeConstant.experiment
+    coarse: ClassVar[dict[int, float]] = {0: 0.3}
     units: ClassVar[dict[str, str]] = {"lag": "s"}
     source: ClassVar[str] = (
         "G. Franklin, J. D. Powell, A. Emami-Naeini, Feedback Control of Dynamic Systems, ch. 2 (motor with winding"

@@ -24,6 +24,8 @@ class MotorThermalDrift(Effect):
     """Steady rotor speed *= 1 - drop h, where h follows (Omega / 1594)^3 with time_constant."""
 
     name: ClassVar[str] = "motor_thermal_drift"
+    meaning: ClassVar[str] = "the motors slow down as they warm up"
+    experiment: ClassVar[str] = "hover for a minute from cold, twice: on a full and on a half-empty battery"
     units: ClassVar[dict[str, str]] = {"drop": "1", "time_constant": "s"}
     source: ClassVar[str] = (
         "D. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed. 2003 (temperature of windings and magnets)"

@@ -16,6 +16,8 @@ class MotorTimeConstant(Effect):
     """T *= 1 + relative."""
 
     name: ClassVar[str] = "motor_time_constant"
+    meaning: ClassVar[str] = "the motors answer slower or faster than declared"
+    experiment: ClassVar[str] = "cfb excite single-motor: steps of one motor at a time, rotor speed logged"
     units: ClassVar[dict[str, str]] = {"relative": "1"}
     source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, eq. 5"
     prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.5, 0.5)}

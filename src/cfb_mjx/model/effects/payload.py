@@ -23,6 +23,8 @@ class Payload(Effect):
     """A point mass fixed to the body."""
 
     name: ClassVar[str] = "payload"
+    meaning: ClassVar[str] = "the drone carries mass that was not declared"
+    experiment: ClassVar[str] = "weigh the drone, then hover and cfb excite roll-pitch"
     units: ClassVar[dict[str, str]] = {"mass": "kg", "height": "m", "offset": "m"}
     source: ClassVar[str] = (
         "J. L. Meriam, L. G. Kraige, Engineering Mechanics: Dynamics, app. B (parallel-axis theorem)"

@@ -35,6 +35,8 @@ class PayloadSwing(Effect):
     """A load on a string under the rotors' centre."""
 
     name: ClassVar[str] = "payload_swing"
+    meaning: ClassVar[str] = "a load swings below the drone"
+    experiment: ClassVar[str] = "a sharp stop followed by a hover of five seconds: a load swings on"
     units: ClassVar[dict[str, str]] = {"mass": "kg", "length": "m", "damping_ratio": "1"}
     source: ClassVar[str] = (
         "K. Sreenath, T. Lee, V. Kumar, Geometric control and differential flatness of a quadrotor UAV with a "

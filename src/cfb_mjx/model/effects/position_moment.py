@@ -31,6 +31,8 @@ class PositionMoment(Effect):
     """tau = (Omega / 1594) (-q_y, q_x, 0) with q = R^T (gradient * (p_x, p_y, 0))."""
 
     name: ClassVar[str] = "position_moment"
+    meaning: ClassVar[str] = "a torque hangs on the position, as in air that moves towards the middle of a room"
+    experiment: ClassVar[str] = "slow passes through the whole room, and the same passes in a larger one"
     units: ClassVar[dict[str, str]] = {"gradient": "N"}
     source: ClassVar[str] = (
         "F. Ricou, D. Spalding, Measurements of entrainment by axisymmetrical turbulent jets, J. Fluid Mech. 11(1), "

@@ -23,6 +23,8 @@ class RotorDrag(Effect):
     """F_xy = -coefficient (Omega / 1594) v_xy, shared by the four rotors."""
 
     name: ClassVar[str] = "rotor_drag"
+    meaning: ClassVar[str] = "the rotors drag against sideways motion, in proportion to speed"
+    experiment: ClassVar[str] = "straight passes at constant speed, 0.5 to 3 m/s, forth and back and in both body axes"
     units: ClassVar[dict[str, str]] = {"coefficient": "N s/m"}
     source: ClassVar[str] = (
         "P. Martin, E. Salaun, The true role of accelerometer feedback in quadrotor control, ICRA 2010; M. "

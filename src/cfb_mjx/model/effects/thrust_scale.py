@@ -16,6 +16,8 @@ class ThrustScale(Effect):
     """thrust_scale *= 1 + relative."""
 
     name: ClassVar[str] = "thrust_scale"
+    meaning: ClassVar[str] = "all rotors lift more or less than the declared thrust curve says"
+    experiment: ClassVar[str] = "weigh the drone, then hover: mass and thrust cannot be told apart in flight"
     units: ClassVar[dict[str, str]] = {"relative": "1"}
     source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, eq. 8"
     prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.2, 0.2)}

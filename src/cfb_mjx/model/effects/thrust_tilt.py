@@ -15,6 +15,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
+from cfb_mjx.model.effects.cog_offset import CogOffset
 from cfb_mjx.model.effects.fields import number, vector
 from cfb_mjx.model.vector import Vec
 
@@ -23,6 +24,8 @@ class ThrustTilt(Effect):
     """F += f (tilt_x, tilt_y, 0), tau_z += f twist l / sqrt(2)."""
 
     name: ClassVar[str] = "thrust_tilt"
+    meaning: ClassVar[str] = "the thrust does not point along the body's z axis"
+    experiment: ClassVar[str] = CogOffset.experiment
     units: ClassVar[dict[str, str]] = {"tilt": "rad", "twist": "rad"}
     source: ClassVar[str] = (
         "G. Michieletto, M. Ryll, A. Franchi, Fundamental actuation properties of multirotors, IEEE T-RO 34(3), "

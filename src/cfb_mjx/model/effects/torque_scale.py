@@ -16,6 +16,8 @@ class TorqueScale(Effect):
     """torque_scale *= 1 + relative."""
 
     name: ClassVar[str] = "torque_scale"
+    meaning: ClassVar[str] = "the rotors' reaction torque differs from the declared torque curve"
+    experiment: ClassVar[str] = "yaw turns and stops at constant height (cfb excite single-motor)"
     units: ClassVar[dict[str, str]] = {"relative": "1"}
     source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, eq. 9"
     prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.5, 0.5)}

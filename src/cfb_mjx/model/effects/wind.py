@@ -23,6 +23,10 @@ class Wind(Effect):
     """F = conductance * velocity in the world."""
 
     name: ClassVar[str] = "wind"
+    meaning: ClassVar[str] = "the air moves"
+    experiment: ClassVar[str] = (
+        "hover with the heading turned through 360 degrees: wind stays in the world, trim turns with the body"
+    )
     units: ClassVar[dict[str, str]] = {"velocity": "m/s", "conductance": "N s/m"}
     source: ClassVar[str] = (
         "S. Waslander, C. Wang, Wind disturbance estimation and rejection for quadrotor position control, AIAA 2009"

@@ -15,13 +15,14 @@ from cfb_mjx import __version__
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_json
 from cfb_mjx.model.effects import effect_from_mapping, effect_to_mapping
+from cfb_mjx.model.effects.catalogue import CATALOGUE, written
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 
 
 @dataclass
 class Checkpoint:
-    """One file; what belongs to other flights, another model or another version is not taken up."""
+    """One file; what belongs to other flights, another model, other effects or another version is not taken up."""
 
     path: Path | None = None
     key: str = ""
@@ -30,7 +31,8 @@ class Checkpoint:
     @classmethod
     def open(cls, path: Path, logs: list[Path], base: ModelFile) -> Checkpoint:
         """The checkpoint of a search over these files."""
-        digest = sha256(f"{__version__} {base}".encode())
+        effects = [written(name) for name in CATALOGUE]
+        digest = sha256(f"{__version__} {base} {effects}".encode())
         for log in logs:
             digest.update(log.name.encode() + log.read_bytes())
         key = digest.hexdigest()

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.model.effects import KNOWN, Effect
+from cfb_mjx.model.effects.catalogue import COMMAND_LEAD
 from cfb_mjx.model.effects.formula import PLACES, TERMS, ResidualFormula
 
-LEAD = "command_lead"
+LEAD = COMMAND_LEAD
 """Nuisance: commands sent between two rows are not in the log. Always free, never reported as an effect."""
 SHIFT = "sensor_time_shift"
 """Not an effect of the catalogue but a fault of the recording: command and rotor-speed columns late or early."""
@@ -21,13 +22,6 @@ TORQUE_UNIT, FORCE_UNIT = 3e-5, 4e-3
 """What a term of a formula typically adds, N m and N: about 1 rad/s^2 and 0.1 m/s^2 on this drone."""
 LEAST_SIZE = 1e-4
 """Signals smaller than this, in their units, were not excited."""
-_COARSE = {
-    ("command_delay", ()): 0.2,
-    ("motor_second_order", ()): 0.3,
-    ("esc_rate_limit", (("rotor", 1.0),)): 0.8,
-}
-"""Effects and probes whose slope at zero says little are looked for at this share of their prior range; no rotor comes
-near the limits that are tried for commands."""
 
 
 @dataclass(frozen=True)
@@ -75,14 +69,20 @@ def shapes(effect: Effect) -> list[Column]:
 
 def coarse(name: str) -> bool:
     """Whether an effect's slope at zero says little of its strength."""
-    return any(effect == name for effect, _ in _COARSE)
+    return name in KNOWN and bool(KNOWN[name].coarse)
 
 
 def step_of(column: Column, present: bool) -> float:
     """Step of the finite difference by which a column is found."""
-    share = 0.02 if present else _COARSE.get((column.effect, column.probe), 0.05)
+    share = 0.02 if present else _shares(column.effect).get(column.probe, 0.05)
     # A step towards positive values: where zero is the lowest value possible there is nothing on the other side.
     return share * 2 * column.scale
+
+
+def _shares(name: str) -> dict[tuple[tuple[str, float], ...], float]:
+    """Shares of the prior range at which an effect is looked for, by probe, where its slope at zero says little."""
+    kind = KNOWN.get(name)
+    return {} if kind is None else {tuple(kind.probes[i].items()): share for i, share in kind.coarse.items()}
 
 
 def moved(effect: Effect, column: Column, by: float, present: bool) -> Effect:
