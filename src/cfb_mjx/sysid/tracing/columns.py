@@ -73,6 +73,18 @@ def shapes(effect: Effect) -> list[Column]:
     return columns_of(kind.name, tuple(f for f in kind.prior if f in moving), {})
 
 
+def bounds(name: str, item: str) -> tuple[float, float]:
+    """Between which values a search moves a field of an effect."""
+    kind = KNOWN[name]
+    low, high = kind.prior[item]
+    if item in kind.strengths:
+        # A strength may exceed what is plausible (the report will say so), but not change a meaningless sign.
+        low, high = (0.0 if low >= 0 else 3 * low), 3 * high
+    # Downwards what is unusual is out of reach as well: a lag or a gain of next to nothing is no motor.
+    limits = kind.limits[item]
+    return max(low, limits.soft_low), min(high, limits.hard_high)
+
+
 def coarse(name: str) -> bool:
     """Whether an effect's slope at zero says little of its strength."""
     return any(effect == name for effect, _ in _COARSE)
