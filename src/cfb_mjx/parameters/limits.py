@@ -65,12 +65,12 @@ class Limits:
         numbers = concrete(value)
         if numbers is None:
             return
-        impossible = ~self.holds(numbers)
+        impossible = np.asarray(~self.holds(numbers))
         if impossible.any():
             said, number = _first(name, numbers, impossible)
             span = _span(self.hard_low, self.hard_high, unit)
             raise CfbError(f"{said} must lie between {span}{self._hint(number, unit)}.")
-        unusual = ~self.usual(numbers)
+        unusual = np.asarray(~self.usual(numbers))
         if warn and unusual.any():
             said, number = _first(name, numbers, unusual)
             span = _span(self.soft_low, self.soft_high, unit)
