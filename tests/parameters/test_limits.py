@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import warnings
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -15,6 +18,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from cfb_mjx.cli.evaluating import changed_model
+from cfb_mjx.envs import TargetTask
 from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.model import Quadrotor, rollout, step
 from cfb_mjx.model.effects import KNOWN, Payload, PayloadSwing, RotorDrag, effect_from_mapping, effect_to_mapping
@@ -31,9 +35,12 @@ from cfb_mjx.parameters import (
     save_model_file,
 )
 from cfb_mjx.parameters.randomisation import Range
+from cfb_mjx.sysid.identification.result import Fit
 from cfb_mjx.sysid.sensor_faults import ATTRIBUTES, LIMITS, SensorFaults
 from cfb_mjx.sysid.tracing.columns import bounds
+from cfb_mjx.train.config import load_config
 from cfb_mjx.train.plants import load_plants
+from cfb_mjx.train.run import Training
 
 GUARDS = load_model_file("cfb-guards")
 NOMINAL = GUARDS.parameters()
@@ -183,6 +190,16 @@ def test_sensor_faults_that_cannot_be_are_refused_by_name(name, key):
     check()
 
 
+def test_the_page_says_what_may_be():
+    page = (Path(__file__).resolve().parents[2] / "docs" / "model.md").read_text()
+    for key, specification in SPECIFICATIONS.items():
+        unit, limits = specification.unit, specification.limits
+        spans = f"{limits.hard_low:g} to {limits.hard_high:g} | {limits.soft_low:g} to {limits.soft_high:g}"
+        assert f"| `{key}` | {unit} | {spans} |" in page
+    named = re.sub(r"\s+", " ", page)
+    assert f'`cfb_mjx.model.effects.KNOWN["payload"].limits["mass"]` is `{KNOWN["payload"].limits["mass"]}`' in named
+
+
 def test_values_of_the_issue_are_refused():
     """Each of these was flown."""
     for item in (
@@ -308,12 +325,32 @@ def test_a_traced_magnitude_never_yields_an_impossible_drone():
     assert np.isfinite(sample(jax.random.split(jax.random.key(2), 500), 1.0).thrust_scale).all()
 
 
-def test_a_training_whose_ranges_allow_impossible_drones_is_refused(tmp_path):
-    from cfb_mjx.train.config import load_config
-    from cfb_mjx.train.run import Training
-
+def test_a_training_whose_ranges_allow_impossible_drones_is_refused():
     config = load_config("target", ("randomisation.magnitude=6",))
     refused(lambda: Training.prepare(config, {}), "randomisation.magnitude = 6", "at most")
+
+
+# Fits.
+
+
+def test_a_fit_that_ends_where_nothing_can_be_is_refused_before_it_is_written():
+    def fitted(**values):
+        drone = eqx.tree_at(
+            lambda p: [getattr(p, key) for key in values], NOMINAL, list(map(jnp.asarray, values.values()))
+        )
+        return Fit.model_file(SimpleNamespace(names=tuple(values), estimates={}, parameters=drone), GUARDS, "a fit")
+
+    refused(lambda: fitted(mass=2e5), "the fit's parameters.mass = 200000", "--parameters")
+    refused(lambda: fitted(observation_delay=-0.002), "the fit's parameters.observation_delay = -0.002")
+    with pytest.warns(CfbWarning, match=r"the fit's parameters\.mass = 0\.3 is unusual"):
+        fitted(mass=0.3)
+    assert fitted(mass=0.05).entries["mass"].value == 0.05
+
+
+def test_gymnasium_refuses_ranges_that_allow_impossible_drones():
+    gym = pytest.importorskip("cfb_mjx.envs.gym", exc_type=CfbError)
+    wild = TargetTask(randomisation=load_randomisation("paper"), magnitude=6.0)
+    refused(lambda: gym.TargetVectorEnv(2, wild), "magnitude = 6", "at most")
 
 
 # Parameters put into a model behind the constructor's back.

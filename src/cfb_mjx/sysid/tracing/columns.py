@@ -80,9 +80,10 @@ def bounds(name: str, item: str) -> tuple[float, float]:
     if item in kind.strengths:
         # A strength may exceed what is plausible (the report will say so), but not change a meaningless sign.
         low, high = (0.0 if low >= 0 else 3 * low), 3 * high
+    if item not in kind.limits:  # of a user's own effect
+        return low, high
     # Downwards what is unusual is out of reach as well: a lag or a gain of next to nothing is no motor.
-    limits = kind.limits[item]
-    return max(low, limits.soft_low), min(high, limits.hard_high)
+    return max(low, kind.limits[item].soft_low), min(high, kind.limits[item].hard_high)
 
 
 def coarse(name: str) -> bool:
