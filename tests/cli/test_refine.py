@@ -8,7 +8,11 @@ import pytest
 
 from cfb_mjx.cli import refining
 from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import read_log
+from cfb_mjx.model.effects import RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file
+from cfb_mjx.sysid.sensor_faults import HEALTHY
+from cfb_mjx.sysid.tracing.given import Given
 
 LOGS = Path(__file__).resolve().parents[2] / "data" / "flight_logs"
 LOG = LOGS / "drag.mcap"
@@ -31,6 +35,19 @@ def test_a_refined_model_is_marked_and_taken_by_other_commands(cfb, tmp_path):
     with pytest.raises(CfbError, match=r"predictor, not a plant.*--force"):
         written.require_plant("training", "--force")
     assert cfb("evaluate", LOG, "--model", model).returncode == 0
+
+
+def test_a_number_that_ends_at_its_bound_says_so(monkeypatch):
+    """By innovations, too: there a strength may not change its sign."""
+
+    def found(drag):
+        given = Given((RotorDrag(coefficient=drag),), {"rotor_drag": {"coefficient": 1e-3}}, HEALTHY)
+        monkeypatch.setattr("cfb_mjx.sysid.tracing.given.fit_given", lambda *_: given)
+        _, report = refining.by_innovations(load_model_file("cfb-guards"), [read_log(LOG)], ["rotor_drag"])
+        return report["numbers"]["rotor_drag.coefficient"]["at_bound"]
+
+    assert found(0.0)
+    assert not found(0.01)
 
 
 def test_plants_say_nothing_and_unknown_kinds_are_refused(tmp_path):

@@ -5,13 +5,16 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pyarrow.csv
 import pytest
 
+from cfb_mjx.cli import unusual_said_once
 from cfb_mjx.cli.interrupts import held_back
+from cfb_mjx.parameters import load_model_file
 
 CFB = str(Path(sys.executable).with_name("cfb"))
 
@@ -103,7 +106,9 @@ def test_empty_and_truncated_files(cfb, files, tmp_path, kind, keep):
         (["evaluate", "FLIGHT", "--model", "cfb-unknown"], ["cfb-unknown", "cfb-guards"]),
         (["evaluate", "FLIGHT", "--set", "mass=heavy"], ["mass=heavy"]),
         (["evaluate", "FLIGHT", "--set", "mass=-1"], ["mass"]),
+        (["evaluate", "FLIGHT", "--set", "mass=38.5"], ["parameters.mass = 38.5", "38.5 g is 0.0385"]),
         (["evaluate", "FLIGHT", "--set", "weight=1"], ["weight"]),
+        (["fly", "pid", "--task", "hover", "--plants", "2", "--magnitude", "6"], ["--magnitude = 6", "at most"]),
         (["evaluate", "FLIGHT", "FLIGHT"], ["flight", "name"]),
         (["evaluate", "FLIGHT", "--json", "nowhere/x.json"], ["nowhere"]),
         (["import", "FLIGHT", "-o", "out.csv"], ["out.csv"]),
@@ -130,6 +135,15 @@ def test_bad_arguments(cfb, files, tmp_path, arguments, needles):
 def test_bad_model_files(cfb, files, tmp_path, text, needle):
     (tmp_path / "m.yaml").write_text(text)
     refused(cfb("evaluate", files / "flight.mcap", "--model", tmp_path / "m.yaml"), "m.yaml", needle)
+
+
+def test_what_is_unusual_is_said_once_and_in_one_sentence(capsys):
+    with unusual_said_once():
+        for _ in range(2):
+            with warnings.catch_warnings():  # as libraries do: Python then forgets what it has shown
+                load_model_file("cfb-guards").with_values("scales", mass=0.3)
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["cfb: model cfb-guards: parameters.mass = 0.3 is unusual; mostly it lies between 0.015 and 0.2 kg."]
 
 
 def run_after(preparation, *arguments, **options):

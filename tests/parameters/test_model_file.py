@@ -45,7 +45,7 @@ def test_every_constant_of_a_preset_has_a_source(name):
     for key, entry in model.entries.items():
         assert len(entry.source) > 5, key
         assert entry.value.shape == SPECIFICATIONS[key].shape
-        assert SPECIFICATIONS[key].holds(entry.value)
+        SPECIFICATIONS[key].check(entry.value, key)
 
 
 @pytest.mark.parametrize("name", sorted(PAPER))
@@ -83,7 +83,7 @@ def test_round_trip_of_awkward_numbers_is_lossless(tmp_path):
         "fit of 3 logs: « Übung », 50 %\nsecond line",
         mass=0.1 + 1e-17 + 0.1 / 3,
         inertia=[1e-5 / 3, 2e-5 / 7, 3e-5 / 11 + 1e-12],
-        motor_gain=np.array([2900.1, 1 / 3, 1e22, 5e3]),
+        motor_gain=np.array([2900.1, 1e4 / 3, 1e3 + 1e-10, 5e3]),
         rotor_inertia=5e-324,
     )
     save_model_file(model, tmp_path / "m.yaml")

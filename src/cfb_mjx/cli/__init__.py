@@ -5,11 +5,14 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from cfb_mjx import __version__
 from cfb_mjx.cli.interrupts import heard
 from cfb_mjx.cli.runtime import set_up_xla
-from cfb_mjx.errors import CfbError
+from cfb_mjx.errors import CfbError, CfbWarning
 
 SUMMARY = {
     "import": "convert a flight log to MCAP",
@@ -41,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
     """
     set_up_xla()
     try:
-        with heard():
+        with heard(), unusual_said_once():
             status = _dispatch(sys.argv[1:] if arguments is None else arguments)
         sys.stdout.flush()
     except CfbError as error:
@@ -59,6 +62,24 @@ def main(arguments: list[str] | None = None) -> int:
     except MemoryError:
         return _fail("out of memory; use fewer drones or shorter logs.", 2)
     return status
+
+
+@contextmanager
+def unusual_said_once() -> Iterator[None]:
+    """Print every `CfbWarning` once, as a sentence on standard error; others go where they went."""
+    said, before = set(), warnings.showwarning
+
+    def show(message, category, *where, **more):
+        if not issubclass(category, CfbWarning):
+            before(message, category, *where, **more)
+        elif str(message) not in said:
+            said.add(str(message))
+            print(f"cfb: {message}", file=sys.stderr, flush=True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", CfbWarning)
+        warnings.showwarning = show
+        yield
 
 
 def _dispatch(arguments: list[str]) -> int:

@@ -86,7 +86,7 @@ def run_fly(
     from cfb_mjx.envs import Noise, TargetTask
     from cfb_mjx.envs.episode import QUIET, longest_delay_s
     from cfb_mjx.model import Quadrotor
-    from cfb_mjx.parameters import load_model_file, load_randomisation
+    from cfb_mjx.parameters import load_model_file, load_randomisation, require_possible
     from cfb_mjx.train import flying
     from cfb_mjx.train.flips import FLIPS, flips
 
@@ -95,6 +95,7 @@ def run_fly(
     described = load_model_file(model)
     nominal = Quadrotor.from_file(described)
     spread = load_randomisation(randomisation)
+    require_possible(nominal.parameters, spread, magnitude, "--magnitude")
     course = TargetTask(
         noise=Noise() if noise else QUIET,
         randomisation=spread if magnitude else None,

@@ -84,6 +84,7 @@ def by_innovations(
     """The model with some effects fitted to innovations, and what to report."""
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid.flight import usual_delay
+    from cfb_mjx.sysid.tracing.columns import bounds
     from cfb_mjx.sysid.tracing.given import fit_given
 
     parameters = base.parameters()
@@ -94,8 +95,9 @@ def by_innovations(
     for mapping in mappings:
         std = mapping.get("uncertainty")
         for field, value in mapping["parameters"].items() if std else ():
+            low, high = bounds(mapping["name"], field)
             for name, (v, s) in _pairs(f"{mapping['name']}.{field}", value, std.get(field)).items():
-                rows[name] = {"value": v, "std": s, "at_bound": False}
+                rows[name] = {"value": v, "std": s, "at_bound": not low < v < high}
     effects = (*mappings, *found.faults.to_mappings())
     return replace(base, effects=effects, description=_description(base, names)), {"numbers": rows}
 

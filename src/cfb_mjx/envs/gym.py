@@ -17,6 +17,7 @@ from cfb_mjx.envs.episode import Task, choose, observe, reset, step
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.parameters import require_possible
 
 try:
     import gymnasium
@@ -46,6 +47,8 @@ class TargetVectorEnv(VectorEnv):
         self.task = TargetTask() if task is None else task
         self.nominal = model if isinstance(model, Quadrotor) else Quadrotor.from_file(model)
         self.task.hold(self.nominal)
+        if self.task.randomisation is not None:
+            require_possible(self.nominal.parameters, self.task.randomisation, self.task.magnitude)
         self.num_envs = num_envs
         self.render_mode = None
         self.single_observation_space, self.single_action_space = _spaces(self.task)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Literal
 
@@ -10,14 +11,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.errors import CfbError
+from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.model import rotors
 from cfb_mjx.model.bodies import Body, RigidBody
 from cfb_mjx.model.effects import SENSOR_FAULTS, Condition, Effect, Motors, Wrench, effect_from_mapping, overrides
+from cfb_mjx.model.effects.inertia import Inertia
 from cfb_mjx.model.integrate import END, INTEGRATORS, MIDDLE, START
 from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec, rotate_inverse
-from cfb_mjx.parameters import ModelFile, Parameters, load_model_file
+from cfb_mjx.parameters import SPECIFICATIONS, ModelFile, Parameters, load_model_file
+from cfb_mjx.parameters.limits import concrete
+from cfb_mjx.parameters.parameters import physical_inertia
 
 
 class Quadrotor(eqx.Module):
@@ -60,17 +64,32 @@ class Quadrotor(eqx.Module):
         """From a preset name, a model YAML or a loaded `ModelFile`, with its effects.
 
         Raises:
-            CfbError: as `cfb_mjx.parameters.load_model_file`, or an unknown effect.
+            CfbError: as `cfb_mjx.parameters.load_model_file`; an unknown effect or an impossible number of one; or
+                effects that together make an impossible drone.
+
+        Warns:
+            CfbWarning: unusual numbers, or a drone that cannot hover.
         """
         where = str(model) if not isinstance(model, ModelFile) else model.name
         model = model if isinstance(model, ModelFile) else load_model_file(model)
         # What a model file says of the sensors does not change how the drone flies.
         physical = (item for item in model.effects if item.get("name") not in SENSOR_FAULTS)
         effects = tuple(effect_from_mapping(item, where) for item in physical)
-        return cls(parameters=model.parameters(), effects=effects, **choices)
+        found = cls(parameters=model.parameters(), effects=effects, **choices)
+        _require_possible(found, model, where)
+        return found
 
     def changed_parameters(self) -> Parameters:
-        """The parameters with what effects change in them (payload, centre of gravity ...)."""
+        """The parameters with what effects change in them (payload, centre of gravity ...).
+
+        Raises:
+            CfbError: a parameter, or a number of an effect, that is no array or has another shape, named.
+        """
+        self.parameters.require_arrays()
+        for effect in self.effects:
+            for field in effect.limits:
+                if isinstance(value := getattr(effect, field), int | float):
+                    raise CfbError(f"{effect.name}.{field} = {value!r} is no array; put jnp.asarray(...) there.")
         parameters = self.parameters
         for effect in self.effects:
             parameters = effect.change(parameters)
@@ -94,6 +113,35 @@ class Quadrotor(eqx.Module):
     def hover_command(self) -> Float[Array, "4"]:
         """Commands that hold `hover_state` (forces of effects not considered)."""
         return rotors.hover_command(self.changed_parameters())
+
+
+def _require_possible(model: Quadrotor, described: ModelFile, where: str) -> None:
+    """Refuse what effects make of a drone where that cannot be, and warn where it cannot hover.
+
+    A predictor's inertia is free; and of a fitted one (it comes with its uncertainty) the best estimate may be one that
+    no body has: of that one is warned.
+    """
+    changed = model.changed_parameters()
+    if concrete(changed.mass) is None:
+        return
+    bodies = described.kind == "plant"
+    for name, specification in SPECIFICATIONS.items():
+        specification.check(getattr(changed, name), f"{where}: with its effects, parameters.{name}", together=False)
+    if bodies and not physical_inertia(changed.inertia):
+        said = (
+            f"{where}: with its effects, parameters.inertia = {changed.inertia.tolist()} is that of no rigid body: one"
+        )
+        said += " moment is larger than the sum of the other two"
+        if not any("uncertainty" in item for item in described.effects if item.get("name") == Inertia.name):
+            raise CfbError(f"{said}.")
+        warnings.warn(f"{said} (a fit may err so far).", CfbWarning, stacklevel=3)
+    speed = changed.motor_gain + changed.motor_speed_offset
+    lift, weight = float(jnp.sum(rotors.thrust(changed, speed))), float(changed.mass * changed.gravity)
+    if lift < weight:
+        said = (
+            f"{where}: the drone cannot hover: it weighs {weight:.3g} N, its rotors lift {lift:.3g} N at full command"
+        )
+        warnings.warn(f"{said}; check mass and thrust.", CfbWarning, stacklevel=3)
 
 
 def begin(model: Quadrotor, state: State) -> State:
@@ -123,7 +171,12 @@ class Prepared(eqx.Module):
 
 
 def prepare(model: Quadrotor, dt: float | Float[Array, ""] | None = None) -> Prepared:
-    """Compute once what every integration step of ``dt`` seconds (default: the model's) needs."""
+    """Compute once what every integration step of ``dt`` seconds (default: the model's) needs.
+
+    Raises:
+        CfbError: a parameter that is no array, or has batch axes (`jax.vmap` over the model takes them), named.
+    """
+    model.parameters.require_arrays(batched=False)
     dt = model.dt / model.substeps if dt is None else dt
     dt = jnp.asarray(dt, model.parameters.mass.dtype)
     parameters = _unstacked(model.changed_parameters())

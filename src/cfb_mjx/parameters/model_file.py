@@ -71,6 +71,9 @@ class ModelFile:
 
         Raises:
             CfbError: an unknown name or an impossible value.
+
+        Warns:
+            CfbWarning: an unusual value.
         """
         where = f"model {self.name}"
         if not source:
@@ -89,7 +92,10 @@ def load_model_file(name_or_path: str | Path) -> ModelFile:
 
     Raises:
         CfbError: no such preset or file, broken YAML, unknown or missing keys, missing or wrong units,
-            impossible values; the message names the file and the key.
+            impossible values (`SPECIFICATIONS`); the message names the file and the key.
+
+    Warns:
+        CfbWarning: values that are possible but unusual, named alike.
     """
     path, document = load_named(name_or_path, "model", FORMAT, "parameters")
     refuse_unknown(document, _TOP_LEVEL, path, "")
@@ -165,14 +171,8 @@ def _entry(key: str, raw: Any, path: Path) -> Entry:
 
 def _value(key: str, raw: Any, path) -> np.ndarray:
     value = _numbers(key, raw, path, "value")
-    specification = SPECIFICATIONS[key]
-    if not specification.holds(value):
-        raise CfbError(f"{path}: parameters.{key} = {_plain(value)} must {_be(specification.condition)}.")
+    SPECIFICATIONS[key].check(value, f"{path}: parameters.{key}", warn=True)
     return value
-
-
-def _be(condition: str) -> str:
-    return condition if condition.startswith("give") else f"be {condition}"
 
 
 def _numbers(key: str, raw: Any, path, what: str) -> np.ndarray:

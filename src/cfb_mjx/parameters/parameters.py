@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.parameters.limits import Limits, concrete
 
 
 def _array(value) -> Array:
@@ -55,63 +59,115 @@ class Parameters(eqx.Module):
     attitude_offset: Float[Array, "*batch 3"] = eqx.field(converter=_array)
     """Rotation vector from the true body axes to the axes the estimator reports, rad."""
 
+    def __check_init__(self):
+        for name, specification in SPECIFICATIONS.items():
+            specification.check(getattr(self, name), f"parameters.{name}")
+
+    def require_arrays(self, batched: bool = True) -> None:
+        """Refuse what ``eqx.tree_at`` lets in: a Python number in an array's place, or an array of another shape.
+
+        Args:
+            batched: whether batch axes may come first.
+
+        Raises:
+            CfbError: a field that is no array, or of another shape, named.
+        """
+        for name, specification in SPECIFICATIONS.items():
+            value, shape = getattr(self, name), specification.shape
+            if not hasattr(value, "shape") or not hasattr(value, "dtype"):
+                raise CfbError(
+                    f"parameters.{name} = {value!r} is a {type(value).__name__}, not an array of shape {shape}; "
+                    "put jnp.asarray(...) there."
+                )
+            axes = value.ndim - len(shape)
+            if axes < 0 or value.shape[axes:] != shape:
+                raise CfbError(f"parameters.{name} has shape {value.shape}; it must be {shape}, after any batch axes.")
+            if axes and not batched:
+                raise CfbError(f"parameters.{name} has shape {value.shape}, not {shape}; use jax.vmap for many drones.")
+
 
 @dataclass(frozen=True)
 class Specification:
-    """Unit, shape (without batch axes) and the condition a parameter must meet."""
+    """Unit, shape (without batch axes), limits of every component, and what the components must do together."""
 
     unit: str
     shape: tuple[int, ...]
     meaning: str
-    condition: str
-    holds: Callable[[np.ndarray], bool]
+    limits: Limits
+    condition: str = ""
+    """What ``together`` asks for, after "must"."""
+    together: Callable[[Any], Any] | None = None
+    """Whether components (last axis, NumPy or jax) make sense together."""
+
+    def check(self, value: Any, name: str, warn: bool = False, together: bool = True) -> None:
+        """Refuse what cannot be. Nothing is said of traced numbers.
+
+        Args:
+            value: number or array, batch axes first.
+            name: of it, for messages.
+            warn: also warn of what is unusual.
+            together: also ask whether the components make sense together.
+
+        Raises:
+            CfbError: an impossible value, named.
+        """
+        self.limits.check(value, name, self.unit, warn)
+        numbers = concrete(value)
+        if together and self.together is not None and numbers is not None and not np.all(self.together(numbers)):
+            raise CfbError(f"{name} = {numbers.tolist()} must {self.condition}.")
 
 
-def _positive(x: np.ndarray) -> bool:
-    return bool(np.all(x > 0))
-
-
-def _not_negative(x: np.ndarray) -> bool:
-    return bool(np.all(x >= 0))
-
-
-def _any(x: np.ndarray) -> bool:
-    return True
-
-
-def _physical_inertia(x: np.ndarray) -> bool:
-    # Equality is a flat plate: still a body, so it is allowed.
-    return bool(np.all(x > 0) and 2 * x.max() <= x.sum() * (1 + 1e-9))
+def physical_inertia(x: Any) -> Any:
+    """Whether a rigid body can have these principal moments of inertia (last axis); a flat plate can."""
+    # The slack is what single precision needs.
+    return 2 * x.max(-1) <= x.sum(-1) * (1 + 1e-6)
 
 
 SPECIFICATIONS: dict[str, Specification] = {
-    "mass": Specification("kg", (), "take-off mass", "positive", _positive),
+    "mass": Specification("kg", (), "take-off mass", Limits(1e-3, 10.0, 0.015, 0.2)),
     "inertia": Specification(
         "kg m^2",
         (3,),
         "principal moments of inertia",
-        "positive and obey the triangle inequality (no moment larger than the sum of the other two)",
-        _physical_inertia,
+        Limits(1e-8, 1.0, 2e-6, 1e-3),
+        "obey the triangle inequality (no moment larger than the sum of the other two)",
+        physical_inertia,
     ),
-    "center_of_gravity": Specification("m", (3,), "centre of gravity from the rotors' centre", "finite", _any),
-    "gravity": Specification("m/s^2", (), "gravitational acceleration", "zero or positive", _not_negative),
-    "rotor_spacing": Specification("m", (), "distance between neighbouring rotors", "positive", _positive),
-    "rotor_inertia": Specification("kg m^2", (), "inertia of one rotor", "zero or positive", _not_negative),
-    "motor_time_constant": Specification("s", (4,), "motor lag", "positive", _positive),
-    "motor_gain": Specification("rad/s", (4,), "steady rotor speed per unit command", "positive", _positive),
-    "motor_speed_offset": Specification("rad/s", (4,), "steady rotor speed at zero command", "finite", _any),
-    "reference_rotor_speed": Specification("rad/s", (), "rotor speed where s = 1", "positive", _positive),
+    "center_of_gravity": Specification(
+        "m", (3,), "centre of gravity from the rotors' centre", Limits(-0.1, 0.1, -0.03, 0.03)
+    ),
+    "gravity": Specification("m/s^2", (), "gravitational acceleration", Limits(0.0, 100.0, 1.0, 25.0)),
+    "rotor_spacing": Specification("m", (), "distance between neighbouring rotors", Limits(0.005, 2.0, 0.03, 0.25)),
+    "rotor_inertia": Specification("kg m^2", (), "inertia of one rotor", Limits(0.0, 1e-4, 0.0, 1e-6)),
+    "motor_time_constant": Specification("s", (4,), "motor lag", Limits(1e-5, 5.0, 1e-3, 0.3)),
+    # At 20000 rad/s tips of 3 cm blades would move at 600 m/s: larger numbers are in rpm.
+    "motor_gain": Specification("rad/s", (4,), "steady rotor speed per unit command", Limits(1.0, 2e4, 500.0, 6000.0)),
+    "motor_speed_offset": Specification(
+        "rad/s", (4,), "steady rotor speed at zero command", Limits(-2e4, 2e4, -1000.0, 1000.0)
+    ),
+    "reference_rotor_speed": Specification("rad/s", (), "rotor speed where s = 1", Limits(1e-3, 1e6, 1.0, 2e4)),
     "thrust_polynomial": Specification(
-        "N", (3,), "thrust cubic", "give positive thrust at s = 1", lambda x: bool(np.all(x.sum(-1) > 0))
+        "N",
+        (3,),
+        "thrust cubic",
+        Limits(-100.0, 100.0, -5.0, 5.0),
+        "give positive thrust at s = 1",
+        lambda x: x.sum(-1) > 0,
     ),
     "torque_polynomial": Specification(
-        "N m", (3,), "torque cubic", "give zero or positive torque at s = 1", lambda x: bool(np.all(x.sum(-1) >= 0))
+        "N m",
+        (3,),
+        "torque cubic",
+        Limits(-10.0, 10.0, -0.1, 0.1),
+        "give zero or positive torque at s = 1",
+        lambda x: x.sum(-1) >= 0,
     ),
-    "thrust_scale": Specification("1", (4,), "factor on thrust", "zero or positive", _not_negative),
-    "torque_scale": Specification("1", (4,), "factor on aerodynamic torque", "zero or positive", _not_negative),
-    "observation_delay": Specification("s", (), "age of pose and velocity", "zero or positive", _not_negative),
-    "attitude_offset": Specification("rad", (3,), "attitude error of the estimator", "finite", _any),
+    "thrust_scale": Specification("1", (4,), "factor on thrust", Limits(0.0, 10.0, 0.3, 2.0)),
+    "torque_scale": Specification("1", (4,), "factor on aerodynamic torque", Limits(0.0, 10.0, 0.2, 4.0)),
+    "observation_delay": Specification("s", (), "age of pose and velocity", Limits(0.0, 1.0, 0.0, 0.1)),
+    "attitude_offset": Specification("rad", (3,), "attitude error of the estimator", Limits(-3.15, 3.15, -0.3, 0.3)),
 }
+"""What every parameter is and where it may lie: files, ``--set``, randomisation, fits and constructors ask here."""
 
 DEFAULTS: dict[str, float] = {
     "center_of_gravity": 0.0,

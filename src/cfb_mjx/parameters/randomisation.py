@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cfb_mjx.documents import load_named, refuse_unknown
 from cfb_mjx.errors import CfbError
+from cfb_mjx.parameters.limits import concrete
 from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters
 
 FORMAT = "cfb_mjx randomisation 1"
-_FREE_SIGN = ("center_of_gravity", "motor_speed_offset", "attitude_offset")
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,8 @@ def _range(key: str, raw, path: Path) -> Range:
     if len(widths) not in (1, *size):
         raise CfbError(f"{path}: ranges.{key}.half_width must have 1 or {size[0] if size else 1} numbers.")
     relative = raw["unit"] == "relative"
-    if not relative and key not in _FREE_SIGN:
+    specification = SPECIFICATIONS[key]
+    if not relative and (specification.limits.hard_low >= 0 or specification.together):
         raise CfbError(f"{path}: ranges.{key}.unit must be 'relative': a width in {unit} would allow the wrong sign.")
     if relative and max(widths) >= 1:
         raise CfbError(f"{path}: ranges.{key}.half_width = {width!r} relative would allow values of the wrong sign.")
@@ -96,10 +99,15 @@ def sample_parameters(
         randomisation: ranges; the paper's (section V) by default.
         magnitude: factor on every range; 0 returns the nominal drone. May be traced.
 
-    A drawn inertia that no rigid body can have (the paper's independent +-20 % allows some) has its largest moment
-    reduced to the sum of the other two.
+    Raises:
+        CfbError: ranges whose draws could lie beyond what can be (`require_possible`).
+
+    Where ``nominal`` or ``magnitude`` is traced, nothing can be refused: there a number drawn beyond what can be is
+    NaN, and so is every state of that drone. A drawn inertia that no rigid body can have (the paper's independent
+    +-20 % allows some) has its largest moment reduced to the sum of the other two.
     """
     randomisation = load_randomisation() if randomisation is None else randomisation
+    require_possible(nominal, randomisation, magnitude)
     drawn = {}
     for name, spread in randomisation.ranges:
         value = getattr(nominal, name)
@@ -112,9 +120,73 @@ def sample_parameters(
         drawn[name] = value * (1 + change) if spread.relative else value + change
     if "inertia" in drawn:
         drawn["inertia"] = _physical(drawn["inertia"])
+    drawn = {name: _possible(name, value) for name, value in drawn.items()}
     return eqx.tree_at(
         lambda p: [getattr(p, name) for name in drawn], nominal, [jnp.asarray(v) for v in drawn.values()]
     )
+
+
+def require_possible(
+    nominal: Parameters,
+    randomisation: Randomisation,
+    magnitude: float | Float[Array, ""] = 1.0,
+    what: str = "magnitude",
+) -> None:
+    """Refuse ranges whose draws could lie beyond what can be (`SPECIFICATIONS`). Nothing is said of what is traced.
+
+    Args:
+        nominal: parameters about which to draw; batch axes may come first.
+        randomisation: ranges.
+        magnitude: factor on every range.
+        what: the magnitude is called, for messages.
+
+    Raises:
+        CfbError: one parameter that could be drawn beyond its limits, and the largest magnitude that fits all.
+    """
+    asked = concrete(magnitude)
+    if asked is None:
+        return
+    fitting = {}
+    for name, spread in randomisation.ranges:
+        center = concrete(getattr(nominal, name))
+        if center is not None:
+            fitting[name] = _largest_magnitude(name, center, spread)
+    if not fitting or np.max(np.abs(asked)) <= min(fitting.values()):
+        return
+    name = min(fitting, key=fitting.__getitem__)
+    specification, most = SPECIFICATIONS[name], max(math.floor(1e3 * fitting[name]) / 1e3, 0.0)
+    limits = specification.limits
+    span = specification.condition or f"lie between {limits.hard_low:g} and {limits.hard_high:g} {specification.unit}"
+    raise CfbError(
+        f"{what} = {np.max(np.abs(asked)):g}: randomisation '{randomisation.name}' could then draw a {name} that does"
+        f" not {span}; at most {most:g} fits this drone."
+    )
+
+
+def _largest_magnitude(name: str, center: np.ndarray, spread: Range) -> float:
+    """Up to which no draw leaves what can be; below zero where the nominal value does."""
+    limits = SPECIFICATIONS[name].limits
+    width = np.asarray(spread.half_width if len(spread.half_width) > 1 else spread.half_width[0])
+    reach = np.broadcast_to(np.abs(center) * width if spread.relative else width, center.shape)
+    room = np.minimum(limits.hard_high - center, center - limits.hard_low)
+    rooms, reaches = [room], [reach]
+    if name in _SUMS:
+        rooms, reaches = [room, center.sum(-1)], [reach, reach.sum(-1)]
+    found = [np.where(r > 0, x / np.where(r > 0, r, 1.0), np.inf) for x, r in zip(rooms, reaches, strict=True)]
+    return float(min(x.min() for x in found))
+
+
+_SUMS = ("thrust_polynomial", "torque_polynomial")
+"""Their coefficients must have a positive sum."""
+
+
+def _possible(name: str, value: Array) -> Array:
+    """The value, and NaN where it cannot be."""
+    specification = SPECIFICATIONS[name]
+    holds = specification.limits.holds(value)
+    if name in _SUMS:
+        holds = holds & specification.together(value)[..., None]
+    return jnp.where(holds, value, jnp.nan)
 
 
 def _physical(inertia: Float[Array, "3"]) -> Float[Array, "3"]:

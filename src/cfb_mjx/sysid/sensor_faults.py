@@ -14,6 +14,7 @@ from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import tidy
 from cfb_mjx.model import State
 from cfb_mjx.model.effects import SENSOR_FAULTS
+from cfb_mjx.parameters import Limits
 from cfb_mjx.sysid.velocity_stretch import VelocityStretch
 from cfb_mjx.sysid.windows import Windows
 
@@ -30,6 +31,17 @@ ATTRIBUTES = {
     "sensor_time_shift": {"shift": "motor_shift"},
 }
 """Attributes of `SensorFaults` that hold the parameters of a fault of `SENSOR_FAULTS`."""
+LIMITS = {
+    "delay": Limits(-0.5, 1.0, -0.05, 0.1),
+    "velocity_scale": Limits(0.1, 10.0, 0.5, 2.0),
+    "vertical_scale": Limits(0.1, 10.0, 0.5, 2.0),
+    "velocity_rise": Limits(0.0, 1e3, 0.0, 30.0),
+    "velocity_fade": Limits(1e-3, 1e6, 0.01, 1e3),
+    "with_attitude": Limits(1.0, 1.0, 1.0, 1.0),
+    "gyro_lag": Limits(-0.1, 1.0, -0.01, 0.05),
+    "motor_shift": Limits(-1.0, 1.0, -0.06, 0.06),
+}
+"""Where each attribute may lie."""
 FORMS = ("rise", "fade", "with_attitude")
 """Of these, what says nothing without another."""
 STRETCH_STEP = 0.05
@@ -187,7 +199,10 @@ class SensorFaults:
         """The faults among the effects of a model file.
 
         Raises:
-            CfbError: a fault without its number, or with something else; ``where`` is the file.
+            CfbError: a fault without its number, with something else, or with what cannot be; ``where`` is the file.
+
+        Warns:
+            CfbWarning: unusual numbers.
         """
         found = {}
         for item in items:
@@ -200,16 +215,13 @@ class SensorFaults:
             for key in dict.fromkeys([SENSOR_FAULTS[name].parameter, *values]):
                 value = values.get(key)
                 number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-                wrong = (
-                    name == "sensor_velocity_scale"
-                    and number
-                    and (value <= 0 or (key == "with_attitude" and value != 1))
-                )
-                if key not in known or not number or wrong:
+                if key not in known or not number:
                     raise CfbError(
                         f"{where}: effects.{name}.parameters.{key} = {value!r} must be a number that makes sense"
                         f" ({name} has {' and '.join(known)})."
                     )
+                unit = "1" if "scale" in known[key] or key == "with_attitude" else "s"
+                LIMITS[known[key]].check(value, f"{where}: effects.{name}.parameters.{key}", unit, warn=True)
                 found[known[key]] = float(value)
         return cls(**found)
 

@@ -27,7 +27,7 @@ from cfb_mjx.model.effects import KNOWN
 from cfb_mjx.model.effects.catalogue import outside, written
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import hover_command
-from cfb_mjx.parameters import ModelFile, load_model_file
+from cfb_mjx.parameters import ModelFile, load_model_file, load_randomisation, require_possible
 from cfb_mjx.train.algorithm import Algorithm
 from cfb_mjx.train.checkpoint import load_state, read_about, save_checkpoint
 from cfb_mjx.train.config import TrainingConfig
@@ -64,9 +64,12 @@ class Training:
         """Read what the configuration names.
 
         Raises:
-            CfbError: a bad model or policy, a predictor that is not insisted on, or a policy of another shape.
+            CfbError: a bad model or policy, a predictor that is not insisted on, ranges that allow impossible drones,
+                or a policy of another shape.
         """
         described = load_model_file(config.model)
+        ranges = load_randomisation(config.randomisation.ranges)
+        require_possible(described.parameters(), ranges, config.randomisation.magnitude, "randomisation.magnitude")
         if not force:
             described.require_plant("training", "--force")
         policy = None if start is None else load_policy(start)

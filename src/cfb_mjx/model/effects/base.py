@@ -9,6 +9,7 @@ from jaxtyping import Array
 
 from cfb_mjx.model.rotors import RotorLoads
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 Memory = tuple[Vec, ...]
@@ -62,7 +63,8 @@ class Effect(eqx.Module):
     """One physical effect. Subclasses hold their parameters as fields and override what they change.
 
     Every subclass sets ``name`` (DESIGN names), ``units`` (per field), ``source``, ``prior`` (per field, the plausible
-    range as low and high) and has a ``neutral()`` at which it vanishes. For tracing it says which fields measure its
+    range as low and high: where a search looks), ``limits`` (per field, what can be at all and what is usual) and has a
+    ``neutral()`` at which it vanishes. For tracing it says which fields measure its
     strength (``strengths``; the others describe its shape), at which values it is looked for first (``probes``) and
     whether a search looks for it at all or only who names it gets it fitted (``searched``).
     """
@@ -78,9 +80,14 @@ class Effect(eqx.Module):
     units: ClassVar[dict[str, str]]
     source: ClassVar[str] = "not given"
     prior: ClassVar[dict[str, tuple[float, float]]]
+    limits: ClassVar[dict[str, Limits]] = {}
     strengths: ClassVar[tuple[str, ...]]
     probes: ClassVar[tuple[dict[str, float], ...]] = ({},)
     searched: ClassVar[bool] = True
+
+    def __check_init__(self):
+        for field, limits in self.limits.items():
+            limits.check(getattr(self, field), f"{self.name}.{field}", self.units[field])
 
     @classmethod
     def neutral(cls) -> Effect:

@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Effect, Memory, Motors, Reading
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 NOMINAL_VOLTAGE = 3.7
@@ -38,6 +39,11 @@ class BatterySag(Effect):
         "voltage)"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"level": (-0.1, 0.1), "slope": (0.0, 1.2), "lag": (0.002, 5.0)}
+    limits: ClassVar[dict[str, Limits]] = {
+        "level": Limits(-0.95, 2.0, -0.3, 0.3),
+        "slope": Limits(-1.0, 4.0, 0.0, 1.5),
+        "lag": Limits(0.0001, 1000.0, 0.001, 60.0),
+    }
     strengths: ClassVar[tuple[str, ...]] = ("level", "slope")
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"lag": 0.02}, {"lag": 0.5})
 

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import mean_hover_ratio, number
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 
 
 class BladeFlapping(Effect):
@@ -42,6 +43,11 @@ class BladeFlapping(Effect):
         "coefficient": (-0.001, 0.001),
         "climb": (-0.5, 0.5),
         "anisotropy": (-0.5, 0.5),
+    }
+    limits: ClassVar[dict[str, Limits]] = {
+        "coefficient": Limits(-0.1, 0.1, -0.004, 0.004),
+        "climb": Limits(-2.0, 2.0, -1.5, 1.5),
+        "anisotropy": Limits(-1.0, 1.0, -1.0, 1.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
     # Both are looked for at zero, and fitted once the moment is there.

@@ -147,7 +147,11 @@ def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
     """Build an effect from ``{name, parameters}`` as written in a model YAML; what is left out is neutral.
 
     Raises:
-        CfbError: unknown effect, unknown parameter or a value that is not a number, named; ``where`` is the file.
+        CfbError: unknown effect, unknown parameter or a value that is no number or cannot be, named; ``where`` is the
+            file.
+
+    Warns:
+        CfbWarning: values that are possible but unusual, named alike.
     """
     name = item.get("name")
     if not isinstance(name, str) or name not in KNOWN:
@@ -176,6 +180,8 @@ def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
         if not np.all(np.isfinite(value)) or value.shape not in ((), shape):
             count = int(np.prod(shape))
             raise CfbError(f"{where}: effects.{name}.parameters.{key} = {raw!r} must be {count} finite number(s).")
+        if key in kind.limits:
+            kind.limits[key].check(value, f"{where}: effects.{name}.parameters.{key}", kind.units[key], warn=True)
         arguments[key] = value
     return kind(**arguments)
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect
 from cfb_mjx.model.effects.fields import vector
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -22,6 +23,7 @@ class CogOffset(Effect):
     units: ClassVar[dict[str, str]] = {"offset": "m"}
     source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, domain randomisation (centre of gravity)"
     prior: ClassVar[dict[str, tuple[float, float]]] = {"offset": (-0.01, 0.01)}
+    limits: ClassVar[dict[str, Limits]] = {"offset": Limits(-0.1, 0.1, -0.03, 0.03)}
     strengths: ClassVar[tuple[str, ...]] = ("offset",)
 
     offset: Float[Array, "*batch 2"] = eqx.field(converter=vector(2))

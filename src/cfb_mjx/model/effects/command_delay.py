@@ -19,6 +19,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Effect, Memory
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 ROWS = 8
@@ -38,6 +39,7 @@ class CommandDelay(Effect):
         " delay)"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"delay": (0.0, 0.02)}
+    limits: ClassVar[dict[str, Limits]] = {"delay": Limits(0.0, 1.0, 0.0, 0.06)}
     strengths: ClassVar[tuple[str, ...]] = ("delay",)
 
     delay: Float[Array, "*batch"] = eqx.field(converter=number)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Effect, Memory, Motors
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -36,6 +37,10 @@ class EscRateLimit(Effect):
         "B. Stevens, F. Lewis, E. Johnson, Aircraft Control and Simulation, 3rd ed. 2016 (rate-limited actuator)"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"slowness": (0.0, 1.0), "rotor": (0.0, 1.0)}
+    limits: ClassVar[dict[str, Limits]] = {
+        "slowness": Limits(0.0, 10.0, 0.0, 3.0),
+        "rotor": Limits(0.0, 1.0, 0.0, 1.0),
+    }
     strengths: ClassVar[tuple[str, ...]] = ("slowness",)
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"rotor": 0.0}, {"rotor": 1.0})
 

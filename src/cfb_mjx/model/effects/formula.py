@@ -17,6 +17,7 @@ from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import HOVER_SPEED, number
 from cfb_mjx.model.rotors import TORQUE_SIGNS
 from cfb_mjx.model.vector import Vec, rotate_inverse
+from cfb_mjx.parameters.limits import Limits
 
 _V, _W, _P = ("v_x", "v_y", "v_z"), ("w_x", "w_y", "w_z"), ("x", "y", "z")
 _SPEEDS = ("n", "n_roll", "n_pitch", "n_yaw")
@@ -60,6 +61,10 @@ class ResidualFormula(Effect):
     units: ClassVar[dict[str, str]] = {"body_terms": "N m or N per unit of the term", "place": "N per unit of the term"}
     source: ClassVar[str] = "regression on the residual of flights; no physics claimed"
     prior: ClassVar[dict[str, tuple[float, float]]] = {"body_terms": (-1.0, 1.0), "place": (-1.0, 1.0)}
+    limits: ClassVar[dict[str, Limits]] = {
+        "body_terms": Limits(-1000.0, 1000.0, -10.0, 10.0),
+        "place": Limits(-1000.0, 1000.0, -10.0, 10.0),
+    }
     strengths: ClassVar[tuple[str, ...]] = ("body_terms", "place")
 
     body_terms: Float[Array, "*batch 6 n"] = eqx.field(converter=_matrix((6, len(TERMS))))

@@ -20,6 +20,7 @@ from cfb_mjx.model.effects.base import Condition, Effect
 from cfb_mjx.model.effects.fields import hub_positions, number
 from cfb_mjx.model.rotors import RotorLoads
 from cfb_mjx.model.vector import rotate
+from cfb_mjx.parameters.limits import Limits
 
 REFERENCE = 0.1
 """Height of the rotors at which the strength is given, m."""
@@ -37,6 +38,10 @@ class GroundEffect(Effect):
         "1955; P. Sanchez-Cuevas, G. Heredia, A. Ollero, Int. J. Aerospace Eng. 2017, 1823056"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"strength": (0.0, 0.3), "height": (0.02, 0.3)}
+    limits: ClassVar[dict[str, Limits]] = {
+        "strength": Limits(-0.5, 3.0, 0.0, 0.9),
+        "height": Limits(0.001, 10.0, 0.01, 1.0),
+    }
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"height": 0.05}, {"height": 0.12}, {"height": 0.25})
 

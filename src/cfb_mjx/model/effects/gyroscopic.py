@@ -17,6 +17,7 @@ from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.rotors import YAW_SIGNS
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 
 
 class Gyroscopic(Effect):
@@ -30,6 +31,7 @@ class Gyroscopic(Effect):
         "S. Bouabdallah, Design and control of quadrotors with application to autonomous flying, EPFL thesis 3727, 2007"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"rotor_inertia": (0.0, 2e-07)}
+    limits: ClassVar[dict[str, Limits]] = {"rotor_inertia": Limits(0.0, 0.0001, 0.0, 1e-06)}
     strengths: ClassVar[tuple[str, ...]] = ("rotor_inertia",)
 
     rotor_inertia: Float[Array, "*batch"] = eqx.field(converter=number)

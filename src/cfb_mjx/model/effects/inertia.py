@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect
 from cfb_mjx.model.effects.fields import vector
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -25,6 +26,7 @@ class Inertia(Effect):
     units: ClassVar[dict[str, str]] = {"relative": "1"}
     source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, eq. 4"
     prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.5, 0.5)}
+    limits: ClassVar[dict[str, Limits]] = {"relative": Limits(-0.95, 20.0, -0.8, 4.0)}
     strengths: ClassVar[tuple[str, ...]] = ("relative",)
 
     relative: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect
 from cfb_mjx.model.effects.fields import HOVER_SPEED, hub_velocities, number
 from cfb_mjx.model.rotors import RotorLoads
+from cfb_mjx.parameters.limits import Limits
 
 
 class InflowThrust(Effect):
@@ -31,6 +32,7 @@ class InflowThrust(Effect):
         "maneuvering, ICRA 2009"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (-0.01, 0.03)}
+    limits: ClassVar[dict[str, Limits]] = {"coefficient": Limits(-1.0, 1.0, -0.05, 0.2)}
     strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)

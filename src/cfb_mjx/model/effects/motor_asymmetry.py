@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Effect, Memory, Motors
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -35,6 +36,11 @@ class MotorAsymmetry(Effect):
         "spin_up": (-0.5, 0.5),
         "spin_down": (-0.5, 0.5),
         "width": (5.0, 200.0),
+    }
+    limits: ClassVar[dict[str, Limits]] = {
+        "spin_up": Limits(-0.95, 20.0, -0.8, 2.0),
+        "spin_down": Limits(-0.95, 20.0, -0.8, 2.0),
+        "width": Limits(0.1, 100000.0, 1.0, 1000.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("spin_up", "spin_down")
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"width": 15.0}, {"width": 60.0})

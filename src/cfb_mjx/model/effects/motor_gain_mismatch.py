@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Effect
 from cfb_mjx.model.effects.fields import vector
 from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -25,6 +26,7 @@ class MotorGainMismatch(Effect):
         "fitted motor by motor)"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.15, 0.15)}
+    limits: ClassVar[dict[str, Limits]] = {"relative": Limits(-0.95, 5.0, -0.5, 0.5)}
     strengths: ClassVar[tuple[str, ...]] = ("relative",)
 
     relative: Float[Array, "*batch 4"] = eqx.field(converter=vector(4))

@@ -17,6 +17,7 @@ from cfb_mjx.model.effects.base import Effect, Memory, Motors
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -33,6 +34,7 @@ class MotorSecondOrder(Effect):
         " inductance)"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"lag": (0.0, 0.03)}
+    limits: ClassVar[dict[str, Limits]] = {"lag": Limits(0.0, 1.0, 0.0, 0.1)}
     strengths: ClassVar[tuple[str, ...]] = ("lag",)
 
     lag: Float[Array, "*batch"] = eqx.field(converter=number)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Memory, Motors
 from cfb_mjx.model.effects.fields import HOVER_SPEED, number
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -31,6 +32,10 @@ class MotorThermalDrift(Effect):
         "D. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed. 2003 (temperature of windings and magnets)"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"drop": (0.0, 0.1), "time_constant": (5.0, 60.0)}
+    limits: ClassVar[dict[str, Limits]] = {
+        "drop": Limits(-0.5, 0.95, 0.0, 0.3),
+        "time_constant": Limits(0.01, 100000.0, 1.0, 1000.0),
+    }
     strengths: ClassVar[tuple[str, ...]] = ("drop",)
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"time_constant": 8.0}, {"time_constant": 20.0})
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect
 from cfb_mjx.model.effects.fields import number
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -21,6 +22,7 @@ class MotorTimeConstant(Effect):
     units: ClassVar[dict[str, str]] = {"relative": "1"}
     source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, eq. 5"
     prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.5, 0.5)}
+    limits: ClassVar[dict[str, Limits]] = {"relative": Limits(-0.95, 20.0, -0.8, 3.0)}
     strengths: ClassVar[tuple[str, ...]] = ("relative",)
 
     relative: Float[Array, "*batch"] = eqx.field(converter=number)

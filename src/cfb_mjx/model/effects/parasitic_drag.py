@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import number, vector
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 
 
 class ParasiticDrag(Effect):
@@ -34,6 +35,11 @@ class ParasiticDrag(Effect):
         "linear": (0.0, 0.05),
         "quadratic": (0.0, 0.02),
         "cross": (0.0, 1.0),
+    }
+    limits: ClassVar[dict[str, Limits]] = {
+        "linear": Limits(0.0, 10.0, 0.0, 0.2),
+        "quadratic": Limits(0.0, 1.0, 0.0, 0.1),
+        "cross": Limits(0.0, 1.0, 0.0, 1.0),
     }
     # The linear part is what `rotor_drag` does at hover; tracing looks for it there.
     strengths: ClassVar[tuple[str, ...]] = ("quadratic",)

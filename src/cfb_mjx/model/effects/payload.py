@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect
 from cfb_mjx.model.effects.fields import number, vector
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -33,6 +34,11 @@ class Payload(Effect):
         "mass": (0.0, 0.02),
         "height": (-0.05, 0.05),
         "offset": (-0.02, 0.02),
+    }
+    limits: ClassVar[dict[str, Limits]] = {
+        "mass": Limits(0.0, 1.0, 0.0, 0.06),
+        "height": Limits(-1.0, 1.0, -0.15, 0.15),
+        "offset": Limits(-1.0, 1.0, -0.08, 0.08),
     }
     strengths: ClassVar[tuple[str, ...]] = ("mass",)
     probes: ClassVar[tuple[dict[str, float], ...]] = (

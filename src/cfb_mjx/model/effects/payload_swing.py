@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Memory, Wrench
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec, rotate, rotate_inverse
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 FOLLOWING = 8.0
@@ -46,6 +47,11 @@ class PayloadSwing(Effect):
         "mass": (0.0, 0.015),
         "length": (0.05, 0.5),
         "damping_ratio": (0.002, 0.4),
+    }
+    limits: ClassVar[dict[str, Limits]] = {
+        "mass": Limits(0.0, 1.0, 0.0, 0.06),
+        "length": Limits(0.005, 100.0, 0.02, 5.0),
+        "damping_ratio": Limits(0.0, 10.0, 0.0, 1.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("mass",)
     probes: ClassVar[tuple[dict[str, float], ...]] = (

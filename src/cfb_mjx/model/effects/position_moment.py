@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import mean_hover_ratio, vector
 from cfb_mjx.model.vector import Vec, rotate_inverse
+from cfb_mjx.parameters.limits import Limits
 
 
 class PositionMoment(Effect):
@@ -39,6 +40,7 @@ class PositionMoment(Effect):
         "1961"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"gradient": (-5e-4, 5e-4)}
+    limits: ClassVar[dict[str, Limits]] = {"gradient": Limits(-0.1, 0.1, -0.002, 0.002)}
     strengths: ClassVar[tuple[str, ...]] = ("gradient",)
     searched: ClassVar[bool] = False
 

@@ -25,6 +25,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Memory, Wrench
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -46,6 +47,13 @@ class RegressionDilution(Effect):
         "reversion": (0.0, 20.0),
         "turning": (0.3, 30.0),
         "time_constant": (0.1, 2.0),
+    }
+    limits: ClassVar[dict[str, Limits]] = {
+        "dilution": Limits(0.0, 1.0, 0.0, 1.0),
+        "knee": Limits(1e-07, 1.0, 1e-06, 0.1),
+        "reversion": Limits(0.0, 1000.0, 0.0, 100.0),
+        "turning": Limits(0.001, 1000.0, 0.05, 100.0),
+        "time_constant": Limits(0.001, 10000.0, 0.05, 60.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("dilution",)
     searched: ClassVar[bool] = False

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import HOVER_SPEED, hub_positions, hub_velocities, number
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 
 
 class RotorDrag(Effect):
@@ -31,6 +32,7 @@ class RotorDrag(Effect):
         "Faessler, A. Franchi, D. Scaramuzza, RA-L 3(2), 2018"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (0.0, 0.05)}
+    limits: ClassVar[dict[str, Limits]] = {"coefficient": Limits(0.0, 10.0, 0.0, 0.2)}
     strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)

@@ -18,6 +18,7 @@ from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.cog_offset import CogOffset
 from cfb_mjx.model.effects.fields import number, vector
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
 
 
 class ThrustTilt(Effect):
@@ -32,6 +33,10 @@ class ThrustTilt(Effect):
         "2018 (thrust along tilted axes)"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"tilt": (-0.05, 0.05), "twist": (-0.05, 0.05)}
+    limits: ClassVar[dict[str, Limits]] = {
+        "tilt": Limits(-0.8, 0.8, -0.2, 0.2),
+        "twist": Limits(-0.8, 0.8, -0.2, 0.2),
+    }
     strengths: ClassVar[tuple[str, ...]] = ("tilt", "twist")
 
     tilt: Float[Array, "*batch 2"] = eqx.field(converter=vector(2))

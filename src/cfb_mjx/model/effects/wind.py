@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import number, vector
 from cfb_mjx.model.vector import Vec, rotate_inverse
+from cfb_mjx.parameters.limits import Limits
 
 
 class Wind(Effect):
@@ -32,6 +33,10 @@ class Wind(Effect):
         "S. Waslander, C. Wang, Wind disturbance estimation and rejection for quadrotor position control, AIAA 2009"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"velocity": (-3.0, 3.0), "conductance": (0.005, 0.05)}
+    limits: ClassVar[dict[str, Limits]] = {
+        "velocity": Limits(-50.0, 50.0, -15.0, 15.0),
+        "conductance": Limits(0.0, 10.0, 0.0, 0.2),
+    }
     strengths: ClassVar[tuple[str, ...]] = ("velocity",)
 
     velocity: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))

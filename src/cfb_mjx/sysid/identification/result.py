@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cfb_mjx.parameters import Entry, ModelFile, Parameters
+from cfb_mjx.errors import CfbError
+from cfb_mjx.parameters import SPECIFICATIONS, Entry, ModelFile, Parameters
 from cfb_mjx.sysid.identification.feedback import Feedback
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.uncertainty import Uncertainty
@@ -51,7 +52,14 @@ class Fit:
     """Whether the commands answered the gyro (innovation)."""
 
     def model_file(self, base: ModelFile, source: str) -> ModelFile:
-        """``base`` with the fitted constants, their uncertainty and ``source``."""
+        """``base`` with the fitted constants, their uncertainty and ``source``.
+
+        Raises:
+            CfbError: a fitted value that cannot be, named: no file may hold it.
+
+        Warns:
+            CfbWarning: an unusual one.
+        """
         return _describe(base, self, source)
 
 
@@ -104,6 +112,10 @@ def _describe(base: ModelFile, result: Fit, source: str) -> ModelFile:
     entries = dict(base.entries)
 
     def put(key, value, std, note=""):
+        try:
+            SPECIFICATIONS[key].check(value, f"the fit's parameters.{key}", warn=True)
+        except CfbError as error:
+            raise CfbError(f"{error} Leave it out of --parameters, or fit flights that tell it.") from None
         entries[key] = Entry(np.asarray(value, dtype=float), source + note, std)
 
     def deviation(name):

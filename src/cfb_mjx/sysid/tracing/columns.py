@@ -67,6 +67,19 @@ def shapes(effect: Effect) -> list[Column]:
     return columns_of(kind.name, tuple(f for f in kind.prior if f in moving), {})
 
 
+def bounds(name: str, item: str) -> tuple[float, float]:
+    """Between which values a search moves a field of an effect."""
+    kind = KNOWN[name]
+    low, high = kind.prior[item]
+    if item in kind.strengths:
+        # A strength may exceed what is plausible (the report will say so), but not change a meaningless sign.
+        low, high = (0.0 if low >= 0 else 3 * low), 3 * high
+    if item not in kind.limits:  # of a user's own effect
+        return low, high
+    # Downwards what is unusual is out of reach as well: a lag or a gain of next to nothing is no motor.
+    return max(low, kind.limits[item].soft_low), min(high, kind.limits[item].hard_high)
+
+
 def coarse(name: str) -> bool:
     """Whether an effect's slope at zero says little of its strength."""
     return name in KNOWN and bool(KNOWN[name].coarse)

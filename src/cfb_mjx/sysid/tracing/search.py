@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import CATALOGUE, KNOWN, Effect
+from cfb_mjx.model.effects import CATALOGUE, Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.sensor_faults import SensorFaults
@@ -40,7 +40,6 @@ SAME_LEVELS = 0.5
 """Noise levels that change by less (their logarithms) do not make it worth while to fit again."""
 FILTERED_GYRO = 0.1
 """Level given to a low-pass filtered gyro, rad/s: only what it shows slowly is believed."""
-LEAST_RELATIVE = -0.8
 SAMPLE = 32
 """Blocks from which noise levels are learned: about a minute, many times longer than what wanders."""
 PAD = 16
@@ -221,16 +220,8 @@ class Search:
             if column.effect == cols.FORMULA:
                 effects[column.effect] = cols.moved(effects[column.effect], column, float(change), True)
                 continue
-            low, high = CATALOGUE[column.effect].prior[column.field]
             effect = cols.moved(effects[column.effect], column, float(change), True)
-            value = np.asarray(getattr(effect, column.field))
-            if column.field in CATALOGUE[column.effect].strengths:
-                # A strength may exceed what is plausible (the report will say so), but not change a meaningless sign.
-                low, high = (0.0 if low >= 0 else 3 * low), 3 * high
-                if KNOWN[column.effect].units[column.field] == "1":
-                    # Relative changes: a lag or a gain of less than nothing is no motor.
-                    low = max(low, LEAST_RELATIVE)
-            value = np.clip(value, low, high)
+            value = np.clip(getattr(effect, column.field), *cols.bounds(column.effect, column.field))
             effects[column.effect] = eqx.tree_at(lambda e, f=column.field: getattr(e, f), effect, jnp.asarray(value))
         lead = float(np.clip(hypothesis.lead + by[0], *LEAD_RANGE))
         found = tuple(effects[type(e).name] for e in hypothesis.effects)
