@@ -36,6 +36,7 @@ from cfb_mjx.parameters import (
 )
 from cfb_mjx.parameters.randomisation import Range
 from cfb_mjx.sysid.identification.result import Fit
+from cfb_mjx.sysid.refinement import free_numbers, plausible_numbers
 from cfb_mjx.sysid.sensor_faults import ATTRIBUTES, LIMITS, SensorFaults
 from cfb_mjx.sysid.tracing.columns import bounds
 from cfb_mjx.train.config import load_config
@@ -139,8 +140,8 @@ def test_every_number_of_every_effect_has_limits(name, field):
 
 
 @pytest.mark.parametrize(("name", "field"), FIELDS)
-def test_a_number_of_an_effect_that_cannot_be_is_refused_by_name(name, field):
-    kind = KNOWN[name]
+def test_a_number_of_an_effect_that_cannot_be_is_refused_by_name(name, field, tmp_path_factory):
+    kind, path = KNOWN[name], tmp_path_factory.mktemp("models") / "drone.yaml"
     shape = getattr(kind.neutral(), field).shape
 
     @QUICK
@@ -150,8 +151,9 @@ def test_a_number_of_an_effect_that_cannot_be_is_refused_by_name(name, field):
         value.reshape(-1)[component % value.size] = number
         item = {"name": name, "parameters": {field: value.tolist()}}
         refused(lambda: effect_from_mapping(item, "drone.yaml"), "drone.yaml", f"effects.{name}.parameters.{field}")
-        described = replace(GUARDS, effects=(item,))
-        refused(lambda: Quadrotor.from_file(described), "cfb-guards", f"effects.{name}.parameters.{field}")
+        save_model_file(replace(GUARDS, effects=(item,)), path)
+        read = load_model_file(path)  # as the commands do: first the file, then the drone
+        refused(lambda: Quadrotor.from_file(read), "drone.yaml", f"effects.{name}.parameters.{field}")
         values = {f.name: getattr(kind.neutral(), f.name) for f in dataclasses.fields(kind)}
         refused(lambda: kind(**values | {field: jnp.broadcast_to(number, shape)}), f"{name}.{field}")
 
@@ -241,6 +243,23 @@ def test_presets_say_nothing(name):
 
 def test_shipped_plants_say_nothing():
     assert load_plants(GUARDS)
+
+
+def test_a_plant_that_cannot_be_is_refused_with_its_file(tmp_path):
+    text = (
+        "format: cfb_mjx plants 1\nplants: [{name: late, effects: [{name: command_delay, parameters: {delay: 4}}]}]\n"
+    )
+    (tmp_path / "fleet.yaml").write_text(text)
+    named = "fleet.yaml: plant late: effects.command_delay.parameters.delay = 4", "4 ms is 0.004"
+    refused(lambda: load_plants(GUARDS, tmp_path / "fleet.yaml"), *named)
+
+
+def test_no_fit_may_look_where_a_file_is_refused():
+    physics = [name for name in KNOWN if name != "regression_dilution"]
+    for number in (*plausible_numbers(NOMINAL, physics), *free_numbers(tuple(KNOWN))):
+        limits = KNOWN[number.effect].limits[number.field]
+        assert limits.holds(number.low), number
+        assert limits.holds(number.high), number
 
 
 def test_traced_numbers_pass_every_constructor():
