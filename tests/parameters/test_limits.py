@@ -6,6 +6,7 @@ import dataclasses
 import re
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 
 from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.envs import TargetTask
+from cfb_mjx.envs.episode import reset
 from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.model import Quadrotor, rollout, step
 from cfb_mjx.model.effects import KNOWN, Payload, PayloadSwing, RotorDrag, effect_from_mapping, effect_to_mapping
@@ -45,6 +47,7 @@ from cfb_mjx.train.run import Training
 
 GUARDS = load_model_file("cfb-guards")
 NOMINAL = GUARDS.parameters()
+MODEL = Quadrotor(NOMINAL)
 FIELDS = [(name, field.name) for name, kind in sorted(KNOWN.items()) for field in dataclasses.fields(kind)]
 QUICK = settings(max_examples=20, deadline=None, derandomize=True)
 
@@ -366,6 +369,15 @@ def test_a_fit_that_ends_where_nothing_can_be_is_refused_before_it_is_written():
     assert fitted(mass=0.05).entries["mass"].value == 0.05
 
 
+def test_an_episode_is_refused_whatever_grade_its_key_would_draw():
+    wild = TargetTask(randomisation=load_randomisation("paper"), magnitude=6.0, graded=1.0)
+    for seed in range(5):
+        refused(lambda seed=seed: reset(wild, MODEL, jax.random.PRNGKey(seed)), "magnitude = 6", "at most")
+    refused(
+        lambda: jax.jit(jax.vmap(partial(reset, wild, MODEL)))(jax.random.split(jax.random.PRNGKey(0), 2)), "at most"
+    )
+
+
 def test_gymnasium_refuses_ranges_that_allow_impossible_drones():
     gym = pytest.importorskip("cfb_mjx.envs.gym", exc_type=CfbError)
     wild = TargetTask(randomisation=load_randomisation("paper"), magnitude=6.0)
@@ -374,7 +386,6 @@ def test_gymnasium_refuses_ranges_that_allow_impossible_drones():
 
 # Parameters put into a model behind the constructor's back.
 
-MODEL = Quadrotor.from_file("cfb-guards")
 ENTRIES = {
     "rollout": lambda model: rollout(model, MODEL.hover_state(), jnp.zeros((2, 4))),
     "step": lambda model: step(model, MODEL.hover_state(), jnp.zeros(4)),
