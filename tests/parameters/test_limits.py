@@ -6,6 +6,7 @@ import dataclasses
 import re
 import warnings
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,6 +20,7 @@ from hypothesis import strategies as st
 
 from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.envs import TargetTask
+from cfb_mjx.envs.episode import reset
 from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.model import Quadrotor, rollout, step
 from cfb_mjx.model.effects import KNOWN, Payload, PayloadSwing, RotorDrag, effect_from_mapping, effect_to_mapping
@@ -36,6 +38,7 @@ from cfb_mjx.parameters import (
 )
 from cfb_mjx.parameters.randomisation import Range
 from cfb_mjx.sysid.identification.result import Fit
+from cfb_mjx.sysid.refinement import free_numbers, plausible_numbers
 from cfb_mjx.sysid.sensor_faults import ATTRIBUTES, LIMITS, SensorFaults
 from cfb_mjx.sysid.tracing.columns import bounds
 from cfb_mjx.train.config import load_config
@@ -44,6 +47,7 @@ from cfb_mjx.train.run import Training
 
 GUARDS = load_model_file("cfb-guards")
 NOMINAL = GUARDS.parameters()
+MODEL = Quadrotor(NOMINAL)
 FIELDS = [(name, field.name) for name, kind in sorted(KNOWN.items()) for field in dataclasses.fields(kind)]
 QUICK = settings(max_examples=20, deadline=None, derandomize=True)
 
@@ -139,8 +143,8 @@ def test_every_number_of_every_effect_has_limits(name, field):
 
 
 @pytest.mark.parametrize(("name", "field"), FIELDS)
-def test_a_number_of_an_effect_that_cannot_be_is_refused_by_name(name, field):
-    kind = KNOWN[name]
+def test_a_number_of_an_effect_that_cannot_be_is_refused_by_name(name, field, tmp_path_factory):
+    kind, path = KNOWN[name], tmp_path_factory.mktemp("models") / "drone.yaml"
     shape = getattr(kind.neutral(), field).shape
 
     @QUICK
@@ -150,8 +154,9 @@ def test_a_number_of_an_effect_that_cannot_be_is_refused_by_name(name, field):
         value.reshape(-1)[component % value.size] = number
         item = {"name": name, "parameters": {field: value.tolist()}}
         refused(lambda: effect_from_mapping(item, "drone.yaml"), "drone.yaml", f"effects.{name}.parameters.{field}")
-        described = replace(GUARDS, effects=(item,))
-        refused(lambda: Quadrotor.from_file(described), "cfb-guards", f"effects.{name}.parameters.{field}")
+        save_model_file(replace(GUARDS, effects=(item,)), path)
+        read = load_model_file(path)  # as the commands do: first the file, then the drone
+        refused(lambda: Quadrotor.from_file(read), "drone.yaml", f"effects.{name}.parameters.{field}")
         values = {f.name: getattr(kind.neutral(), f.name) for f in dataclasses.fields(kind)}
         refused(lambda: kind(**values | {field: jnp.broadcast_to(number, shape)}), f"{name}.{field}")
 
@@ -241,6 +246,23 @@ def test_presets_say_nothing(name):
 
 def test_shipped_plants_say_nothing():
     assert load_plants(GUARDS)
+
+
+def test_a_plant_that_cannot_be_is_refused_with_its_file(tmp_path):
+    text = (
+        "format: cfb_mjx plants 1\nplants: [{name: late, effects: [{name: command_delay, parameters: {delay: 4}}]}]\n"
+    )
+    (tmp_path / "fleet.yaml").write_text(text)
+    named = "fleet.yaml: plant late: effects.command_delay.parameters.delay = 4", "4 ms is 0.004"
+    refused(lambda: load_plants(GUARDS, tmp_path / "fleet.yaml"), *named)
+
+
+def test_no_fit_may_look_where_a_file_is_refused():
+    physics = [name for name in KNOWN if name != "regression_dilution"]
+    for number in (*plausible_numbers(NOMINAL, physics), *free_numbers(tuple(KNOWN))):
+        limits = KNOWN[number.effect].limits[number.field]
+        assert limits.holds(number.low), number
+        assert limits.holds(number.high), number
 
 
 def test_traced_numbers_pass_every_constructor():
@@ -347,6 +369,15 @@ def test_a_fit_that_ends_where_nothing_can_be_is_refused_before_it_is_written():
     assert fitted(mass=0.05).entries["mass"].value == 0.05
 
 
+def test_an_episode_is_refused_whatever_grade_its_key_would_draw():
+    wild = TargetTask(randomisation=load_randomisation("paper"), magnitude=6.0, graded=1.0)
+    for seed in range(5):
+        refused(lambda seed=seed: reset(wild, MODEL, jax.random.PRNGKey(seed)), "magnitude = 6", "at most")
+    refused(
+        lambda: jax.jit(jax.vmap(partial(reset, wild, MODEL)))(jax.random.split(jax.random.PRNGKey(0), 2)), "at most"
+    )
+
+
 def test_gymnasium_refuses_ranges_that_allow_impossible_drones():
     gym = pytest.importorskip("cfb_mjx.envs.gym", exc_type=CfbError)
     wild = TargetTask(randomisation=load_randomisation("paper"), magnitude=6.0)
@@ -355,7 +386,6 @@ def test_gymnasium_refuses_ranges_that_allow_impossible_drones():
 
 # Parameters put into a model behind the constructor's back.
 
-MODEL = Quadrotor.from_file("cfb-guards")
 ENTRIES = {
     "rollout": lambda model: rollout(model, MODEL.hover_state(), jnp.zeros((2, 4))),
     "step": lambda model: step(model, MODEL.hover_state(), jnp.zeros(4)),

@@ -23,7 +23,7 @@ from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.rotors import steady_command
 from cfb_mjx.model.state import AnyArray, Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec, exponential, multiply
-from cfb_mjx.parameters import Parameters, Randomisation, sample_parameters
+from cfb_mjx.parameters import Parameters, Randomisation, require_possible, sample_parameters
 
 
 @dataclass(frozen=True)
@@ -169,11 +169,16 @@ def reset(
         target: position that estimates are relative to, world, m.
         magnitude: of the randomisation, in place of the task's; may be traced.
         setpoint: what is asked for beside the target; drawn by default.
+
+    Raises:
+        CfbError: ranges that allow impossible drones (`cfb_mjx.parameters.require_possible`).
     """
     of_drone, of_start, of_noise, of_first = jax.random.split(key, 4)
     model = nominal
     if task.randomisation is not None:
         factor = task.magnitude if magnitude is None else magnitude
+        # Asked of the whole magnitude: whether a drone can be must not depend on the grade that this key draws.
+        require_possible(nominal.parameters, task.randomisation, factor)
         if task.graded:
             which, grade = jax.random.uniform(jax.random.fold_in(of_drone, 0), (2,))
             factor = factor * jnp.where(which < task.graded, grade, 1.0)

@@ -70,8 +70,8 @@ class Quadrotor(eqx.Module):
         Warns:
             CfbWarning: unusual numbers, or a drone that cannot hover.
         """
-        where = str(model) if not isinstance(model, ModelFile) else model.name
         model = model if isinstance(model, ModelFile) else load_model_file(model)
+        where = model.path or model.name
         # What a model file says of the sensors does not change how the drone flies.
         physical = (item for item in model.effects if item.get("name") not in SENSOR_FAULTS)
         effects = tuple(effect_from_mapping(item, where) for item in physical)

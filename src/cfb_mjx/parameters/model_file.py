@@ -45,6 +45,8 @@ class ModelFile:
     effects: tuple[Mapping[str, Any], ...] = ()
     provenance: Mapping[str, Any] = field(default_factory=dict)
     kind: str = "plant"
+    path: str = field(default="", compare=False)
+    """The file it was read from, for messages."""
 
     def require_plant(self, purpose: str, how: str) -> None:
         """Refuse a predictor where the drone itself is needed.
@@ -126,6 +128,7 @@ def load_model_file(name_or_path: str | Path) -> ModelFile:
         effects=tuple(effects),
         provenance=provenance,
         kind=kind,
+        path=str(path),
     )
 
 

@@ -144,7 +144,7 @@ def require_possible(
         CfbError: one parameter that could be drawn beyond its limits, and the largest magnitude that fits all.
     """
     asked = concrete(magnitude)
-    if asked is None:
+    if asked is None or not asked.any():
         return
     fitting = {}
     for name, spread in randomisation.ranges:

@@ -17,14 +17,15 @@ def load_plants(base: ModelFile, name_or_path: str | Path = "off-nominal") -> di
     """Drones of a shipped set, or of a YAML file: ``base`` with the effects that each adds.
 
     Raises:
-        CfbError: no such set, or an entry without a name, or unknown effects.
+        CfbError: no such set, an entry without a name, unknown effects, or numbers of them that cannot be.
     """
     path, document = load_named(name_or_path, "set of plants", FORMAT, "plants")
     plants = {}
     for item in document.get("plants") or []:
         if not isinstance(item, dict) or not isinstance(item.get("effects"), list) or "name" not in item:
             raise CfbError(f"{path}: every plant needs a name and a list of effects, found {item!r}.")
-        described = replace(base, name=str(item["name"]), effects=(*base.effects, *item["effects"]))
+        where, effects = f"{path}: plant {item['name']}", (*base.effects, *item["effects"])
+        described = replace(base, name=str(item["name"]), effects=effects, path=where)
         plants[described.name] = Quadrotor.from_file(described)
     if not plants:
         raise CfbError(f"{path}: names no plants.")
