@@ -109,7 +109,7 @@ class Task:
 
 def longest_delay_s(model: Quadrotor) -> float:
     """The ``Task.longest_delay_s`` that holds ``model``: whole simulation steps, and no less than the default."""
-    delay = float(jnp.max(model.parameters.observation_delay))
+    delay = float(jnp.max(model.parameters.pose_delay))
     return max(Task.longest_delay_s, model.dt * math.ceil(delay / model.dt - 1e-9))
 
 
@@ -277,7 +277,7 @@ def _pose(state: State) -> Pose:
 
 def _estimate(task: Task, model: Quadrotor, past: DelayLine, target: Array, key: PRNGKeyArray) -> Estimate:
     parameters, noise = model.parameters, task.noise
-    late = past.read(parameters.observation_delay)
+    late = past.read(parameters.pose_delay)
     draws = jax.random.normal(key, (12,), late.position.dtype)
     # Between two samples the blend of unit quaternions is a little short.
     q = late.quaternion / jnp.sqrt(jnp.sum(late.quaternion**2))

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from cfb_mjx.errors import CfbError
 
 
 def _array(value) -> Array:
@@ -50,10 +54,18 @@ class Parameters(eqx.Module):
     """Factor on each rotor's thrust. One in the paper."""
     torque_scale: Float[Array, "*batch 4"] = eqx.field(converter=_array)
     """Factor on each rotor's aerodynamic torque. One in the paper."""
-    observation_delay: Float[Array, "*batch"] = eqx.field(converter=_array)
-    """Age of the estimated pose and velocity when the controller reads them, s."""
+    pose_delay: Float[Array, "*batch"] = eqx.field(converter=_array)
+    """Age of the estimated pose and velocity when the controller reads them, s. Formerly ``observation_delay``."""
     attitude_offset: Float[Array, "*batch 3"] = eqx.field(converter=_array)
     """Rotation vector from the true body axes to the axes the estimator reports, rad."""
+    gyro_delay: Float[Array, "*batch"] = eqx.field(converter=_array)
+    """Age of the gyro's reading when the controller reads it, s. The gyro is on the drone: a real one's filters make
+    about 2 ms."""
+
+    @property
+    def observation_delay(self) -> Float[Array, "*batch"]:
+        """Former name of ``pose_delay``."""
+        return self.pose_delay
 
 
 @dataclass(frozen=True)
@@ -109,8 +121,10 @@ SPECIFICATIONS: dict[str, Specification] = {
     ),
     "thrust_scale": Specification("1", (4,), "factor on thrust", "zero or positive", _not_negative),
     "torque_scale": Specification("1", (4,), "factor on aerodynamic torque", "zero or positive", _not_negative),
-    "observation_delay": Specification("s", (), "age of pose and velocity", "zero or positive", _not_negative),
+    "pose_delay": Specification("s", (), "age of pose and velocity", "zero or positive", _not_negative),
     "attitude_offset": Specification("rad", (3,), "attitude error of the estimator", "finite", _any),
+    # Last: a parameter's place decides its random draws.
+    "gyro_delay": Specification("s", (), "age of the gyro's reading", "zero or positive", _not_negative),
 }
 
 DEFAULTS: dict[str, float] = {
@@ -120,5 +134,21 @@ DEFAULTS: dict[str, float] = {
     "thrust_scale": 1.0,
     "torque_scale": 1.0,
     "attitude_offset": 0.0,
+    "gyro_delay": 0.0,
 }
 """Neutral values of what a parameter file may leave out."""
+
+FORMER_NAMES = {"observation_delay": "pose_delay"}
+"""Names that files and commands may still use."""
+
+
+def current_names(values: Mapping[str, Any], where: str | Path, prefix: str = "") -> dict[str, Any]:
+    """The same values under the names of today.
+
+    Raises:
+        CfbError: one is given under both of its names.
+    """
+    for former, now in FORMER_NAMES.items():
+        if former in values and now in values:
+            raise CfbError(f"{where}: {prefix}{former} and {prefix}{now} are one thing; give {prefix}{now} alone.")
+    return {FORMER_NAMES.get(name, name): value for name, value in values.items()}
