@@ -37,7 +37,7 @@ class Problem:
 def of_shooting(logs: list[FlightLog], nominal: Parameters, names, use_measured: bool = True) -> Problem:
     """Multiple shooting from the measured starts, whose weights are constant."""
     unknowns, body = choose(names, nominal), RigidBody()
-    data = shooting_data.batches(logs, None, float(nominal.observation_delay), use_measured)
+    data = shooting_data.batches(logs, None, float(nominal.pose_delay), use_measured)
     whiten = shooting._whitening(unknowns, unknowns.start, data, body, False)
 
     @eqx.filter_jit

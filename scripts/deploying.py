@@ -110,8 +110,8 @@ exported `README.md`, and tested (`tests/deploy`).
   motor at 0.2 N. Both change what a policy's command does; the exported `app-config` turns that off. Policies trained
   on a model with `battery_sag` fitted to your flights need it off as well.
 - The estimate the policy sees is the firmware's Kalman filter's, position and velocity in the world, the gyro after its
-  80 Hz low-pass. Training assumed 8 ms of delay for all of it (`observation_delay`); `cfb fit --parameters
-  observation_delay` measures yours.
+  80 Hz low-pass. Training assumed 8 ms of delay for all of it (`pose_delay`, and the gyro as late); `cfb fit
+  --parameters pose_delay` measures yours.
 """
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import jax
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -217,3 +218,41 @@ SMALL_TRAINING = (
     "ppo.value_hidden=[8]",
 )
 """Changes that make any training one of seconds."""
+
+
+class KeyUses:
+    """What was done with every random key, from `watch_keys` on."""
+
+    def __init__(self):
+        self.of: dict[bytes, list] = {}
+
+    @property
+    def count(self) -> int:
+        """Keys that were used."""
+        return len(self.of)
+
+    def of_no_key_twice(self) -> bool:
+        """Every key was drawn from once, or split once, or only other keys were derived from it, each once."""
+        return all(
+            len(uses) == 1 or (len(set(uses)) == len(uses) and {kind for kind, _ in uses} == {"fold_in"})
+            for uses in self.of.values()
+        )
+
+
+def watch_keys(monkeypatch) -> KeyUses:
+    """Note what is done with random keys by the functions of ``jax.random`` (outside of ``jit`` and ``vmap``)."""
+    seen = KeyUses()
+
+    def watched(name):
+        function = getattr(jax.random, name)
+
+        def noted(key, *args, **kwargs):
+            use = (name, int(args[0]) if name == "fold_in" else None)
+            seen.of.setdefault(np.asarray(key).tobytes(), []).append(use)
+            return function(key, *args, **kwargs)
+
+        monkeypatch.setattr(jax.random, name, noted)
+
+    for name in ("split", "fold_in", "uniform", "normal", "randint", "permutation"):
+        watched(name)
+    return seen

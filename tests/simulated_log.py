@@ -17,7 +17,7 @@ def simulated_log(seconds: float = 4.0, drone=None) -> FlightLog:
     from cfb_mjx.model import Quadrotor, specific_force, step
 
     drone = drone or Quadrotor.from_file(MODEL)
-    delay = round(float(drone.parameters.observation_delay) / drone.dt)
+    delay = round(float(drone.parameters.pose_delay) / drone.dt)
     signs = jnp.array([[-1.0, -1, 1, 1], [-1, 1, 1, -1], [-1, 1, -1, 1]])
 
     def command(t, state):

@@ -55,6 +55,17 @@ def lane(setpoints, noisy=False, every=1):
     return Lane(physics.nominal(), instruments, setpoints, rows, 3.7, np.zeros(3), rng)
 
 
+def test_what_is_only_logged_has_noise_of_its_own():
+    """The first hundred numbers of every stream of a few flights: none of them comes twice."""
+    case, body, instruments = Case("drone", 3), physics.nominal(), QUIET
+    drawn = []
+    for index in range(2):
+        for attempt in range(2):
+            flown = flights._lane(case, index, "figure8", attempt, body, instruments, 0.01)
+            drawn += [flown.rng.standard_normal(100), flights._logging(case, index, attempt).standard_normal(100)]
+    assert len(np.unique(drawn)) == 800
+
+
 def still(seconds):
     setpoints = np.zeros((round(seconds / (c.SETPOINT_TICKS * c.TICK)), SETPOINT_COLUMNS))
     setpoints[:, POSITION] = [0.3, -0.2, 1.0]

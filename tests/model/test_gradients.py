@@ -22,7 +22,7 @@ WEIGHTS = np.concatenate(
     [[1.0, -0.7, 0.9], [0.5, 0.4, -0.6], [0.8, -0.5, 0.3, 0.6], [0.1, -0.2, 0.3], np.full(4, 1e-3)]
 )
 # Measuring-side constants: a rollout does not depend on them.
-NOT_IN_THE_ROLLOUT = ("observation_delay", "attitude_offset")
+NOT_IN_THE_ROLLOUT = ("pose_delay", "gyro_delay", "attitude_offset")
 
 
 class _Problem:

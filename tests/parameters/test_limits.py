@@ -363,7 +363,7 @@ def test_a_fit_that_ends_where_nothing_can_be_is_refused_before_it_is_written():
         return Fit.model_file(SimpleNamespace(names=tuple(values), estimates={}, parameters=drone), GUARDS, "a fit")
 
     refused(lambda: fitted(mass=2e5), "the fit's parameters.mass = 200000", "--parameters")
-    refused(lambda: fitted(observation_delay=-0.002), "the fit's parameters.observation_delay = -0.002")
+    refused(lambda: fitted(pose_delay=-0.002), "the fit's parameters.pose_delay = -0.002")
     with pytest.warns(CfbWarning, match=r"the fit's parameters\.mass = 0\.3 is unusual"):
         fitted(mass=0.3)
     assert fitted(mass=0.05).entries["mass"].value == 0.05

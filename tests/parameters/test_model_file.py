@@ -24,7 +24,8 @@ PAPER_SHARED = {
     "reference_rotor_speed": 2900.0,
     "thrust_polynomial": [-0.23, 0.562, -0.043],
     "torque_polynomial": [-3.4e-4, 8.7e-4, 2.9e-4],
-    "observation_delay": 0.008,
+    "pose_delay": 0.008,
+    "gyro_delay": 0.0,
     "center_of_gravity": 0.0,
     "motor_speed_offset": 0.0,
     "thrust_scale": 1.0,
@@ -137,9 +138,25 @@ def document() -> dict:
             "reference_rotor_speed": {"value": 2900.0, "unit": "rad/s", "source": "paper"},
             "thrust_polynomial": {"value": [-0.23, 0.562, -0.043], "unit": "N", "source": "paper"},
             "torque_polynomial": {"value": [-3.4e-4, 8.7e-4, 2.9e-4], "unit": "N m", "source": "paper"},
-            "observation_delay": {"value": 0.008, "unit": "s", "source": "paper"},
+            "pose_delay": {"value": 0.008, "unit": "s", "source": "paper"},
         },
     }
+
+
+def test_the_delay_of_the_pose_may_have_its_former_name(document, tmp_path):
+    parameters = document["parameters"]
+    parameters["observation_delay"] = parameters.pop("pose_delay") | {"value": 0.012}
+    model = load_model_file(_write(tmp_path, document))
+    assert (model.entries["pose_delay"].value, model.entries["gyro_delay"].value) == (0.012, 0.0)
+    assert model.parameters().observation_delay == 0.012
+    save_model_file(model.with_values("me", observation_delay=0.016), tmp_path / "written.yaml")
+    assert "observation_delay" not in (tmp_path / "written.yaml").read_text()
+    assert load_model_file(tmp_path / "written.yaml").entries["pose_delay"].value == 0.016
+    with pytest.raises(CfbError, match="give pose_delay alone"):
+        model.with_values("me", observation_delay=0.016, pose_delay=0.02)
+    parameters["pose_delay"] = parameters["observation_delay"]
+    with pytest.raises(CfbError, match=r"drone\.yaml: parameters\.observation_delay and parameters\.pose_delay"):
+        load_model_file(_write(tmp_path, document))
 
 
 def _write(tmp_path, document):
@@ -191,7 +208,7 @@ SPOILED = [
     (["parameters", "motor_gain", "value"], [1.0, 2.0, 3.0], "parameters.motor_gain"),
     (["parameters", "motor_time_constant", "value"], 0.0, "parameters.motor_time_constant"),
     (["parameters", "thrust_polynomial", "value"], [-1.0, 0.1, 0.1], "parameters.thrust_polynomial"),
-    (["parameters", "observation_delay", "value"], -0.001, "parameters.observation_delay"),
+    (["parameters", "pose_delay", "value"], -0.001, "parameters.pose_delay"),
     (["effects"], {"name": "parasitic_drag"}, "effects"),
     (["effects"], [{"parameters": {}}], "effects"),
     (["effects"], ["parasitic_drag"], "effects"),

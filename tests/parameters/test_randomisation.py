@@ -155,6 +155,16 @@ def test_unusable_files_are_refused_with_file_and_key(text, named, tmp_path):
     assert named in str(caught.value)
 
 
+def test_a_range_may_have_its_former_name(tmp_path):
+    path = tmp_path / "spread.yaml"
+    path.write_text(_ranges("observation_delay: {half_width: 0.5, unit: relative}"))
+    assert [name for name, _ in load_randomisation(path).ranges] == ["pose_delay"]
+    both = "observation_delay: {half_width: 0.5, unit: relative}\n  pose_delay: {half_width: 0.5, unit: relative}"
+    path.write_text(_ranges(both))
+    with pytest.raises(CfbError, match=r"spread\.yaml: ranges\.observation_delay and ranges\.pose_delay"):
+        load_randomisation(path)
+
+
 def test_an_unknown_name_is_told_apart_from_a_broken_installation():
     with pytest.raises(CfbError, match="papre") as caught:
         load_randomisation("papre")

@@ -182,8 +182,8 @@ def test_what_the_flight_cannot_tell_is_named_and_gets_no_number(flights):
     assert not set(found.unidentifiable) & set(found.parameters)
     seen = predict([log], UNKNOWNS, False).parameters
     assert seen["inertia_xx"].std < 0.2 * seen["inertia_xx"].value
-    with pytest.raises(CfbError, match="observation_delay"):
-        predict([log], choose("inertia,observation_delay", MODEL.parameters))
+    with pytest.raises(CfbError, match="pose_delay"):
+        predict([log], choose("inertia,pose_delay", MODEL.parameters))
 
 
 def run(output, **changes):

@@ -218,15 +218,15 @@ def test_shooting_agrees_with_innovations_without_disturbance(campaign):
         assert abs(found.estimates[name].value - value) < 4 * found.estimates[name].std, name
 
 
-def test_the_observation_delay_is_found_by_shooting():
+def test_the_delay_of_the_pose_is_found_by_shooting():
     log = fly(Plant(), 6.0, seed=8)[0]
     log = dataclasses.replace(log, metadata={**log.metadata, "observation_delay": None})
-    nominal = eqx.tree_at(lambda p: p.observation_delay, NOMINAL, jnp.asarray(0.003))
-    found = fit([log], nominal, "inertia_xx,observation_delay")
+    nominal = eqx.tree_at(lambda p: p.pose_delay, NOMINAL, jnp.asarray(0.003))
+    found = fit([log], nominal, "inertia_xx,pose_delay")
     assert found.estimator == "shooting"
-    assert found.estimates["observation_delay"].value == pytest.approx(0.008, abs=0.0003)
-    innovation = fit([log], nominal, "inertia_xx,observation_delay", estimator="innovation")
-    assert "observation_delay" in innovation.unidentifiable
+    assert found.estimates["pose_delay"].value == pytest.approx(0.008, abs=0.0003)
+    innovation = fit([log], nominal, "inertia_xx,pose_delay", estimator="innovation")
+    assert "pose_delay" in innovation.unidentifiable
 
 
 def test_commands_that_answer_the_gyro_are_seen(campaign):

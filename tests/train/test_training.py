@@ -14,13 +14,15 @@ from cfb_mjx.envs import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, rollout_final
 from cfb_mjx.parameters import load_model_file, load_randomisation, save_model_file
+from cfb_mjx.train import run
 from cfb_mjx.train.analytic import Analytic
 from cfb_mjx.train.brax_compat import brax_ppo
 from cfb_mjx.train.config import AnalyticSettings, load_config
+from cfb_mjx.train.flying import Hover
 from cfb_mjx.train.plants import load_plants
 from cfb_mjx.train.ppo import Ppo
 from cfb_mjx.train.run import CHECKPOINT, CURVE, POLICY, Training, segments, train
-from tests.helpers import SMALL_TRAINING
+from tests.helpers import SMALL_TRAINING, watch_keys
 
 pytestmark = pytest.mark.xdist_group("training")
 
@@ -56,6 +58,35 @@ def test_the_gradient_of_a_flight_is_that_of_differences():
         along = sum(jnp.vdot(g, d) for g, d in zip(jax.tree.leaves(gradient), jax.tree.leaves(way), strict=True))
         ahead, behind = (jax.tree.map(lambda w, d, h=h: w + h * d, controller, way) for h in (1e-5, -1e-5))
         np.testing.assert_allclose(along, (loss(ahead) - loss(behind)) / 2e-5, rtol=1e-5)
+
+
+class Idle(eqx.Module):
+    """An algorithm that learns nothing, and a state of it."""
+
+    episodes: None = None
+    network: NeuralController | None = None
+    updates: int = eqx.field(static=True, default=1)
+    steps_per_update: int = eqx.field(static=True, default=1)
+
+    def begin(self, key, controller):
+        jax.random.split(key)
+        return Idle(None, controller)
+
+    def update(self, state):
+        return state, {}
+
+    def controller(self, state):
+        return state.network
+
+
+def test_no_key_of_a_training_is_used_twice(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "build", lambda *_: Idle())
+    flown = Hover(*np.zeros((2, 1)), np.zeros(1, bool)), None
+    monkeypatch.setattr(run, "hover", lambda controller, task, nominal, keys: flown)
+    uses = watch_keys(monkeypatch)
+    train(small("ppo"), tmp_path)
+    assert uses.count > 5
+    assert uses.of_no_key_twice()
 
 
 @pytest.mark.long

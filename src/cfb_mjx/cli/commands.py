@@ -124,14 +124,14 @@ def fit(
         output: model YAML to write.
         parameters: names or groups, comma separated: inertia (or inertia_xx, ...), rotor_inertia (J_m), motor
             (motor_time_constant, motor_gain), motor_speed_offset, thrust_scale, torque_scale, mass, cog (cog_x, cog_y),
-            observation_delay.
+            pose_delay.
         held_out: logs to judge on; without them the last quarter of every log is kept from the fit.
         model: preset or model YAML to start from.
         set: parameters to set before, for instance mass=0.045 (weigh the drone: flights cannot tell it).
         json: write the results here.
         figure: draw the estimates and the held-out errors before and after here (.png, .svg, .pdf).
         estimator: innovation (safe under feedback) or shooting (predictions over 200 ms; for flights without feedback);
-            auto takes innovation unless the observation delay is asked for.
+            auto takes innovation unless pose_delay is asked for.
         robust: let outliers count linearly instead of squared.
         commands_only: do not use measured rotor speeds to drive the body.
         compare: show what the other estimator would say; multiple shooting is blind to feedback.

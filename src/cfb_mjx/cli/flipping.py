@@ -18,6 +18,9 @@ from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.train.flip_search import Goal, bounds, search
 from cfb_mjx.train.flips import FLIPS
 
+OF_SEARCH = 2**32 - 1
+"""Derives the key of a search: the flights that judge what it finds have the keys 0, 1, 2 ... of the same seed."""
+
 
 def prepared(
     turner: Pilot, controller: str, task: str, turn: Turn, wild: TargetTask, nominal: Quadrotor, seed: int
@@ -55,7 +58,7 @@ def prepared(
             wild,
             nominal,
             goal,
-            jax.random.PRNGKey(seed),
+            jax.random.fold_in(jax.random.PRNGKey(seed), OF_SEARCH),
             bounds(described.rotations, **_fixed(turn.changes, described.knobs)),
             rounds,
             report=lambda done, cost: bar(done, rounds, f"cost {cost:.4f}"),

@@ -36,7 +36,7 @@ def contract(deployment: Deployment) -> dict[str, Any]:
             "battery_compensation": "off",
         },
         "heading": "held at zero: the body's x axis along the world's",
-        "estimate_delay_s": None if trained is None else trained["parameters"]["observation_delay"],
+        "estimate_delay_s": deployment.pose_delay(),
         "first_step": {
             "meaning": "history is filled with the first estimate and the command that hovers",
             "hover_command": deployment.hover_command(),

@@ -15,6 +15,7 @@ from cfb_mjx.control.policy_file import PolicyFile, load_policy, shipped_policie
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters.model_file import load_model_file
+from cfb_mjx.parameters.parameters import current_names
 
 CATCH_S = 3.0
 """How long after the turn a flip counts as under way."""
@@ -67,6 +68,11 @@ class Deployment:
     def trained_on(self) -> dict[str, Any] | None:
         """The model that the holder was trained on; None: its file does not say."""
         return self.holder.training.get("model")
+
+    def pose_delay(self) -> float | None:
+        """Age of the pose that the holder was trained with, s; None: its file does not say."""
+        trained = self.trained_on()
+        return None if trained is None else current_names(trained["parameters"], f"policy {self.name}")["pose_delay"]
 
     def hover_command(self) -> float:
         """The command that hovers the drone it was trained for, mean of the motors."""

@@ -83,8 +83,7 @@ def _filled(text: str, deployment: Deployment) -> str:
 
 
 def _marks(deployment: Deployment) -> dict[str, str]:
-    trained = deployment.trained_on()
-    delay = "an unknown number of" if trained is None else f"{1e3 * trained['parameters']['observation_delay']:g}"
+    delay = deployment.pose_delay()
     step_ms = 1e3 * deployment.holder.controller.control_dt_s
     marks = {
         "TITLE": f"{deployment.name}, a policy of a Crazyflie Brushless",
@@ -92,7 +91,7 @@ def _marks(deployment: Deployment) -> dict[str, str]:
         "VERSION": __version__,
         "HASH": " and ".join(p.weights_sha256[:12] for p in deployment.policies.values()),
         "PILOT_DOES": "what flies: the network",
-        "DELAY_MS": delay,
+        "DELAY_MS": "an unknown number of" if delay is None else f"{1e3 * delay:g}",
         "BLIND_STEPS": f"{BLIND_STEPS}",
         "LARGEST_BITS": f"{np.float32(LARGEST).view(np.uint32):#x}",
         "BLIND_MS": f"{BLIND_STEPS * step_ms:g}",

@@ -109,8 +109,28 @@ class Task:
 
 def longest_delay_s(model: Quadrotor) -> float:
     """The ``Task.longest_delay_s`` that holds ``model``: whole simulation steps, and no less than the default."""
-    delay = float(jnp.max(model.parameters.observation_delay))
+    delay = float(jnp.max(model.parameters.pose_delay))
     return max(Task.longest_delay_s, model.dt * math.ceil(delay / model.dt - 1e-9))
+
+
+class Streams(NamedTuple):
+    """One key for each thing that an episode draws: nothing else may be drawn from it, or derived from it.
+
+    A key is told by its place, so a new stream goes last and leaves the draws of the others alone.
+    """
+
+    drone: PRNGKeyArray
+    start: PRNGKeyArray
+    noise: PRNGKeyArray
+    first_estimate: PRNGKeyArray
+    mildness: PRNGKeyArray
+    """Of the factor on the ranges of randomisation."""
+    setpoint: PRNGKeyArray
+
+    @classmethod
+    def of(cls, key: PRNGKeyArray) -> Streams:
+        """Of the episode that ``key`` decides."""
+        return cls(*(jax.random.fold_in(key, place) for place in range(len(cls._fields))))
 
 
 class Pose(eqx.Module):
@@ -173,26 +193,32 @@ def reset(
     Raises:
         CfbError: ranges that allow impossible drones (`cfb_mjx.parameters.require_possible`).
     """
-    of_drone, of_start, of_noise, of_first = jax.random.split(key, 4)
+    streams = Streams.of(key)
     model = nominal
     if task.randomisation is not None:
         factor = task.magnitude if magnitude is None else magnitude
         # Asked of the whole magnitude: whether a drone can be must not depend on the grade that this key draws.
         require_possible(nominal.parameters, task.randomisation, factor)
-        if task.graded:
-            which, grade = jax.random.uniform(jax.random.fold_in(of_drone, 0), (2,))
-            factor = factor * jnp.where(which < task.graded, grade, 1.0)
-        drawn = sample_parameters(of_drone, nominal.parameters, task.randomisation, factor)
+        factor = factor * mildness(task, streams.mildness)
+        drawn = sample_parameters(streams.drone, nominal.parameters, task.randomisation, factor)
         model = eqx.tree_at(lambda m: m.parameters, nominal, drawn)
     target = jnp.asarray(target, model.parameters.mass.dtype)
-    drawn = task.draw_setpoint(jax.random.fold_in(of_start, 1)) if setpoint is None else setpoint
+    drawn = task.draw_setpoint(streams.setpoint) if setpoint is None else setpoint
     setpoint = jnp.asarray(drawn, target.dtype)
-    state = task.draw_start(model, target, setpoint, of_start) if state is None else state
+    state = task.draw_start(model, target, setpoint, streams.start) if state is None else state
     state = begin(model, state)
     past = DelayLine.filled(_pose(state), model.dt, task.longest_delay_s)
-    estimate = _estimate(task, model, past, target, of_first)
+    estimate = _estimate(task, model, past, target, streams.first_estimate)
     memory = seen.start(task.layout, estimate, settled_command(model, state))
-    return Episode(model, state, target, setpoint, past, memory, estimate, jnp.asarray(0), of_noise)
+    return Episode(model, state, target, setpoint, past, memory, estimate, jnp.asarray(0), streams.noise)
+
+
+def mildness(task: Task, key: PRNGKeyArray) -> Float[Array, ""] | float:
+    """Factor in [0, 1] on an episode's randomisation: of a share ``task.graded`` of the episodes uniform, else 1."""
+    if not task.graded:
+        return 1.0
+    which, grade = jax.random.uniform(key, (2,))
+    return jnp.where(which < task.graded, grade, 1.0)
 
 
 def settled_command(model: Quadrotor, state: State) -> Float[Array, "4"]:
@@ -257,7 +283,7 @@ def _pose(state: State) -> Pose:
 
 def _estimate(task: Task, model: Quadrotor, past: DelayLine, target: Array, key: PRNGKeyArray) -> Estimate:
     parameters, noise = model.parameters, task.noise
-    late = past.read(parameters.observation_delay)
+    late = past.read(parameters.pose_delay)
     draws = jax.random.normal(key, (12,), late.position.dtype)
     # Between two samples the blend of unit quaternions is a little short.
     q = late.quaternion / jnp.sqrt(jnp.sum(late.quaternion**2))

@@ -78,8 +78,7 @@ def fly_campaign(
         for i, lane, flight in zip(waiting, lanes, simulate(lanes, pilot_of([controller] * len(lanes))), strict=True):
             tries[i] = attempt + 1
             if not flight.crashed:
-                rng = np.random.default_rng([case.seed, i, attempt, _OWN, 1])
-                logs[i] = recorded(lane, flight, rng, f"log_{i + 1:02d}")
+                logs[i] = recorded(lane, flight, _logging(case, i, attempt), f"log_{i + 1:02d}")
     if len(logs) < len(names):
         lost = ", ".join(name for i, name in enumerate(names) if i not in logs)
         raise CfbError(f"{case.name}: the policy cannot keep this drone in the air ({lost}).")
@@ -87,10 +86,20 @@ def fly_campaign(
     return Flown(ordered[: len(FIT)], ordered[len(FIT) :], names, tuple(tries), truth)
 
 
+def _streams(case: Case, index: int, attempt: int) -> list[np.random.Generator]:
+    """Of what is flown, of the noise in flight, and of the noise of what is only logged."""
+    # All by one `spawn`: it does no more than append 0, 1, 2 to these numbers, so a list of one's own can be one of it.
+    return np.random.default_rng([case.seed, index, attempt, _OWN]).spawn(3)
+
+
+def _logging(case: Case, index: int, attempt: int) -> np.random.Generator:
+    return _streams(case, index, attempt)[2]
+
+
 def _lane(
     case: Case, index: int, manoeuvre: str, attempt: int, drone: dict, instruments: Instruments, duration_scale: float
 ) -> Lane:
-    rng, noise = np.random.default_rng([case.seed, index, attempt, _OWN]).spawn(2)
+    rng, noise, _ = _streams(case, index, attempt)
     seconds = duration_scale * rng.uniform(*SECONDS.get(manoeuvre, USUAL_SECONDS))
     generate = jumps if manoeuvre == "jumps" else MANOEUVRES[manoeuvre]
     setpoints = generate(rng, seconds, GENTLER**attempt)

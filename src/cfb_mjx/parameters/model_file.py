@@ -14,7 +14,7 @@ import yaml
 from cfb_mjx.documents import load_named, refuse_unknown, shipped_names
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_text
-from cfb_mjx.parameters.parameters import DEFAULTS, SPECIFICATIONS, Parameters
+from cfb_mjx.parameters.parameters import DEFAULTS, SPECIFICATIONS, Parameters, current_names
 
 FORMAT = "cfb_mjx model 1"
 _TOP_LEVEL = {"format", "kind", "name", "description", "parameters", "effects", "provenance"}
@@ -80,6 +80,7 @@ class ModelFile:
         where = f"model {self.name}"
         if not source:
             raise CfbError(f"{where}: new values need a source; say where the numbers come from.")
+        values = current_names(values, where)
         changed = {k: Entry(_value(k, v, where), source) for k, v in values.items() if _known(k, where)}
         return replace(self, entries={**self.entries, **changed})
 
@@ -107,6 +108,7 @@ def load_model_file(name_or_path: str | Path) -> ModelFile:
     raw = document.get("parameters")
     if not isinstance(raw, dict):
         raise CfbError(f"{path}: 'parameters' must be a mapping of names to {{value, unit, source}}.")
+    raw = current_names(raw, path, "parameters.")
     refuse_unknown(raw, set(SPECIFICATIONS), path, "parameters.")
     entries = {key: _entry(key, raw[key], path) for key in raw}
     missing = [key for key in SPECIFICATIONS if key not in raw and key not in DEFAULTS]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -54,10 +55,18 @@ class Parameters(eqx.Module):
     """Factor on each rotor's thrust. One in the paper."""
     torque_scale: Float[Array, "*batch 4"] = eqx.field(converter=_array)
     """Factor on each rotor's aerodynamic torque. One in the paper."""
-    observation_delay: Float[Array, "*batch"] = eqx.field(converter=_array)
-    """Age of the estimated pose and velocity when the controller reads them, s."""
+    pose_delay: Float[Array, "*batch"] = eqx.field(converter=_array)
+    """Age of the estimated pose and velocity when the controller reads them, s. Formerly ``observation_delay``."""
     attitude_offset: Float[Array, "*batch 3"] = eqx.field(converter=_array)
     """Rotation vector from the true body axes to the axes the estimator reports, rad."""
+    gyro_delay: Float[Array, "*batch"] = eqx.field(converter=_array)
+    """Age of the gyro's reading when the controller reads it, s. The gyro is on the drone: a real one's filters make
+    about 2 ms."""
+
+    @property
+    def observation_delay(self) -> Float[Array, "*batch"]:
+        """Former name of ``pose_delay``."""
+        return self.pose_delay
 
     def __check_init__(self):
         for name, specification in SPECIFICATIONS.items():
@@ -164,8 +173,10 @@ SPECIFICATIONS: dict[str, Specification] = {
     ),
     "thrust_scale": Specification("1", (4,), "factor on thrust", Limits(0.0, 10.0, 0.3, 2.0)),
     "torque_scale": Specification("1", (4,), "factor on aerodynamic torque", Limits(0.0, 10.0, 0.2, 4.0)),
-    "observation_delay": Specification("s", (), "age of pose and velocity", Limits(0.0, 1.0, 0.0, 0.1)),
+    "pose_delay": Specification("s", (), "age of pose and velocity", Limits(0.0, 1.0, 0.0, 0.1)),
     "attitude_offset": Specification("rad", (3,), "attitude error of the estimator", Limits(-3.15, 3.15, -0.3, 0.3)),
+    # Last: a parameter's place decides its random draws.
+    "gyro_delay": Specification("s", (), "age of the gyro's reading", Limits(0.0, 1.0, 0.0, 0.05)),
 }
 """What every parameter is and where it may lie: files, ``--set``, randomisation, fits and constructors ask here."""
 
@@ -176,5 +187,21 @@ DEFAULTS: dict[str, float] = {
     "thrust_scale": 1.0,
     "torque_scale": 1.0,
     "attitude_offset": 0.0,
+    "gyro_delay": 0.0,
 }
 """Neutral values of what a parameter file may leave out."""
+
+FORMER_NAMES = {"observation_delay": "pose_delay"}
+"""Names that files and commands may still use."""
+
+
+def current_names(values: Mapping[str, Any], where: str | Path, prefix: str = "") -> dict[str, Any]:
+    """The same values under the names of today.
+
+    Raises:
+        CfbError: one is given under both of its names.
+    """
+    for former, now in FORMER_NAMES.items():
+        if former in values and now in values:
+            raise CfbError(f"{where}: {prefix}{former} and {prefix}{now} are one thing; give {prefix}{now} alone.")
+    return {FORMER_NAMES.get(name, name): value for name, value in values.items()}

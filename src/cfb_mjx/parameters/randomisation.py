@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cfb_mjx.documents import load_named, refuse_unknown
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters.limits import concrete
-from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters
+from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters, current_names
 
 FORMAT = "cfb_mjx randomisation 1"
 
@@ -52,6 +52,7 @@ def load_randomisation(name_or_path: str | Path = "paper") -> Randomisation:
     ranges = document.get("ranges") or {}
     if not isinstance(ranges, dict):
         raise CfbError(f"{path}: 'ranges' must be a mapping of parameter names.")
+    ranges = current_names(ranges, path, "ranges.")
     refuse_unknown(ranges, set(SPECIFICATIONS), path, "ranges.")
     return Randomisation(
         name=str(document.get("name", path.stem)),

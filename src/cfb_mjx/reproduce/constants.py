@@ -18,7 +18,7 @@ SHARED = {
     "motor_gain": ("motor gain K, rad/s", 2900.0),
     "rotor_inertia": ("rotor inertia J_m, kg m^2", 0.5e-7),
     "rotor_spacing": ("rotor spacing l, m", 0.0707),
-    "observation_delay": ("observation delay, s", 0.008),
+    "pose_delay": ("observation delay, s", 0.008),
 }
 NAMES = {"cfb-guards": "with guards", "cfb": "without guards"}
 RANDOMISATION = {

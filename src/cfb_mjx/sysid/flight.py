@@ -33,7 +33,7 @@ class Flight(eqx.Module):
     position: Float[Array, "n 3"]
     velocity: Float[Array, "n 3"]
     quaternion: Float[Array, "n 4"]
-    """Pose and velocity when the row's time stamp was written, not ``observation_delay`` before."""
+    """Pose and velocity when the row's time stamp was written, not ``pose_delay`` before."""
     body_rate: Float[Array, "n 3"]
     specific_force: Float[Array, "n 3"]
     command: Float[Array, "n 4"]
@@ -52,13 +52,13 @@ class Flight(eqx.Module):
 def delay_of(log: FlightLog, parameters: Parameters) -> float:
     """Age of pose and velocity in a row, s: as the log says, else as the model does."""
     delay = log.observation_delay
-    return float(parameters.observation_delay) if delay is None else float(delay)
+    return float(parameters.pose_delay) if delay is None else float(delay)
 
 
 def usual_delay(logs: Sequence[FlightLog], parameters: Parameters) -> float:
     """One `delay_of` for several logs: the median of what they say."""
     delays = {log.observation_delay for log in logs} - {None}
-    return float(np.median(list(delays))) if delays else float(parameters.observation_delay)
+    return float(np.median(list(delays))) if delays else float(parameters.pose_delay)
 
 
 def prepare_flight(log: FlightLog, delay: float) -> Flight:

@@ -8,7 +8,7 @@ What they know at a window's start is added to the prediction and fades with its
 (``docs/nanodrone.md``).
 
 Causal: an estimate rests on gyro, accelerometer, commands, voltage and rotor speeds up to its row. Attitude and
-velocity enter through the model's effects only, read ``observation_delay`` late as a window's initial state is.
+velocity enter through the model's effects only, read ``pose_delay`` late as a window's initial state is.
 """
 
 from __future__ import annotations

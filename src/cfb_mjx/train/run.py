@@ -8,6 +8,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import yaml
+from jaxtyping import PRNGKeyArray
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
@@ -39,6 +41,16 @@ _JUDGED_ON = 64
 """Hover flights at each point of the curve, with the noise of the task."""
 
 Row = dict[str, float]
+
+
+class Stream(IntEnum):
+    """What a training draws with its seed; each has a key of its own."""
+
+    NETWORK, LEARNING, JUDGING = range(3)
+
+    def key(self, seed: int) -> PRNGKeyArray:
+        """Of a training with this seed."""
+        return jax.random.fold_in(jax.random.PRNGKey(seed), int(self))
 
 
 @dataclass(frozen=True)
@@ -106,7 +118,7 @@ class Training:
             return self.start.controller
         network = self.config.network
         return NeuralController.random(
-            jax.random.PRNGKey(self.config.seed),
+            Stream.NETWORK.key(self.config.seed),
             self.config.observation,
             network.hidden,
             network.activation,
@@ -152,8 +164,7 @@ def train(
     task = training.config.build_task(longest_delay_s(nominal))
     task.hold(nominal)
     algorithm = build(training.config, task, nominal, over)
-    key = jax.random.fold_in(jax.random.PRNGKey(training.config.seed), 1)
-    state = algorithm.begin(key, training.first_controller(nominal))
+    state = algorithm.begin(Stream.LEARNING.key(training.config.seed), training.first_controller(nominal))
     done, seconds, rows = 0, 0.0, []
     if about is not None:
         state = _loaded(checkpoint, state)
@@ -259,7 +270,7 @@ def _differences(before: Any, now: Any, path: str) -> list[str]:
 
 
 def _judged(controller: NeuralController, training: Training, task, nominal: Quadrotor) -> Row:
-    keys = jax.random.split(jax.random.PRNGKey(training.config.seed + 1), _JUDGED_ON)
+    keys = jax.random.split(Stream.JUDGING.key(training.config.seed), _JUDGED_ON)
     if training.config.task == "flip":
         measured = turning(controller, nominal_task(task), nominal, keys)
         return {name: float(jnp.mean(value)) for name, value in measured._asdict().items()}

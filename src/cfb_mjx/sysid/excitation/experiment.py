@@ -143,7 +143,7 @@ def _flown(model: Quadrotor, stabiliser: Stabiliser, start: State, phase, fixed,
         np.asarray, _simulate(model, stabiliser, start, levels, (phase, fixed, draws))
     )
     time = np.arange(n) * TICK
-    log = _log(time, state, measured, command, force, conditions, rng, float(model.parameters.observation_delay), name)
+    log = _log(time, state, measured, command, force, conditions, rng, float(model.parameters.pose_delay), name)
     return log, time, state, command
 
 
@@ -186,7 +186,7 @@ def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs):
         state, line, memory, target, wandering = carry
         phase, fixed, draws = row
         line = line.push(state)
-        measured = observe(line.read(p.observation_delay), state.body_rate, draws)
+        measured = observe(line.read(p.pose_delay), state.body_rate, draws)
         memory = jax.tree.map(
             lambda new, old: jnp.where(phase == HANDOVER, new, old),
             stabiliser.resume(memory, measured),

@@ -83,8 +83,8 @@ def linearise(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = Tr
     Raises:
         CfbError: a parameter that does not show in the innovations.
     """
-    if "observation_delay" in unknowns.names:
-        raise CfbError("--parameters observation_delay: a manoeuvre cannot be designed for it; leave it out.")
+    if "pose_delay" in unknowns.names:
+        raise CfbError("--parameters pose_delay: a manoeuvre cannot be designed for it; leave it out.")
     data = prepare(list(logs))
     segments = jax.tree.map(jnp.asarray, data.segments)
     noise = Noise.first(data)

@@ -86,7 +86,7 @@ def fit(
         return fit(logs, nominal, ",".join([base, *kept]), use_measured, robust, estimator, progress, over)
     unknowns = choose(parameters, nominal)
     if estimator == "auto":
-        estimator = "shooting" if "observation_delay" in unknowns.names else "innovation"
+        estimator = "shooting" if "pose_delay" in unknowns.names else "innovation"
     if estimator == "shooting":
         return shoot(
             logs, nominal, unknowns.names, use_measured=use_measured, robust=robust, progress=progress, over=over

@@ -103,7 +103,7 @@ _FILE_KEYS = (
     "motor_speed_offset",
     "thrust_scale",
     "torque_scale",
-    "observation_delay",
+    "pose_delay",
 )
 _AXES = ("inertia_xx", "inertia_yy", "inertia_zz")
 

@@ -72,8 +72,8 @@ def shoot(
         CfbError: unknown parameters, or no window in any log.
     """
     unknowns = choose(parameters, nominal)
-    delayed = "observation_delay" in unknowns.names
-    data = batches(logs, None, float(nominal.observation_delay), use_measured, over)
+    delayed = "pose_delay" in unknowns.names
+    data = batches(logs, None, float(nominal.pose_delay), use_measured, over)
     if not data:
         raise CfbError(f"{', '.join(log.name for log in logs)}: no prediction window fits; fly at least 1.2 s.")
     body = RigidBody() if body is None else body
@@ -82,7 +82,7 @@ def shoot(
     for done in range(ROUNDS):
         before = vector
         if delayed and done:
-            data = batches(logs, float(unknowns.apply(vector).observation_delay), 0.0, use_measured, over)
+            data = batches(logs, float(unknowns.apply(vector).pose_delay), 0.0, use_measured, over)
         whiten = _whitening(unknowns, vector, data, body, free_start)
         whiten = whiten if over is None else over.along(whiten)
         vector = _solve(unknowns, vector, data, body, whiten, robust)
@@ -106,10 +106,10 @@ def _errors(
     unknowns: Unknowns, vector: Array, start: Float[Array, "w 16"], batch: Batch, body: Body
 ) -> Float[Array, "w m"]:
     """Prediction errors in standard deviations, with the starts moved by ``start`` standard deviations."""
-    parameters, delayed = unknowns.apply(vector), "observation_delay" in unknowns.names
+    parameters, delayed = unknowns.apply(vector), "pose_delay" in unknowns.names
     model = Quadrotor(parameters, body=body, integrator="rk4", rotor_loads="instant")
     # What a row calls the pose at t is the pose at t + late; the windows were cut with the logs' own delays.
-    late = batch.delay - parameters.observation_delay if delayed else 0.0
+    late = batch.delay - parameters.pose_delay if delayed else 0.0
 
     def one(lead_step, lead_command, state, step, inputs, at, truth, noise, rotor_noise, move):
         speed = state.rotor_speed if batch.measured else _speed_after(parameters, lead_step, lead_command)

@@ -30,7 +30,7 @@ UNITS = {
     "torque_scale": "1",
     "cog_x": "m",
     "cog_y": "m",
-    "observation_delay": "s",
+    "pose_delay": "s",
 }
 """Names a fit knows, with their units. Motor quantities are common to the four motors; ``thrust_linear`` is the
 coefficient of s in the thrust cubic: with ``thrust_scale`` it sets level and slope of the thrust near hover."""
@@ -39,13 +39,14 @@ GROUPS = {
     "motor": ("motor_time_constant", "motor_gain"),
     "cog": ("cog_x", "cog_y"),
     "J_m": ("rotor_inertia",),
+    "observation_delay": ("pose_delay",),
 }
 OFFSETS = {
     "motor_speed_offset": 200.0,
     "thrust_linear": 0.05,
     "cog_x": 0.01,
     "cog_y": 0.01,
-    "observation_delay": 0.004,
+    "pose_delay": 0.004,
 }
 """Quantities that may be zero: changed by so much, not by a factor, for one unit of the optimiser's number."""
 _AXES = ("inertia_xx", "inertia_yy", "inertia_zz")
@@ -77,7 +78,7 @@ class Unknowns(eqx.Module):
                 q.center_of_gravity,
                 q.motor_speed_offset,
                 q.thrust_polynomial,
-                q.observation_delay,
+                q.pose_delay,
             ),
             p,
             (
@@ -86,7 +87,7 @@ class Unknowns(eqx.Module):
                 p.center_of_gravity + jnp.stack([*cog, jnp.zeros(())]),
                 p.motor_speed_offset + moved.get("motor_speed_offset", 0.0),
                 p.thrust_polynomial + jnp.stack([0.0, 0.0, moved.get("thrust_linear", 0.0)]),
-                p.observation_delay + moved.get("observation_delay", 0.0),
+                p.pose_delay + moved.get("pose_delay", 0.0),
             ),
         )
 
@@ -94,7 +95,7 @@ class Unknowns(eqx.Module):
         """The chosen quantities at ``vector``, SI (means over the motors); differentiable."""
         p = self.apply(vector)
         known = {
-            **{name: jnp.mean(getattr(p, name)) for name in (*_FACTORS, "motor_speed_offset", "observation_delay")},
+            **{name: jnp.mean(getattr(p, name)) for name in (*_FACTORS, "motor_speed_offset", "pose_delay")},
             **{axis: p.inertia[i] for i, axis in enumerate(_AXES)},
             "thrust_linear": p.thrust_polynomial[2],
             "cog_x": p.center_of_gravity[0],
