@@ -7,6 +7,7 @@ Minutes. The paper's own numbers are of the real drone and stand beside.
 
 import argparse
 import sys
+from dataclasses import replace
 
 from campaign import ROOT
 
@@ -27,7 +28,7 @@ def main() -> None:
     import jax
     import numpy as np
 
-    from cfb_mjx.control.pilot import find_pilot
+    from cfb_mjx.control.pilot import find_pilot, has_lumped_delay
     from cfb_mjx.envs import reset
     from cfb_mjx.files import write_json, write_text
     from cfb_mjx.train.flying import hover, recovery, six_metres
@@ -35,12 +36,13 @@ def main() -> None:
 
     judge = Judge(random_drones=arguments.plants)
     described, nominal, plants = judge.described, judge.nominal, judge.plants
-    calm, wild, few, many = judge.calm, judge.wild, judge.few, judge.many
-    drones = jax.jit(jax.vmap(lambda key: reset(wild, nominal, key).model.parameters))(many)
+    few, many = judge.few, judge.many
+    drones = jax.jit(jax.vmap(lambda key: reset(judge.wild, nominal, key).model.parameters))(many)
     results = {}
     for name in arguments.controllers:
         say(name)
         pilot = find_pilot(name, nominal)
+        calm, wild = (replace(task, lumped_delay=has_lumped_delay(name)) for task in (judge.calm, judge.wild))
         one, _ = hover(pilot, calm, nominal, few)
         step, _ = six_metres(pilot, calm, nominal, few)
         all_of_them, _ = hover(pilot, wild, nominal, many)
@@ -123,8 +125,9 @@ def page(results: dict, facts: dict, plants: int, described) -> str:
         "",
         f"Written by `{' '.join(['python', *map(str, ['scripts/measure_controllers.py', *sys.argv[1:]])])}` on "
         f"{facts['date']}, {facts['processor']}, Python {facts['python']}, jax {facts['jax']}, cfb_mjx "
-        f"{facts['cfb_mjx']}. In simulation: model `{described.name}`, estimates 8 ms late and noisy, noise of the "
-        "state as in the paper. The paper's numbers are of its real drone.",
+        f"{facts['cfb_mjx']}. In simulation: model `{described.name}`, estimates 8 ms late and noisy, the gyro too "
+        "but for the firmware's controllers, which read it on the drone; noise of the state as in the paper. The "
+        "paper's numbers are of its real drone.",
         "",
         "## On the nominal drone",
         "",

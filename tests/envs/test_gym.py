@@ -1,14 +1,22 @@
 """The Gymnasium environments: its own checker, and the same flights as the functions they wrap."""
 
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
-from cfb_mjx.envs import FlipTask, TargetTask
-from cfb_mjx.envs.gym import TargetEnv, TargetVectorEnv
+from cfb_mjx.envs import FlipTask, Starts, TargetTask
+from cfb_mjx.envs.gym import DIVERGED, FAST, TargetEnv, TargetVectorEnv
 from cfb_mjx.errors import CfbError
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.parameters import load_randomisation
 
 SHORT = replace(TargetTask(), episode_s=0.04)
 
@@ -32,7 +40,7 @@ def test_many_fly_end_and_begin_anew():
         assert reward.shape == (3,)
         assert not failed.any()
         assert not timed_out.any()
-        assert not info
+        assert "final_obs" not in info
     seen, _, failed, timed_out, info = env.step(hover)
     assert timed_out.all()
     assert not failed.any()
@@ -54,9 +62,129 @@ def test_one_drone_shows_its_last_observation():
     assert np.abs(path[-1][:3] - path[-2][:3]).max() < 0.2
 
 
-def test_a_step_before_a_reset_is_refused():
+@pytest.fixture(scope="module")
+def one():
+    return TargetEnv(SHORT)
+
+
+@pytest.fixture(scope="module")
+def three():
+    return TargetVectorEnv(3, replace(SHORT, randomisation=load_randomisation("paper")))
+
+
+def test_a_step_before_a_reset_is_refused(one):
     with pytest.raises(CfbError, match="call reset"):
         TargetVectorEnv(1, SHORT).step(np.zeros((1, 4)))
+    with pytest.raises(ResetNeeded, match="call reset"):
+        TargetEnv(SHORT).step(np.zeros(4))
+
+
+def test_a_step_past_the_end_is_refused(one):
+    one.reset(seed=0)
+    while not one.step(np.full(4, 0.1))[3]:
+        pass
+    with pytest.raises(ResetNeeded, match="call reset before step"):
+        one.step(np.full(4, 0.1))
+    one.reset()
+    one.step(np.full(4, 0.1))
+
+
+@pytest.mark.parametrize("action", [np.zeros(3), np.zeros((1, 4)), 0.5, "full", [[0.0], [0.0, 1.0]], None])
+def test_an_action_of_another_shape_is_refused_in_a_sentence(one, three, action):
+    one.reset(seed=0)
+    with pytest.raises(CfbError, match=r"^TargetEnv: an action must be 4 numbers, .*, found .*\.$"):
+        one.step(action)
+    three.reset(seed=0)
+    with pytest.raises(CfbError, match=r"^TargetVectorEnv: an action must be 3 x 4 numbers, .*, found .*\.$"):
+        three.step(action)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_an_action_that_is_not_finite_is_refused_at_once(one, three, number):
+    actions = np.zeros((3, 4))
+    actions[1, 2] = number
+    three.reset(seed=0)
+    with pytest.raises(CfbError, match="TargetVectorEnv: an action must be finite, found"):
+        three.step(actions)
+    one.reset(seed=0)
+    with pytest.raises(CfbError, match="TargetEnv: an action must be finite, found"):
+        one.step(actions[1])
+
+
+def test_what_the_controller_does_not_see_is_in_the_info(three):
+    _, info = three.reset(seed=5)
+    mass = info["parameters"]["mass"]
+    assert mass.shape == (3,)
+    assert len(np.unique(mass)) == 3
+    places = [info["position"]]
+    for _ in range(4):
+        *_, info = three.step(np.full((3, 4), 0.1))
+        places.append(info["position"])
+        np.testing.assert_allclose(np.linalg.norm(info["quaternion"], axis=1), 1, rtol=1e-5)
+        assert info["rotor_speed"].shape == (3, 4)
+        np.testing.assert_array_equal(info["parameters"]["mass"], mass)
+        np.testing.assert_allclose(places[-1], places[-2] + 0.008 * info["velocity"], atol=2e-3)
+    *_, info = three.step(np.full((3, 4), 0.1))
+    # The truth of what ended, and of what has begun.
+    np.testing.assert_array_equal(info["final_info"]["parameters"]["mass"], mass)
+    np.testing.assert_allclose(info["final_info"]["position"], 2 * places[-1] - places[-2], atol=2e-3)
+    assert not np.any(info["parameters"]["mass"] == mass)
+    assert "failure" not in info["final_info"]
+
+
+def test_a_drone_that_fails_says_why(one):
+    drone = Quadrotor.from_file("cfb-guards")
+    fast = replace(SHORT, starts=Starts(near=0.0, speed_mps=300.0))
+    failing = TargetEnv(fast, drone)
+    failing.reset(seed=3)
+    _, reward, failed, _, info = failing.step(np.zeros(4))
+    assert failed
+    assert info["failure"] == FAST
+    # A rotor that turns the faster the faster it turns: its speed overflows within a step.
+    broken = eqx.tree_at(lambda m: m.parameters.motor_time_constant, drone, jnp.full(4, -1e-6))
+    env = TargetVectorEnv(2, SHORT, broken)
+    env.reset(seed=3)
+    seen, reward, failed, timed_out, info = env.step(np.zeros((2, 4)))
+    assert failed.all()
+    assert not timed_out.any()
+    assert info["final_info"]["failure"].tolist() == [DIVERGED] * 2
+    assert (reward == -300).all()
+    for numbers in (seen, info["final_obs"], info["final_info"]["position"], info["final_info"]["rotor_speed"]):
+        assert np.isfinite(numbers).all()
+
+
+def test_environments_without_a_seed_are_not_alike():
+    many = [TargetVectorEnv(1, SHORT).reset()[0] for _ in range(2)]
+    assert not np.any(many[0] == many[1])
+    single = [TargetEnv(SHORT).reset()[0] for _ in range(2)]
+    assert not np.any(single[0] == single[1])
+    with pytest.raises(CfbError, match="one whole number"):
+        TargetVectorEnv(2, SHORT).reset(seed=[1, 2])
+
+
+FORKED = """
+import warnings
+warnings.simplefilter("ignore")
+from dataclasses import replace
+from gymnasium.vector import AsyncVectorEnv
+from cfb_mjx.envs import TargetTask
+from cfb_mjx.envs.gym import TargetEnv
+from cfb_mjx.errors import CfbError
+many = AsyncVectorEnv([TargetEnv, TargetEnv], context="fork")
+try:
+    many.reset(seed=0)
+except CfbError as error:
+    print(error)
+many.close(terminate=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork here")
+def test_environments_in_forked_processes_say_so_instead_of_waiting():
+    done = subprocess.run(
+        [sys.executable, "-c", FORKED], capture_output=True, text=True, timeout=120, env={**os.environ}, check=False
+    )
+    assert 'context="spawn"' in done.stdout, done.stderr
 
 
 def test_seeds_count():

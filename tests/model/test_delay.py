@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cfb_mjx.errors import CfbError
 from cfb_mjx.model import DelayLine, State
 
 DT = 0.004
@@ -29,14 +30,27 @@ def _line(values, longest=0.012):
         (0.012, 2.0),
         (0.005, 3.75),
         (0.0105, 2.375),
-        (0.1, 2.0),  # longer than the line: the oldest
-        (-0.1, 5.0),  # the future is not known: the newest
     ],
 )
 def test_reads_what_was_true_then(delay, expected):
     line = _line([0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
     assert float(line.read(delay)) == pytest.approx(expected, abs=1e-12)
     assert float(jax.jit(DelayLine.read)(line, delay)) == pytest.approx(expected, abs=1e-12)
+
+
+@pytest.mark.parametrize("delay", [0.0121, 0.1, -0.1, float("nan")])
+def test_a_delay_outside_of_the_line_is_no_number(delay):
+    line = _line([0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
+    with pytest.raises(CfbError, match=r"does not fit in a line of 0\.012 s"):
+        line.read(delay)
+    assert np.isnan(jax.jit(DelayLine.read)(line, delay))
+    states = DelayLine.filled(_state(0.2), DT, 0.012)
+    assert np.isnan(helpers.pack(jax.jit(DelayLine.read)(states, delay))).all()
+
+
+def test_a_delay_of_the_whole_line_may_be_rounded():
+    line = DelayLine.filled(jnp.float32(1.0), DT, 0.012).push(jnp.float32(2.0))
+    assert line.read(jnp.float32(0.012) * (1 + 1e-6)) == 1.0
 
 
 @pytest.mark.parametrize(("longest", "count"), [(0.0, 1), (0.004, 2), (0.008, 3), (0.0081, 4), (0.012, 4), (0.005, 3)])

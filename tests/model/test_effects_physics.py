@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from cfb_mjx.model import Quadrotor, State, begin, rotors
+from cfb_mjx.model import Quadrotor, State, begin, rollout, rotors
 from cfb_mjx.model.effects import (
     BatterySag,
     BladeFlapping,
@@ -285,15 +285,31 @@ def test_a_step_without_duration_shows_the_command_of_its_instant(guards):
     np.testing.assert_allclose(got[:, 0], [0.5, 0.3, 0.1, 0.1, 0.15], rtol=1e-12)
 
 
-def test_longest_delay_is_the_memory(guards):
-    commands = jnp.linspace(0.0, 1.0, 21)[:, None] * jnp.ones(4)
-    for delay in (8 * 0.004, 1.0):
-        got = _received(CommandDelay(delay), guards, jnp.full(4, 1450.0), jnp.full(21, 0.004), commands)
-        np.testing.assert_allclose(got, jnp.concatenate([jnp.full((8, 4), 0.5), commands[:13]]), rtol=1e-9)
+@pytest.mark.parametrize(("dt", "substeps"), [(0.001, 1), (0.004, 4), (0.004, 1)])
+def test_the_longest_delay_is_flown_at_any_step(dt, substeps, guards):
+    """20 ms, the largest of the range: what the motors got is what was commanded then, step for step."""
+    steps = round(0.1 / dt)
+    commands = np.random.default_rng(2).uniform(0.0, 1.0, (steps, 4))
+    model = Quadrotor(guards, (CommandDelay(0.020),), dt=dt, substeps=substeps)
+    prompt = Quadrotor(guards, dt=dt, substeps=substeps)
+    start = State.at_rest(rotor_speed=jnp.full(4, 1450.0))
+    late, at_once = (rollout(m, start, jnp.asarray(commands)).rotor_speed for m in (model, prompt))
+    ago = round(0.020 / dt)
+    np.testing.assert_allclose(late[:ago], 1450.0, rtol=1e-9)
+    np.testing.assert_allclose(late[ago:], at_once[:-ago], rtol=1e-9)
+
+
+def test_a_delay_outlasts_any_number_of_commands(guards):
+    """Commands every millisecond through a memory made for steps of 4 ms: less sharp, and as late as it says."""
+    ramp = jnp.linspace(0.0, 1.0, 101)[:, None] * jnp.ones(4)
+    got = _received(CommandDelay(0.020), guards, jnp.full(4, 1.0), jnp.full(101, 0.001), ramp)
+    at = 0.01 * (np.arange(101) - 20)
+    np.testing.assert_allclose(np.asarray(got)[30:, 0], at[30:], atol=0.01 * 20 / 7)
+    assert abs(np.mean(np.asarray(got)[30:, 0] - at[30:])) < 0.01
 
 
 def test_delay_shifts_the_rotors_by_exactly_the_delay(guards, fly_fleet):
-    rows = (0, 3, 8)
+    rows = (0, 3, 5)
     models = [Quadrotor(guards, (CommandDelay(0.004 * n),)) for n in rows]
     _, commands = helpers.aggressive_manoeuvre(0.1)
     flown = fly_fleet(_batch(models), models[0].hover_state(), jnp.asarray(commands)).rotor_speed

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.windows import find_starts, find_windows
 
 HORIZONS = (0.05, 0.1, 0.2, 0.5)
@@ -76,6 +77,25 @@ def test_pose_is_read_late_by_the_delay_and_gyro_is_not():
     ends = windows.start[:, None] + np.array(HORIZONS)
     np.testing.assert_allclose(windows.true_position[..., 0], ends + delay, atol=1e-12)
     np.testing.assert_allclose(windows.true_body_rate[..., 0], ends, atol=1e-12)
+
+
+def test_a_gyro_that_is_late_is_read_late():
+    log = make_log(np.arange(0, 3.0, 0.004))
+    windows = find_windows(log, HORIZONS, 0.0065, gyro_delay=0.003)
+    ends = windows.start[:, None] + np.array(HORIZONS)
+    np.testing.assert_allclose(windows.position[:, 0], windows.start + 0.0065, atol=1e-12)
+    np.testing.assert_allclose(windows.body_rate[:, 0], windows.start + 0.003, atol=1e-12)
+    np.testing.assert_allclose(windows.true_body_rate[..., 0], ends + 0.003, atol=1e-12)
+    np.testing.assert_allclose(prepare_flight(log, 0.0065, 0.003).body_rate[:700, 0], log.time[:700] + 0.003)
+
+
+@pytest.mark.parametrize("delays", [(0.09, 0.0), (0.008, 0.09)])
+def test_no_window_reads_what_comes_after_the_logs_end(delays):
+    log = make_log(np.arange(0, 3.0001, 0.004))
+    windows = find_windows(log, HORIZONS, delays[0], gyro_delay=delays[1])
+    assert windows.start[-1] + HORIZONS[-1] + 0.09 <= log.time[-1] < windows.start[-1] + HORIZONS[-1] + 0.09 + 0.2
+    ends = windows.start[:, None] + np.array(HORIZONS)
+    np.testing.assert_allclose(windows.true_position[..., 0], ends + delays[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("rate", [250, 100, 48])

@@ -55,6 +55,7 @@ def run_fly(
     outputs: Outputs,
     turn: Turn,
     devices: int = 1,
+    gyro: Literal["late", "local"] | None = None,
 ) -> None:
     """Fly, print what was measured, write what was asked for.
 
@@ -81,10 +82,10 @@ def run_fly(
     import jax
     import numpy as np
 
-    from cfb_mjx.control.pilot import find_pilot
+    from cfb_mjx.control.pilot import find_pilot, has_lumped_delay
     from cfb_mjx.devices import Devices
     from cfb_mjx.envs import Noise, TargetTask
-    from cfb_mjx.envs.episode import QUIET, longest_delay_s
+    from cfb_mjx.envs.episode import QUIET, with_room
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import load_model_file, load_randomisation, require_possible
     from cfb_mjx.train import flying
@@ -96,14 +97,14 @@ def run_fly(
     nominal = Quadrotor.from_file(described)
     spread = load_randomisation(randomisation)
     require_possible(nominal.parameters, spread, magnitude, "--magnitude")
+    # Scaled for the model that was named, whatever it is flown on.
+    pilot = find_pilot(controller, nominal)
     course = TargetTask(
         noise=Noise() if noise else QUIET,
         randomisation=spread if magnitude else None,
         magnitude=magnitude,
-        longest_delay_s=longest_delay_s(nominal),
+        lumped_delay=has_lumped_delay(controller) if gyro is None else gyro == "late",
     )
-    # Scaled for the model that was named, whatever it is flown on.
-    pilot = find_pilot(controller, nominal)
     if task is None:
         task = "flip" if asks_for_setpoints(pilot) else DEFAULT_TASK
     rotations = None
@@ -117,7 +118,7 @@ def run_fly(
             raise CfbError(f"{controller}: is a flip policy and cannot fly --task {task}; fly flip or double-flip.")
         if turn != Turn():
             raise CfbError(f"--knobs, --set, --holder, --search and --keep are for flips, not for --task {task}.")
-    test = flips if task in FLIPS else flying.TESTS[task]
+    test, course = flips if task in FLIPS else flying.TESTS[task], with_room(course, nominal)
     keys = jax.random.split(jax.random.PRNGKey(seed), plants)
     over = Devices.take(devices)
     together = over.divided(lambda pilot, drone, keys: test(pilot, course, drone, keys), (None, None, 0), 0)
@@ -133,6 +134,7 @@ def run_fly(
         return summary(task, {k: np.asarray(v) for k, v in measured._asdict().items()}, good, diverged), flown
 
     result = {"controller": controller, "task": task, "model": model, "plants": plants, "magnitude": magnitude}
+    result["gyro"] = "late" if course.lumped_delay else "local"
     if rotations is not None:
         result["knobs"] = {name: float(x) for name, x in pilot.knobs._asdict().items() if np.isfinite(x)}
     if on is None:
@@ -222,10 +224,11 @@ def _label(key: str) -> str:
 
 def _print(result: dict) -> None:
     drones = "drone" if result["plants"] == 1 else "drones"
-    print(f"{result['controller']}, {result['task']}: {result['plants']} {drones}, {result['model']}")
+    gyro = "the gyro as late as the pose" if result["gyro"] == "late" else "the gyro on the drone"
+    print(f"{result['controller']}, {result['task']}: {result['plants']} {drones}, {result['model']}, {gyro}")
     quantiles = result.get("quantiles", {})
     for key, value in result.items():
-        if key in ("controller", "task", "model", "plants", "magnitude", "quantiles", "knobs", "diverged"):
+        if key in ("controller", "task", "model", "plants", "magnitude", "gyro", "quantiles", "knobs", "diverged"):
             continue
         shown = value if isinstance(value, bool) else "never" if value is None else f"{value:.4g}"
         spread = quantiles.get(key)

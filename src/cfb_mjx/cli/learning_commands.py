@@ -75,6 +75,7 @@ def fly(
     search: Literal["height", "margin"] | None = None,
     keep: File = None,
     devices: int = 1,
+    gyro: Literal["late", "local"] | None = None,
 ) -> None:
     """Fly a controller in simulation and measure it.
 
@@ -106,8 +107,10 @@ def fly(
             randomisation.
         keep: write the knobs that were flown here, for --knobs.
         devices: of this machine that share the flights of many plants.
+        gyro: late: as late as the pose, the model's pose_delay, as in the paper; local: on the drone, gyro_delay late.
+            By default a policy flies as it was trained, and pid and mellinger with a local one, as in the firmware.
     """
     from cfb_mjx.cli.flying import Outputs, Turn, run_fly
 
     outputs, turn = Outputs(json, figure, recording, video, log), Turn(knobs, tuple(flat(set)), holder, search, keep)
-    run_fly(controller, task, model, plants, magnitude, randomisation, on, noise, seed, outputs, turn, devices)
+    run_fly(controller, task, model, plants, magnitude, randomisation, on, noise, seed, outputs, turn, devices, gyro)

@@ -60,6 +60,20 @@ class MellingerPilot(eqx.Module):
         return mellinger.step(self.firmware, memory, _measured(estimate), jnp.zeros(3))
 
 
+def has_lumped_delay(controller: str | Path) -> bool:
+    """Whether a controller of `find_pilot` flies with the gyro as late as the pose (`cfb_mjx.envs.Task.lumped_delay`).
+
+    A policy does as it was trained, which for those that do not say is the paper's reading; the firmware's controllers
+    read the gyro on the drone.
+
+    Raises:
+        CfbError: the file is no policy.
+    """
+    if controller in ("pid", "mellinger"):
+        return False
+    return load_policy(shipped_policies().get(str(controller), controller)).lumped_delay
+
+
 def _measured(estimate: Estimate) -> State:
     return State(estimate.position, estimate.velocity, estimate.quaternion, estimate.body_rate, jnp.zeros(4))
 

@@ -34,6 +34,11 @@ class PolicyFile:
     training: dict[str, Any] = field(default_factory=dict)
 
     @property
+    def lumped_delay(self) -> bool:
+        """Whether it was trained with the gyro as late as the pose: `cfb_mjx.envs.Task.lumped_delay`."""
+        return bool(self.training.get("config", {}).get("lumped_delay", True))
+
+    @property
     def weights_sha256(self) -> str:
         """Of weights and biases, first layer first, as little-endian float32."""
         network = self.controller.network

@@ -16,7 +16,7 @@ from cfb_mjx.deploy.compiled import CompiledPolicy
 from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.deploy.parity import begin
 from cfb_mjx.envs import Estimate, TargetTask
-from cfb_mjx.envs.episode import Episode, longest_delay_s, reset, step
+from cfb_mjx.envs.episode import Episode, reset, step, with_room
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
 
@@ -62,8 +62,8 @@ def fly_beside(
     pilot, dt = deployment.pilot, deployment.pilot.control_dt_s
     if dt < plant.dt:
         plant = replace(plant, dt=dt)
-    task = TargetTask(layout=deployment.holder.controller.layout, longest_delay_s=longest_delay_s(plant))
-    start = plant.hover_state(offset)
+    task = TargetTask(layout=deployment.holder.controller.layout, lumped_delay=deployment.holder.lumped_delay)
+    task, start = with_room(task, plant), plant.hover_state(offset)
     hover = jnp.full(4, deployment.hover_command(), jnp.float32)
     steps = round(seconds / dt)
     position, command = np.empty((2, steps, 3)), np.empty((2, steps, 4), np.float32)

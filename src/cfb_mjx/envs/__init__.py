@@ -1,6 +1,6 @@
 """Tasks to train on: what the controller sees, what it is rewarded for, how episodes begin and end."""
 
-from cfb_mjx.envs.episode import Episode, Noise, Task, observe, reset, step
+from cfb_mjx.envs.episode import Episode, Noise, Task, observe, reset, step, with_room
 from cfb_mjx.envs.flip import FlipReward, FlipStarts, FlipTask, Setpoints
 from cfb_mjx.envs.observation import Estimate, Layout, Memory
 from cfb_mjx.envs.reward import PaperReward
@@ -24,4 +24,5 @@ __all__ = [
     "observe",
     "reset",
     "step",
+    "with_room",
 ]

@@ -7,17 +7,18 @@ wanted of the drone is said by a `Task`: `cfb_mjx.envs.target` and `cfb_mjx.envs
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cfb_mjx.envs import observation as seen
 from cfb_mjx.envs.observation import Estimate, Layout, Memory
+from cfb_mjx.errors import CfbError
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.rotors import steady_command
@@ -58,8 +59,12 @@ class Task:
     graded: float = 0.0
     """Share of the episodes that draw their own factor between 0 and ``magnitude``."""
     episode_s: float = 6.0
-    longest_delay_s: float = 0.016
-    """The longest observation delay any drone of the task may have; longer ones count as this."""
+    lumped_delay: bool = True
+    """The paper's reading: one delay, the model's ``pose_delay``, for pose, velocity and gyro alike. Else the gyro is
+    on the drone, as real ones are, and only ``gyro_delay`` late."""
+    longest_delay_s: float | None = None
+    """The longest delay that any drone of the task has, for which estimates are kept; None: what the model and the
+    randomisation say. To be given (`with_room`) where the model is traced."""
 
     @property
     def episode_steps(self) -> int:
@@ -97,8 +102,13 @@ class Task:
         raise NotImplementedError
 
     def failed(self, state: State) -> Bool[Array, ""]:
-        """Whether ``state`` ends the episode."""
+        """Whether ``state`` ends the episode; one that is not finite does, whatever is said here."""
         raise NotImplementedError
+
+    @property
+    def diverged_reward(self) -> float:
+        """Reward of the step after which the state is not finite any more."""
+        return -300.0
 
     def errors(
         self, state: State, target: Float[Array, "3"], setpoint: Float[Array, "setpoints"]
@@ -107,10 +117,64 @@ class Task:
         raise NotImplementedError
 
 
-def longest_delay_s(model: Quadrotor) -> float:
-    """The ``Task.longest_delay_s`` that holds ``model``: whole simulation steps, and no less than the default."""
-    delay = float(jnp.max(model.parameters.pose_delay))
-    return max(Task.longest_delay_s, model.dt * math.ceil(delay / model.dt - 1e-9))
+def longest_delay_s(task: Task, nominal: Quadrotor, magnitude: Float[Array, ""] | float | None = None) -> float | None:
+    """The longest delay of what a controller sees, s, of any drone that the task draws about ``nominal``.
+
+    Args:
+        task: the task.
+        nominal: the drone about which others are drawn; may carry batch axes.
+        magnitude: of the randomisation, in place of the task's.
+
+    Returns:
+        None where it cannot be known, as the model or the magnitude is traced.
+
+    Raises:
+        CfbError: a delay of zero has a relative range, which is none.
+    """
+    ranges = {} if task.randomisation is None else dict(task.randomisation.ranges)
+    magnitude = task.magnitude if magnitude is None else magnitude
+    longest = 0.0
+    for name in _DELAYS[: 1 if task.lumped_delay else 2]:
+        value, spread = getattr(nominal.parameters, name), ranges.get(name)
+        if isinstance(value, jax.core.Tracer) or (spread is not None and isinstance(magnitude, jax.core.Tracer)):
+            return None
+        value = float(np.max(value))
+        if spread is not None:
+            if spread.relative and value == 0:
+                raise CfbError(
+                    f"ranges.{name} is relative, and {name} is 0: nothing would vary; give the model one (--set {name}="
+                    "0.002), or leave the range out."
+                )
+            width = float(magnitude) * max(spread.half_width)
+            value = value * (1 + width) if spread.relative else value + width
+        longest = max(longest, value)
+    return longest
+
+
+_DELAYS = ("pose_delay", "gyro_delay")
+
+
+def with_room(task: Task, nominal: Quadrotor) -> Task:
+    """The task with room for late estimates of every drone it draws about ``nominal``, which may then be traced."""
+    longest = longest_delay_s(task, nominal)
+    return task if longest is None else replace(task, longest_delay_s=longest)
+
+
+def _room_s(task: Task, nominal: Quadrotor, magnitude) -> float:
+    """For how long estimates are kept."""
+    longest, room = longest_delay_s(task, nominal, magnitude), task.longest_delay_s
+    if room is None and longest is None:
+        raise CfbError(
+            "reset: the delay of a traced model is not known while compiling; give the task its longest_delay_s, for "
+            "instance by with_room(task, model) outside of jit and vmap."
+        )
+    if room is not None and longest is not None and longest > room * (1 + 1e-6):
+        names = " or ".join(_DELAYS[: 1 if task.lumped_delay else 2])
+        raise CfbError(
+            f"The task keeps estimates for longest_delay_s = {room:g} s, but {names} can be {longest:g} s; raise it or "
+            "leave it out."
+        )
+    return longest if room is None else room
 
 
 class Streams(NamedTuple):
@@ -165,9 +229,11 @@ class Outcome(NamedTuple):
 
     reward: Float[Array, ""]
     failed: Bool[Array, ""]
-    """The episode is over: too fast."""
+    """The episode is over: too fast, or not finite."""
     timed_out: Bool[Array, ""]
     """The episode is over: its time is up."""
+    diverged: Bool[Array, ""]
+    """It failed because its state is not finite any more."""
 
 
 def reset(
@@ -191,8 +257,10 @@ def reset(
         setpoint: what is asked for beside the target; drawn by default.
 
     Raises:
-        CfbError: ranges that allow impossible drones (`cfb_mjx.parameters.require_possible`).
+        CfbError: ranges that allow impossible drones (`cfb_mjx.parameters.require_possible`); or the task has no room
+            for the delays that can be drawn, or they are not known as the model is traced.
     """
+    room = _room_s(task, nominal, magnitude)
     streams = Streams.of(key)
     model = nominal
     if task.randomisation is not None:
@@ -207,7 +275,7 @@ def reset(
     setpoint = jnp.asarray(drawn, target.dtype)
     state = task.draw_start(model, target, setpoint, streams.start) if state is None else state
     state = begin(model, state)
-    past = DelayLine.filled(_pose(state), model.dt, task.longest_delay_s)
+    past = DelayLine.filled(_pose(state), model.dt, room)
     estimate = _estimate(task, model, past, target, streams.first_estimate)
     memory = seen.start(task.layout, estimate, settled_command(model, state))
     return Episode(model, state, target, setpoint, past, memory, estimate, jnp.asarray(0), streams.noise)
@@ -248,6 +316,8 @@ def step(
         episode: the flight so far.
         command: of M1..M4; clipped to [0, 1].
         prepared: `prepare(episode.model)`, where the caller has it already.
+
+    A state that is not finite any more has failed; the episode keeps the last one that was, and what was seen of it.
     """
     model = episode.model
     prepared = prepare(model) if prepared is None else prepared
@@ -267,14 +337,24 @@ def step(
     # A loop, however short, and arrays put together only after it: else XLA fuses the dynamics into every such array
     # and, on CPU without its multi-output fusion, computes them once for each number in it, twenty times slower.
     moved, passed = jax.lax.scan(fly, unstack(episode.state, center), Vec.unstack(kicks))
-    state = stack(moved, center)
-    past = episode.past.push_all(_pose(stack(passed, center)))
+    state, poses = stack(moved, center), _pose(stack(passed, center))
+    finite = _finite(state)
+    state = choose(finite, state, episode.state)
+    poses = jax.tree.map(lambda new, old: jnp.where(finite, new, old), poses, _pose(episode.state))
+    command = jnp.where(finite, command, 0.0)
+    past = episode.past.push_all(poses)
     memory = seen.remember(task.layout, episode.memory, episode.estimate, command)
     estimate = _estimate(task, model, past, episode.target, of_estimate)
     count = episode.count + 1
     after = Episode(model, state, episode.target, episode.setpoint, past, memory, estimate, count, episode.key)
     reward = task.judge(state, episode.target, episode.setpoint, command, model.parameters)
-    return after, Outcome(reward, task.failed(state), count >= task.episode_steps)
+    reward = jnp.where(finite, reward, task.diverged_reward)
+    return after, Outcome(reward, task.failed(state) | ~finite, count >= task.episode_steps, ~finite)
+
+
+def _finite(state: State) -> Bool[Array, ""]:
+    parts = (state.position, state.velocity, state.quaternion, state.body_rate, state.rotor_speed)
+    return jnp.all(jnp.isfinite(jnp.concatenate(parts)))
 
 
 def _pose(state: State) -> Pose:
@@ -284,6 +364,9 @@ def _pose(state: State) -> Pose:
 def _estimate(task: Task, model: Quadrotor, past: DelayLine, target: Array, key: PRNGKeyArray) -> Estimate:
     parameters, noise = model.parameters, task.noise
     late = past.read(parameters.pose_delay)
+    if not task.lumped_delay:
+        gyro = DelayLine(past.samples.body_rate, past.dt).read(parameters.gyro_delay)
+        late = Pose(late.position, late.velocity, late.quaternion, gyro)
     draws = jax.random.normal(key, (12,), late.position.dtype)
     # Between two samples the blend of unit quaternions is a little short.
     q = late.quaternion / jnp.sqrt(jnp.sum(late.quaternion**2))

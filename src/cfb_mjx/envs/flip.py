@@ -188,6 +188,11 @@ class FlipTask(Task):
         """Too fast."""
         return self.reward.failed(state)
 
+    @property
+    def diverged_reward(self) -> float:
+        """The failure of the paper."""
+        return -self.reward.failure
+
     def errors(self, state: State, target: Float[Array, "3"], setpoint: Float[Array, "2"]) -> Float[Array, "3"]:
         """Of velocity, axis and body rate."""
         velocity, axis, body_rate = deviations(state, setpoint, self.reward.axis_direction)

@@ -41,6 +41,11 @@ class TargetTask(Task):
         """Too fast."""
         return self.reward.failed(state)
 
+    @property
+    def diverged_reward(self) -> float:
+        """The failure of the paper."""
+        return -self.reward.failure
+
     def errors(self, state: State, target: Float[Array, "3"], setpoint: Array) -> Float[Array, "3"]:
         """Of position, velocity and body rate."""
         rate = length(state.body_rate) / 10

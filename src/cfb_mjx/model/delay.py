@@ -1,4 +1,4 @@
-"""Observation delay: a buffer that gives back what was true some time ago, between samples if need be."""
+"""Late estimates: a buffer that gives back what was true some time ago, between samples if need be."""
 
 from __future__ import annotations
 
@@ -7,9 +7,14 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from cfb_mjx.errors import CfbError
 from cfb_mjx.model.state import State
+
+_SLACK = 1e-3
+"""Of a sample: delays and steps are rounded to float32."""
 
 
 class DelayLine(eqx.Module):
@@ -47,12 +52,23 @@ class DelayLine(eqx.Module):
         return DelayLine(shifted, self.dt)
 
     def read(self, delay: Float[Array, ""] | float) -> PyTree:
-        """The sample ``delay`` seconds before the newest, linear between samples; longer delays give the oldest.
+        """The sample ``delay`` seconds before the newest, linear between samples.
 
-        Quaternions of a `State` are interpolated along the shorter way and normalised.
+        Quaternions of a `State` are interpolated along the shorter way and normalised. A delay that is traced and does
+        not lie within the line reads as NaN, and so fails whatever is computed from it.
+
+        Raises:
+            CfbError: the delay is negative, or longer than the line.
         """
         count = jax.tree.leaves(self.samples)[0].shape[0]
-        at = jnp.clip(jnp.asarray(delay) / self.dt, 0.0, count - 1.0)
+        if not isinstance(delay, jax.core.Tracer) and not _fits(np.asarray(delay) / self.dt, count):
+            longest = (count - 1) * self.dt
+            raise CfbError(
+                f"A delay of {delay:g} s does not fit in a line of {longest:g} s; fill one for the longest delay."
+            )
+        at = jnp.asarray(delay) / self.dt
+        inside = jnp.where(at < 0, 0.0, jnp.where(at > count - 1, count - 1.0, at))
+        at = jnp.where(_fits(at, count), inside, jnp.nan)
         # Weights instead of indexing: the same cost for few samples, and differentiable in the delay.
         weights = jnp.maximum(0.0, 1.0 - jnp.abs(jnp.arange(count) - at))
 
@@ -78,3 +94,7 @@ class DelayLine(eqx.Module):
             )
 
         return jax.tree.map(read_node, self.samples, is_leaf=lambda x: isinstance(x, State))
+
+
+def _fits(at, count: int):
+    return (at >= -_SLACK) & (at <= count - 1 + _SLACK)

@@ -47,8 +47,8 @@ def controllers(folder: Path, real: Path | None) -> Result:
     _draw_hover(distances, paper, folder / "controllers.png")
     text = [
         f"{SIMULATED} Six seconds at the target, the last five count, mean of {len(judge.few)} flights with the noise "
-        "and the delay that networks are trained with; then the ten drones of `configs/plants/off-nominal.yaml`, whose "
-        "effects no controller knows of.",
+        "and the delay, of pose and gyro alike, that networks are trained with; then the ten drones of "
+        "`configs/plants/off-nominal.yaml`, whose effects no controller knows of.",
         "The firmware's PID has integral action, and a simulated drone without wind and drifting batteries lets it "
         "come to rest; Mellinger's height error is that of the firmware's default mass and thrust scale.",
     ]

@@ -61,12 +61,13 @@ def usual_delay(logs: Sequence[FlightLog], parameters: Parameters) -> float:
     return float(np.median(list(delays))) if delays else float(parameters.pose_delay)
 
 
-def prepare_flight(log: FlightLog, delay: float) -> Flight:
+def prepare_flight(log: FlightLog, delay: float, gyro_delay: float = 0.0) -> Flight:
     """Rows of a log at their own time.
 
     Args:
         log: the flight.
         delay: age of pose and velocity in a row, s.
+        gyro_delay: age of the gyro's reading in a row, s.
     """
     n, time = len(log), log.time
     gaps = log.gaps()
@@ -77,10 +78,10 @@ def prepare_flight(log: FlightLog, delay: float) -> Flight:
     ends = np.append(time[gaps], time[-1])
     until = ends[np.searchsorted(ends, time)] - time
     # Pose at a row's own time is read from later rows, which must not lie behind a gap.
-    valid = (since >= WARM_UP) & (until >= delay)
+    valid = (since >= WARM_UP) & (until >= max(delay, gyro_delay))
 
-    def late(values):
-        return interpolate(time, values, time + delay)
+    def late(values, by=delay):
+        return interpolate(time, values, time + by)
 
     speed, measured = _rotor_speed(log)
     flight = {
@@ -89,7 +90,7 @@ def prepare_flight(log: FlightLog, delay: float) -> Flight:
         "position": late(log.position),
         "velocity": late(log.velocity),
         "quaternion": tidy(late(tidy(log.quaternion))),
-        "body_rate": log.body_rate,
+        "body_rate": late(log.body_rate, gyro_delay),
         "specific_force": log.specific_force,
         "command": np.clip(log.command, 0.0, 1.0),
         "rotor_speed": speed,

@@ -134,7 +134,9 @@ def observe(model: Quadrotor, log: FlightLog, delay: float, observer: Observer, 
     Returns:
         NumPy arrays, one row per row of the log.
     """
-    found, _ = _observe(model, *replay_inputs(log, delay, use_measured), _numbers(observer))
+    found, _ = _observe(
+        model, *replay_inputs(log, delay, use_measured, float(model.parameters.gyro_delay)), _numbers(observer)
+    )
     return jax.tree.map(lambda x: np.asarray(x)[: len(log)], found)
 
 
@@ -161,7 +163,9 @@ def fit_observer(model: Quadrotor, logs: Sequence[FlightLog], observer: Observer
     first = _numbers(observer or Observer())
     replays = []
     for log in logs:
-        flight, driven = replay_inputs(log, delay_of(log, model.parameters))
+        flight, driven = replay_inputs(
+            log, delay_of(log, model.parameters), gyro_delay=float(model.parameters.gyro_delay)
+        )
         replays.append((model, flight, driven, replayed(model, flight, driven)))
     leaves, structure = jax.tree.flatten(first)
     sizes = [leaf.size for leaf in leaves]
@@ -194,9 +198,11 @@ def _numbers(observer: Observer) -> Observer:
     return Observer(**fields)
 
 
-def replay_inputs(log: FlightLog, delay: float, use_measured: bool = True) -> tuple[Flight, Array]:
+def replay_inputs(
+    log: FlightLog, delay: float, use_measured: bool = True, gyro_delay: float = 0.0
+) -> tuple[Flight, Array]:
     """The flight and the rotor speeds that drive the body; its ``measured`` says whether they do."""
-    flight = prepare_flight(log, delay)
+    flight = prepare_flight(log, delay, gyro_delay)
     driven = causal_rotor_speed(log) if use_measured else None
     used = 1.0 if driven is not None else 0.0
     driven = np.zeros((len(log), 4)) if driven is None else driven

@@ -98,7 +98,7 @@ def start_of_windows(model: Quadrotor, log: FlightLog, windows: Windows, delay: 
 
     Both come from the commands since the log began and from what the log measured before each start, never after.
     """
-    flight = prepare_flight(log, delay)
+    flight = prepare_flight(log, delay, float(model.parameters.gyro_delay))
     # Indexing in NumPy: the number of windows differs from log to log, and the program should not.
     speed, memory = jax.tree.map(lambda x: np.asarray(x)[windows.row], _remembered(model, flight))
     # A start that is a row's own time may fall a rounding before it.

@@ -13,6 +13,8 @@ FIRST_START = 0.6
 START_SPACING = 0.2
 REACH = 0.53
 """A window starts while t0 + REACH lies inside the log, s."""
+ROOM = 0.03
+"""What `REACH` holds of the age of readings, s; as much as they are older a window must end earlier."""
 GAP_BEFORE, GAP_AFTER = 0.3, 0.5
 COMMAND_TICK = 0.001
 """A command takes effect at the first tick at or after its row: the firmware's main loop runs at 1 kHz, and time stamps
@@ -55,15 +57,17 @@ class Windows:
         return len(self.start)
 
 
-def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float) -> np.ndarray:
+def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float, gyro_delay: float = 0.0) -> np.ndarray:
     """Window starts the protocol allows: (W,) s of log time, possibly none."""
     # Logs count from zero even when their first sample comes a little later; others are taken from their first row.
     origin = 0.0 if 0 <= log.time[0] < START_SPACING else log.time[0]
-    count = int(np.floor((log.time[-1] - origin - REACH - FIRST_START) / START_SPACING + 1e-9)) + 1
+    ages = (0.0, delay, gyro_delay)
+    reach = REACH + max(0.0, max(ages) - ROOM)
+    count = int(np.floor((log.time[-1] - origin - reach - FIRST_START) / START_SPACING + 1e-9)) + 1
     starts = origin + FIRST_START + START_SPACING * np.arange(max(count, 0))
     gaps = np.asarray(log.gaps(), dtype=int)
     begin, end = log.time[gaps], log.time[gaps + 1] if len(gaps) else log.time[gaps]
-    instants = np.array([0.0, delay, *horizons, *(h + delay for h in horizons)])
+    instants = np.array([start + age for start in (0.0, *horizons) for age in ages])
     allowed = [
         not np.any((begin >= t0 - GAP_BEFORE) & (begin <= t0 + GAP_AFTER))
         # The edges of a gap count as covered: a reading there would rest on rounding.
@@ -74,17 +78,22 @@ def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float) -> np
 
 
 def find_windows(
-    log: FlightLog, horizons: tuple[float, ...], delay: float, starts: np.ndarray | None = None
+    log: FlightLog,
+    horizons: tuple[float, ...],
+    delay: float,
+    starts: np.ndarray | None = None,
+    gyro_delay: float = 0.0,
 ) -> Windows:
     """Cut a log into prediction windows.
 
     Args:
         log: the flight.
         horizons: prediction horizons, s, ascending.
-        delay: age of pose and velocity in a row, s; gyro and commands are taken as current.
+        delay: age of pose and velocity in a row, s; commands are taken as current.
         starts: window starts, s, in place of those of `find_starts`.
+        gyro_delay: age of the gyro's reading in a row, s.
     """
-    starts = find_starts(log, horizons, delay) if starts is None else starts
+    starts = find_starts(log, horizons, delay, gyro_delay) if starts is None else starts
     ticks = np.ceil(log.time / COMMAND_TICK - 1e-6) * COMMAND_TICK
     plans = [_plan(ticks, t0, horizons) for t0 in starts]
     width = max((len(edges) - 1 for edges, _, _ in plans), default=0)
@@ -104,7 +113,7 @@ def find_windows(
         position=interpolate(log.time, log.position, starts + delay),
         velocity=interpolate(log.time, log.velocity, starts + delay),
         quaternion=_unit(interpolate(log.time, log.quaternion, starts + delay)),
-        body_rate=interpolate(log.time, log.body_rate, starts),
+        body_rate=interpolate(log.time, log.body_rate, starts + gyro_delay),
         row=_row(log.time, starts),
         step=step,
         command=command,
@@ -113,7 +122,7 @@ def find_windows(
         true_position=interpolate(log.time, log.position, ends + delay),
         true_velocity=interpolate(log.time, log.velocity, ends + delay),
         true_quaternion=_unit(interpolate(log.time, log.quaternion, ends + delay)),
-        true_body_rate=interpolate(log.time, log.body_rate, ends),
+        true_body_rate=interpolate(log.time, log.body_rate, ends + gyro_delay),
     )
 
 

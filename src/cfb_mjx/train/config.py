@@ -127,6 +127,8 @@ class TrainingConfig:
     checkpoints: int = 20
     """Over the whole training, evenly spaced; the policy is flown and the learning curve grows at each."""
     episode_s: float = 6.0
+    lumped_delay: bool = True
+    """Whether the gyro is as late as the pose, as in the paper, or only by the model's ``gyro_delay``."""
     network: NetworkSettings = field(default_factory=NetworkSettings)
     observation: Layout = field(default_factory=Layout)
     reward: PaperReward = field(default_factory=PaperReward)
@@ -136,11 +138,11 @@ class TrainingConfig:
     analytic: AnalyticSettings = field(default_factory=AnalyticSettings)
     ppo: PpoSettings = field(default_factory=PpoSettings)
 
-    def build_task(self, longest_delay_s: float = 0.016) -> TargetTask:
+    def build_task(self) -> TargetTask:
         """The task that is trained on."""
-        return TargetTask(reward=self.reward, starts=self.starts, **self._common(longest_delay_s))
+        return TargetTask(reward=self.reward, starts=self.starts, **self._common())
 
-    def _common(self, longest_delay_s: float) -> dict[str, Any]:
+    def _common(self) -> dict[str, Any]:
         chosen = self.randomisation
         return {
             "layout": self.observation,
@@ -149,7 +151,7 @@ class TrainingConfig:
             "magnitude": chosen.magnitude,
             "graded": chosen.graded,
             "episode_s": self.episode_s,
-            "longest_delay_s": longest_delay_s,
+            "lumped_delay": self.lumped_delay,
         }
 
     def to_mapping(self) -> dict[str, Any]:
@@ -170,10 +172,10 @@ class FlipTrainingConfig(TrainingConfig):
     analytic: FlipAnalyticSettings = field(default_factory=FlipAnalyticSettings)
     ppo: FlipPpoSettings = field(default_factory=FlipPpoSettings)
 
-    def build_task(self, longest_delay_s: float = 0.016) -> FlipTask:
+    def build_task(self) -> FlipTask:
         """The task that is trained on."""
         own = {"reward": self.reward, "starts": self.starts, "setpoints": self.setpoints}
-        return FlipTask(**own, **self._common(longest_delay_s))
+        return FlipTask(**own, **self._common())
 
 
 _KINDS = {"target": TrainingConfig, "flip": FlipTrainingConfig}

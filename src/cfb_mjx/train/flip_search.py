@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cfb_mjx.control.manoeuvre import Knobs, Manoeuvre
+from cfb_mjx.envs.episode import with_room
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
@@ -115,6 +116,7 @@ def search(
     if goal.aim == "margin" and task.randomisation is None:
         raise CfbError("A flip's margin is looked for on randomised drones; give the task a randomisation.")
     within = bounds(goal.rotations) if within is None else within
+    task = with_room(task, nominal)
     low, high = (jnp.stack([jnp.asarray(x, float) for x in side]) for side in within)
     of_nominal, of_plants, of_draws = jax.random.split(key, 3)
     few = jax.random.split(of_nominal, 4)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.control.manoeuvre import CATCH, Manoeuvre, roll_angle, unwrapped
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.envs.episode import QUIET, observe, reset, step
+from cfb_mjx.envs.episode import QUIET, observe, reset, step, with_room
 from cfb_mjx.envs.flip import FlipTask, deviations
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
@@ -70,7 +70,7 @@ def flips(
         keys: one per flight.
         seconds: watched; no shorter than the manoeuvre and `COUNTED_S`.
     """
-    return _flips(manoeuvre, task, nominal, keys, seconds)
+    return _flips(manoeuvre, with_room(task, nominal), nominal, keys, seconds)
 
 
 @eqx.filter_jit
@@ -120,7 +120,7 @@ TURNING_S, SPUN_UP_S, RISING_MPS = 1.0, 0.3, 3.5
 
 def turning(controller: NeuralController, task: FlipTask, nominal: Quadrotor, keys: PRNGKeyArray) -> Turning:
     """Turn `TURNING_S` at the middle of the task's set-points, from rising level at `RISING_MPS`; a flight per key."""
-    return _turning(controller, task, nominal, keys)
+    return _turning(controller, with_room(task, nominal), nominal, keys)
 
 
 @eqx.filter_jit
@@ -162,13 +162,13 @@ class Replay(NamedTuple):
 
 def replay(manoeuvre: Manoeuvre, nominal: Quadrotor) -> Replay:
     """Fly, and fly the commands again open loop: nothing but the commands moves the drone."""
-    return _replay(manoeuvre, nominal)
+    return _replay(manoeuvre, with_room(TargetTask(noise=QUIET), nominal), nominal)
 
 
 @eqx.filter_jit
-def _replay(manoeuvre, nominal):
+def _replay(manoeuvre, task, nominal):
     start, dt = nominal.hover_state((0.0, 0.0, 0.0)), manoeuvre.control_dt_s
-    flown = fly(manoeuvre, TargetTask(noise=QUIET), nominal, jax.random.PRNGKey(0), FLIP_S, start)
+    flown = fly(manoeuvre, task, nominal, jax.random.PRNGKey(0), FLIP_S, start)
     again = rollout(nominal, start, flown.command, hold=round(dt / nominal.dt))
     apart = jnp.max(jnp.linalg.norm(again.position - flown.position, axis=-1))
     parameters = nominal.changed_parameters()

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.control.pilot import Pilot
-from cfb_mjx.envs.episode import reset, settled_command, step
+from cfb_mjx.envs.episode import reset, settled_command, step, with_room
 from cfb_mjx.envs.observation import Layout
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
@@ -113,7 +113,7 @@ def hover(pilot: Pilot, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray
         nominal: the drone.
         keys: one per flight.
     """
-    return _hover(pilot, task, nominal, keys)
+    return _hover(pilot, with_room(task, nominal), nominal, keys)
 
 
 @eqx.filter_jit
@@ -139,7 +139,7 @@ class Step(NamedTuple):
 
 def six_metres(pilot: Pilot, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray) -> tuple[Step, Flight]:
     """From hover, `STEP_DISTANCE_M` away along x; the flights too."""
-    return _six_metres(pilot, task, nominal, keys)
+    return _six_metres(pilot, with_room(task, nominal), nominal, keys)
 
 
 @eqx.filter_jit
@@ -169,7 +169,7 @@ def back_and_forth(
     Returns:
         One flight, its ``position`` in the world; ``watched`` is the target (steps, 3).
     """
-    return _back_and_forth(pilot, task, nominal, key, legs, leg_s)
+    return _back_and_forth(pilot, with_room(task, nominal), nominal, key, legs, leg_s)
 
 
 @eqx.filter_jit
@@ -204,7 +204,7 @@ def recovery(
     Recovered is who is below 0.5 m/s, tilted less than 30 deg and within `CAUGHT_M` after `RECOVERY_S` without having
     passed a limit on the way.
     """
-    return _recovery(pilot, task, nominal, keys, jnp.asarray(tilt_deg), jnp.asarray(speed))
+    return _recovery(pilot, with_room(task, nominal), nominal, keys, jnp.asarray(tilt_deg), jnp.asarray(speed))
 
 
 @eqx.filter_jit

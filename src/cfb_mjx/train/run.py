@@ -21,7 +21,6 @@ from jaxtyping import PRNGKeyArray
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
 from cfb_mjx.devices import Devices
-from cfb_mjx.envs.episode import longest_delay_s
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, write_text
 from cfb_mjx.hosts import as_first, first, from_first
@@ -161,7 +160,7 @@ def train(
     checkpoint = output / CHECKPOINT
     about = from_first(lambda: _found(checkpoint, output_folder(output), training, resume))
     over, nominal = Devices.take(devices), training.nominal()
-    task = training.config.build_task(longest_delay_s(nominal))
+    task = training.config.build_task()
     task.hold(nominal)
     algorithm = build(training.config, task, nominal, over)
     state = algorithm.begin(Stream.LEARNING.key(training.config.seed), training.first_controller(nominal))

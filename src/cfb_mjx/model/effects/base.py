@@ -102,6 +102,10 @@ class Effect(eqx.Module):
         """Memory after a long steady flight at ``rotor_speed``."""
         return ()
 
+    def begin(self, rotor_speed: Vec, parameters: Parameters, dt: float) -> Memory:
+        """`start` of a flight in steps of ``dt`` seconds, where those decide how much there is to remember."""
+        return self.start(rotor_speed, parameters)
+
     def sense(self, memory: Memory, reading: Reading) -> Memory:
         """Take over what a log measured of the hidden state."""
         return memory

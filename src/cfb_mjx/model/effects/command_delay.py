@@ -4,16 +4,22 @@ Commands are held between rows, so the delayed command of one step is piecewise 
 exact mean over the step. Each command's weight is the overlap of the interval in which it was held with [t - delay,
 t - delay + dt], divided by dt: any fraction of a step is possible, and the derivative by the delay exists.
 
-Remembered are the last eight commands and how long ago each began; one row is one integration step, so the longest
-delay is eight of them. Beyond that the oldest command stands for all before it.
+Remembered are the last commands and how long ago each began. There are as many as the longest delay of the effect's
+range needs at the model's integration step, and no fewer than eight. Where steps are shorter than that, as between the
+rows of a log, commands that together lasted less than the seventh (or what that number is) part of the delay are
+remembered as their mean: whatever the steps, the delay is what it says.
 """
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect, Memory
@@ -23,7 +29,7 @@ from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 ROWS = 8
-"""Commands remembered."""
+"""Least number of commands remembered."""
 
 
 class CommandDelay(Effect):
@@ -49,12 +55,21 @@ class CommandDelay(Effect):
     def neutral(cls) -> CommandDelay:
         return cls(delay=0.0)
 
+    def begin(self, rotor_speed: Vec, parameters: Parameters, dt: float) -> Memory:
+        longest = self.prior["delay"][1]
+        if not isinstance(self.delay, jax.core.Tracer):
+            longest = max(longest, float(np.max(self.delay)))
+        return self._steady(rotor_speed, parameters, max(ROWS, math.ceil(longest / dt - 1e-6) + 1))
+
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
+        return self._steady(rotor_speed, parameters, ROWS)
+
+    def _steady(self, rotor_speed: Vec, parameters: Parameters, rows: int) -> Memory:
         steady = (rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
         steady = steady.map(lambda u: jnp.clip(u, 0.0, 1.0))
         age = jnp.zeros_like(rotor_speed[0])
         # Commands that began at the same instant had no time to act, save the oldest, which has acted for ever.
-        return Vec(*(age,) * ROWS), *(steady,) * ROWS
+        return Vec(*(age,) * rows), *(steady,) * rows
 
     def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
         ages, *earlier = memory
@@ -74,10 +89,22 @@ class CommandDelay(Effect):
             received = received + (older - newer) * before(age)
             newer = older
 
-        # A step without duration has given no command.
-        def pushed(newest, line):
-            return [jnp.where(held, a, b) for a, b in zip((newest, *line[:-1]), line, strict=True)]
+        # A row of its own, if the newest one has lasted long enough: rows this long reach as far back as the delay.
+        # Else both as their mean. A step without duration changes nothing.
+        own = ages[0] >= self.delay / (len(earlier) - 1) * (1 - 1e-3)
+        lasted = ages[0] + dt
+        share = dt / jnp.where(lasted > 0, lasted, 1.0)
+        own = own & held
 
-        ages = pushed(dt, [age + dt for age in ages])
-        columns = [pushed(newest, list(line)) for newest, line in zip(command, zip(*earlier, strict=True), strict=True)]
+        def pushed(newest, mixed, line):
+            return [
+                jnp.where(own, newest, mixed),
+                *(jnp.where(own, a, b) for a, b in pairwise(line)),
+            ]
+
+        ages = pushed(dt, lasted, [age + dt for age in ages])
+        columns = [
+            pushed(newest, line[0] + (newest - line[0]) * share, line)
+            for newest, line in zip(command, zip(*earlier, strict=True), strict=True)
+        ]
         return received, (Vec(*ages), *(Vec(*row) for row in zip(*columns, strict=True)))

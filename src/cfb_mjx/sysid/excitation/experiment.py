@@ -48,7 +48,8 @@ class Experiment:
     """A simulated flight.
 
     Attributes:
-        log: what would be recorded (pose and velocity late by the model's observation delay).
+        log: what would be recorded (pose and velocity late by the model's ``pose_delay``,
+            the gyro by ``gyro_delay``).
         time: (n,) s, every `TICK`.
         state: true states at ``time``.
         command: (n, 4) in force from ``time`` on.
@@ -140,7 +141,7 @@ def _flown(model: Quadrotor, stabiliser: Stabiliser, start: State, phase, fixed,
     draws = {name: rng.normal(size=(n, width)) for name, width in widths.items()}
     levels = {k: jnp.asarray(v) for k, v in vars(conditions).items() if not isinstance(v, bool)}
     state, measured, command, force = jax.tree.map(
-        np.asarray, _simulate(model, stabiliser, start, levels, (phase, fixed, draws))
+        np.asarray, _simulate(model, stabiliser, start, levels, (phase, fixed, draws), _longest_delay(model))
     )
     time = np.arange(n) * TICK
     log = _log(time, state, measured, command, force, conditions, rng, float(model.parameters.pose_delay), name)
@@ -163,8 +164,12 @@ class _Push(Effect):
         return Wrench(wrench.force + Vec.unstack(self.force), wrench.torque + Vec.unstack(self.torque))
 
 
+def _longest_delay(model: Quadrotor) -> float:
+    return max(float(model.parameters.pose_delay), float(model.parameters.gyro_delay))
+
+
 @eqx.filter_jit
-def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs):
+def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs, longest_delay: float):
     p = model.parameters
     keep = jnp.exp(-TICK / levels["correlation_time"])
     # One process per axis of torque, force and rotor; the first draw starts it in its steady state.
@@ -186,7 +191,8 @@ def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs):
         state, line, memory, target, wandering = carry
         phase, fixed, draws = row
         line = line.push(state)
-        measured = observe(line.read(p.pose_delay), state.body_rate, draws)
+        rate = DelayLine(line.samples.body_rate, TICK).read(p.gyro_delay)
+        measured = observe(line.read(p.pose_delay), rate, draws)
         memory = jax.tree.map(
             lambda new, old: jnp.where(phase == HANDOVER, new, old),
             stabiliser.resume(memory, measured),
@@ -220,7 +226,7 @@ def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs):
     # The push remembers nothing, but a state has an entry for each effect.
     pushed = eqx.tree_at(lambda q: q.effects, model, (*model.effects, _Push(jnp.zeros(3), jnp.zeros(3))))
     begun = begin(pushed, eqx.tree_at(lambda s: s.memory, start, (), is_leaf=lambda x: isinstance(x, tuple)))
-    carry = (begun, DelayLine.filled(begun, TICK, 0.1), memory, start.position, wandering)
+    carry = (begun, DelayLine.filled(begun, TICK, longest_delay), memory, start.position, wandering)
     return jax.lax.scan(tick, carry, jax.tree.map(jnp.asarray, inputs))[1]
 
 
