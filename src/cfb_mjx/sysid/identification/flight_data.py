@@ -25,6 +25,9 @@ class Segments(eqx.Module):
     valid: Float[Array, "s n"]
     """1 for rows that are measured, 0 for the padding."""
     command: Float[Array, "s n 4"]
+    doubt: Float[Array, "s n 4"]
+    """Of a command's step to the next row, the part that the steps about it do not foretell: what may have been sent
+    between the rows is uncertain by a share of it."""
     rotor_speed: Float[Array, "s n 4"]
     """Measured, rad/s; what it holds where ``measured`` is 0 means nothing."""
     measured: Float[Array, "s"]
@@ -122,12 +125,23 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> di
         "interval": np.where(padding, 0.0, pad(np.concatenate([[0.0], np.diff(log.time[rows])]))),
         "valid": (~padding).astype(float),
         "command": pad(np.clip(log.command[rows], 0, 1)),
+        "doubt": np.concatenate(
+            [_unforetold(log.time[rows], np.clip(log.command[rows], 0, 1)), np.zeros((1 + width - count, 4))]
+        ),
         "rotor_speed": pad(speed),
         "measured": np.array(float(measured)),
         "warm_up": (np.arange(width) < lead).astype(float),
         "body_rate": pad(log.body_rate[rows]),
         "specific_force": pad(log.specific_force[rows]),
     }
+
+
+def _unforetold(time: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """(n - 1, 4) steps of the command without what the mean slope of the steps before and after would make."""
+    interval, step = np.diff(time)[:, None], np.diff(command, axis=0)
+    slope = step / interval
+    before, after = np.concatenate([slope[:1], slope[:-1]]), np.concatenate([slope[1:], slope[-1:]])
+    return step - 0.5 * (before + after) * interval
 
 
 def _runs(mask: np.ndarray):
