@@ -43,7 +43,7 @@ PRIORS = {"thrust_scale": 0.3, "torque_scale": 0.5, "command_hold": 1.0}
 drones pull 11 to 15 % less than the paper's curve; published torque curves differ by a factor of two."""
 NEED_ROTOR_SPEED = ("motor_speed_offset", "thrust_linear")
 """Held, and not tried, where rotor speed was not measured: on real motors the steady speed is affine in the command,
-and the thrust's slope near hover is not the paper's, but commands alone hardly tell these from gain and thrust scale."""
+and the thrust's slope near hover is not the paper's, but commands alone hardly tell them from gain and scale."""
 
 
 def default_parameters(logs: list[FlightLog]) -> str:

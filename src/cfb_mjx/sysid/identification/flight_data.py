@@ -117,6 +117,8 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> di
         else:
             speed[:, motor] = np.interp(np.arange(count), np.flatnonzero(good), speed[good, motor])
 
+    doubt = _unforetold(log.time[rows], np.clip(log.command[rows], 0, 1))
+
     def pad(values):
         return np.concatenate([values, np.repeat(values[-1:], width - count, axis=0)])
 
@@ -125,9 +127,7 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> di
         "interval": np.where(padding, 0.0, pad(np.concatenate([[0.0], np.diff(log.time[rows])]))),
         "valid": (~padding).astype(float),
         "command": pad(np.clip(log.command[rows], 0, 1)),
-        "doubt": np.concatenate(
-            [_unforetold(log.time[rows], np.clip(log.command[rows], 0, 1)), np.zeros((1 + width - count, 4))]
-        ),
+        "doubt": np.concatenate([doubt, np.zeros((1 + width - count, 4))]),
         "rotor_speed": pad(speed),
         "measured": np.array(float(measured)),
         "warm_up": (np.arange(width) < lead).astype(float),

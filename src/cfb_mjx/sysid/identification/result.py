@@ -70,7 +70,7 @@ def summarise(
     names: tuple[str, ...] | None = None,
     **more,
 ) -> Fit:
-    """A `Fit` that gives numbers only to what the data can tell; of the unknowns, ``names`` (default: all) are shown."""
+    """A `Fit` that gives numbers only to what the data can tell; of the unknowns, only ``names`` are shown."""
     names = unknowns.names if names is None else names
     every = dict(zip(unknowns.names, map(float, np.asarray(unknowns.values(vector))), strict=True))
     preset = dict(zip(unknowns.names, map(float, np.asarray(unknowns.values(unknowns.start))), strict=True))
@@ -112,9 +112,9 @@ def _combinations(uncertainty: Uncertainty, values: dict[str, float], names: tup
         for i, name in enumerate(order):
             slope = covariance[i, m] / covariance[m, m]
             shared = slope * covariance[i, m]
-            if name in names and name not in uncertainty.names and name not in OFFSETS:
-                if shared > 0.5 * covariance[i, i]:
-                    put({name: 1.0, "mass": -slope}, float(np.sqrt(covariance[i, i] - shared)))
+            told = name in names and name not in uncertainty.names and name not in OFFSETS
+            if told and shared > 0.5 * covariance[i, i]:
+                put({name: 1.0, "mass": -slope}, float(np.sqrt(covariance[i, i] - shared)))
     return found
 
 
