@@ -114,7 +114,7 @@ def _combinations(uncertainty: Uncertainty, values: dict[str, float], names: tup
             shared = slope * covariance[i, m]
             told = name in names and name not in uncertainty.names and name not in OFFSETS
             if told and shared > 0.5 * covariance[i, i]:
-                put({name: 1.0, "mass": -slope}, float(np.sqrt(covariance[i, i] - shared)))
+                put({name: 1.0, "mass": -float(f"{slope:.3g}")}, float(np.sqrt(covariance[i, i] - shared)))
     return found
 
 

@@ -81,8 +81,9 @@ def assess(
     free = [row for row, is_loose in zip(rows, loose, strict=True) if is_loose]
     moved = [name for i, name in enumerate(names) if any(abs(v[i]) > SHARE for v in free)]
     correlation = covariance / np.outer(deviation, deviation)
-    # With what is free known to a factor of e^10: a product of powers that moves along it shows as unknown.
-    everything = covariance + 100 * sum((np.outer(v, v) for v in free), np.zeros_like(covariance))
+    # With what is free as well, known to a factor of e^10 at least.
+    size = np.minimum(1 / np.maximum(singular[loose], 1e-9), 10.0)
+    everything = covariance + (rows[loose].T * size**2) @ rows[loose]
     products = _products(everything, len(free), [i for i, name in enumerate(names) if name in moved], names)
     return Uncertainty(covariance, correlation, free, moved, [_told(p) for p, _ in products], names, products)
 
@@ -160,9 +161,11 @@ def _products(
         power = np.linalg.solve(covariance[np.ix_(given, given)], covariance[given, i])
         powers = {names[i]: 1.0} | {names[g]: -float(p) for g, p in zip(given, power, strict=True) if abs(p) > 0.02}
         if len(powers) == 2:  # the least known first
-            size = -powers[names[given[int(np.argmax(np.abs(power)))]]]
-            powers = {name: -p / size for name, p in reversed(powers.items())}
-        found.append((powers, float(np.sqrt(left[i, i])) / abs(1.0 if len(powers) != 2 else size)))
+            other, size = list(powers.items())[1]
+            powers = {other: 1.0, names[i]: 1 / size}
+        powers = {name: float(f"{p:.3g}") for name, p in powers.items()}
+        weight = np.array([powers.get(name, 0.0) for name in names])
+        found.append((powers, float(np.sqrt(weight @ covariance @ weight))))
     return found
 
 
@@ -170,10 +173,8 @@ def power_product(powers: dict[str, float]) -> str:
     """As text: ``thrust_scale * motor_gain^2``."""
     parts = []
     for name, power in powers.items():
-        nearest = round(power)
-        power = nearest if nearest and abs(power - nearest) < 0.1 * abs(nearest) else power
-        exponent = "" if abs(power) == 1 else f"^{abs(power):.3g}"
-        parts.append(f"{'' if not parts and power > 0 else '* ' if power > 0 else '/ '}{name}{exponent}")
+        sign = ("* " if power > 0 else "/ ") if parts else ("" if power > 0 else "1 / ")
+        parts.append(f"{sign}{name}" + ("" if abs(power) == 1 else f"^{abs(power):.3g}"))
     return " ".join(parts)
 
 
