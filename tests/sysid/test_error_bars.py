@@ -18,6 +18,7 @@ from cfb_mjx.sysid.identification.fitting import fit
 from cfb_mjx.sysid.identification.flight_data import prepare
 from cfb_mjx.sysid.identification.innovation import as_held
 from cfb_mjx.sysid.identification.uncertainty import assess, most_contradicted
+from cfb_mjx.sysid.identification.unknowns import at_the_border
 
 PRESET = load_model_file("cfb-guards")
 NOMINAL = PRESET.parameters()
@@ -147,6 +148,15 @@ def test_only_what_the_data_contradict_is_named():
     held = ["motor_gain", "thrust_scale"]
     assert most_contradicted(settled(np.zeros(3)), jacobian, names, free, held) is None
     assert most_contradicted(settled(np.array([0, 0, 0.1])), jacobian, names, free, held) == "thrust_scale"
+
+
+def test_an_inertia_at_the_border_of_the_possible_gets_no_number():
+    inside = NOMINAL
+    assert at_the_border(inside) == {}
+    flat = eqx.tree_at(lambda p: p.inertia, inside, jnp.asarray([3.0e-5, 3.0e-5, 5.99e-5]))
+    reasons = at_the_border(flat)
+    assert {"inertia_zz", "rotor_inertia", "torque_scale"} <= set(reasons)
+    assert "inertia_zz > inertia_xx + inertia_yy" in reasons["inertia_zz"]
 
 
 @pytest.mark.skipif(not GENERATOR.is_file(), reason="needs the generator in ../shared/cases/fit")

@@ -260,8 +260,8 @@ def _print(motors: MotorFit | None, maps: dict[str, MapFit], base: ModelFile, as
         print(f"{name}: {len(m.value)} points, noise {m.noise[0]:.2g} {unit}, {len(m.outliers)} outliers")
         if m.offset_std:
             print(
-                f"{name}: every point reads {m.offset:+.3g} {unit} too much ({abs(m.offset) / m.offset_std:.0f} std): a "
-                "scale that was not tared; fitted as an offset and left out of the curve."
+                f"{name}: every point reads {m.offset:+.3g} {unit} too much ({abs(m.offset) / m.offset_std:.0f} std): "
+                "a scale that was not tared; fitted as an offset and left out of the curve."
             )
         for note in m.shape.notes():
             print(f"{name}: {note}")

@@ -25,7 +25,7 @@ from cfb_mjx.sysid.identification.robust import tempered
 from cfb_mjx.sysid.identification.shooting import shoot
 from cfb_mjx.sysid.identification.solver import RIDGE, least_squares
 from cfb_mjx.sysid.identification.uncertainty import assess, most_contradicted
-from cfb_mjx.sysid.identification.unknowns import GROUPS, UNITS, Unknowns, choose
+from cfb_mjx.sysid.identification.unknowns import GROUPS, UNITS, Unknowns, at_the_border, choose
 
 ROUNDS = 8
 """Noise levels and parameters are found in turns, at most so often."""
@@ -121,6 +121,7 @@ def fit(
     columns = [unknowns.names.index(name) for name in judged]
     priors = {"command_hold": PRIORS["command_hold"]} | stated
     uncertainty = assess(blocks[0], blocks[1][..., columns], judged, priors)
+    impossible = {} if not set(GROUPS["inertia"]) & set(fitted) else at_the_border(unknowns.apply(vector))
     return summarise(
         unknowns,
         vector,
@@ -128,6 +129,7 @@ def fit(
         "innovation",
         data.rows,
         names=tuple(name for name in fitted if name != "command_hold" or name in asked),
+        impossible=impossible,
         contradicted=tuple(contradicted),
         noise=noise,
         whiteness=dict(zip(CHANNELS, map(float, _lag_one(residual)), strict=True)),

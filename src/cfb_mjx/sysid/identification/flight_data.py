@@ -137,11 +137,17 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> di
 
 
 def _unforetold(time: np.ndarray, command: np.ndarray) -> np.ndarray:
-    """(n - 1, 4) steps of the command without what the mean slope of the steps before and after would make."""
+    """(n - 1, 4) steps of the command without what the mean slope of the steps before and after would make.
+
+    A step far larger than the others (a new set-point) came at one moment that no row tells, always the same one where
+    rows and set-points are in step: it counts for still more, or a handful of them would decide the motors' lag.
+    """
     interval, step = np.diff(time)[:, None], np.diff(command, axis=0)
     slope = step / interval
     before, after = np.concatenate([slope[:1], slope[:-1]]), np.concatenate([slope[1:], slope[-1:]])
-    return step - 0.5 * (before + after) * interval
+    left = np.abs(step - 0.5 * (before + after) * interval)
+    usual = np.maximum(np.median(left, axis=0), 0.3 * np.sqrt(np.mean(left**2, axis=0)))
+    return left * np.maximum(1.0, left / np.maximum(4 * usual, 1e-12))
 
 
 def _runs(mask: np.ndarray):

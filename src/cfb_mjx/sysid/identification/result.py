@@ -68,9 +68,14 @@ def summarise(
     estimator: str,
     rows: int,
     names: tuple[str, ...] | None = None,
+    impossible: dict[str, str] | None = None,
     **more,
 ) -> Fit:
-    """A `Fit` that gives numbers only to what the data can tell; of the unknowns, only ``names`` are shown."""
+    """A `Fit` that gives numbers only to what the data can tell; of the unknowns, only ``names`` are shown.
+
+    Those in ``impossible`` get its reasons instead of a number.
+    """
+    impossible = impossible or {}
     names = unknowns.names if names is None else names
     every = dict(zip(unknowns.names, map(float, np.asarray(unknowns.values(vector))), strict=True))
     preset = dict(zip(unknowns.names, map(float, np.asarray(unknowns.values(unknowns.start))), strict=True))
@@ -81,10 +86,10 @@ def summarise(
         estimates={
             name: Estimate(every[name], float(std[name] * scale[name]), UNITS[name], preset[name])
             for name in names
-            if name not in uncertainty.names
+            if name not in uncertainty.names and name not in impossible
         },
-        unidentifiable={name: reason for name, reason in _reasons(uncertainty).items() if name in names},
-        combinations=_combinations(uncertainty, every, names),
+        unidentifiable={name: reason for name, reason in (_reasons(uncertainty) | impossible).items() if name in names},
+        combinations=_combinations(uncertainty, every, tuple(name for name in names if name not in impossible)),
         parameters=unknowns.apply(vector),
         uncertainty=uncertainty,
         names=names,
@@ -105,7 +110,7 @@ def _combinations(uncertainty: Uncertainty, values: dict[str, float], names: tup
         found[power_product(powers)] = Estimate(value, value * std, "SI", np.nan)
 
     for powers, std in uncertainty.products:
-        if not any(name in OFFSETS for name in powers):
+        if all(name in names and name not in OFFSETS for name in powers):
             put(powers, std)
     if "mass" in order and "mass" not in names:
         m = order.index("mass")

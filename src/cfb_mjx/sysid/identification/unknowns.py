@@ -156,6 +156,27 @@ def _inertia(nominal: Float[Array, "3"], change: tuple[Array | None, ...]) -> Fl
     return jnp.sum(moments) - moments
 
 
+BORDER = 0.01
+"""A second moment of the mass below this share of their sum is at the border of what a rigid body can be."""
+
+
+def at_the_border(parameters: Parameters) -> dict[str, str]:
+    """What no number can be given of an inertia that only the possibility of the body stopped, with the reason.
+
+    Empty for a body well inside. Yaw tells J_zz, J_m and the torque scale as ratios, so these go together.
+    """
+    inertia = np.asarray(parameters.inertia)
+    worst = int(np.argmax(inertia))
+    if 0.5 * inertia.sum() - inertia[worst] > BORDER * 0.5 * inertia.sum():
+        return {}
+    others = [axis for i, axis in enumerate(_AXES) if i != worst]
+    reason = (
+        f"these flights ask for {_AXES[worst]} > {others[0]} + {others[1]}, which no rigid body has: something "
+        "else that turns the drone is not in the model"
+    )
+    return dict.fromkeys((*_AXES, "rotor_inertia", "torque_scale"), reason)
+
+
 def choose(request: str | tuple[str, ...], nominal: Parameters) -> Unknowns:
     """Unknowns from names and group names (``inertia``, ``motor``, ``cog``, ``J_m``), comma separated or as a tuple.
 
