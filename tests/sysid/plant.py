@@ -28,6 +28,8 @@ class Plant:
     rotor_inertia: np.ndarray = field(default_factory=lambda: np.array([5e-8]))
     lag: np.ndarray = field(default_factory=lambda: np.array([0.05]))
     gain: np.ndarray = field(default_factory=lambda: np.array([2900.0]))
+    thrust_scale: np.ndarray = field(default_factory=lambda: np.array([1.0]))
+    torque_scale: np.ndarray = field(default_factory=lambda: np.array([1.0]))
 
 
 def cubic(c, s):
@@ -38,7 +40,8 @@ def derivative(plant: Plant, x, u, push):
     """(F, 17) rate of change; ``push`` (F, 3) is the unmodelled angular acceleration."""
     q, w, speed = x[:, 6:10], x[:, 10:13], x[:, 13:17]
     s = speed / SIGMA
-    thrust, drag = np.maximum(cubic(THRUST, s), 0), cubic(TORQUE, s)
+    thrust = plant.thrust_scale[:, None] * np.maximum(cubic(THRUST, s), 0)
+    drag = plant.torque_scale[:, None] * cubic(TORQUE, s)
     speed_rate = (plant.gain[:, None] * u - speed) / plant.lag[:, None]
     torque = np.stack(
         [HALF * thrust @ ROLL, HALF * thrust @ PITCH, (plant.rotor_inertia[:, None] * speed_rate + drag) @ YAW], axis=1
@@ -68,8 +71,10 @@ def fly(
     goals: tuple[float, float, float] = (1.0, 1.0, 1.0),
     dither: float = 0.01,
     gyro_feedback: float = 1.0,
+    loop: int = ROW,
+    row: int = ROW,
 ) -> list[FlightLog]:
-    """Fly F drones and return their logs (250 Hz rows, pose and velocity 8 ms late).
+    """Fly F drones and return their logs (250 Hz rows unless told otherwise, pose and velocity 8 ms late).
 
     Args:
         plant: physics, batched.
@@ -81,6 +86,8 @@ def fly(
         goals: factors on the roll, pitch and yaw set-points.
         dither: rms of the noise added to the commands.
         gyro_feedback: factor on the controller's gains; 0 leaves the drone to itself.
+        loop: ticks between commands; those between two rows are not logged.
+        row: ticks between rows.
     """
     rng = np.random.default_rng(seed)
     count = len(plant.mass)
@@ -94,7 +101,7 @@ def fly(
     goal = rng.uniform(-0.35, 0.35, (steps, count, 3)) * [1, 1, 2] * np.asarray(goals)
     push = np.zeros((count, 3))
     keep = np.exp(-TICK * 2 * np.pi * 2.0)  # corner at 2 Hz
-    history, rows = [], []
+    history, rows, last = [], [], None
     for tick in range(ticks):
         delayed = history[max(len(history) - DELAY_TICKS, 0)] if history else x
         q, w, height, climb = delayed[:, 6:10], x[:, 10:13], delayed[:, 2], delayed[:, 5]
@@ -105,14 +112,14 @@ def fly(
         collective = 0.15 * (1.0 - height) - 0.12 * climb
         mix = 6e-4 * (command[:, :1] * ROLL + command[:, 1:2] * PITCH) + 1.2e-3 * command[:, 2:] * YAW
         u = np.clip(hover_u[:, None] + collective[:, None] + mix + dither * rng.normal(size=(count, 4)), 0.05, 0.95)
-        u = u if tick % ROW == 0 else rows[-1][1]  # commands change with the rows: every one is logged
-        if tick % ROW == 0:
+        u = last = u if tick % loop == 0 else last
+        if tick % row == 0:
             rows.append((x.copy(), u.copy(), delayed.copy()))
         push = keep * push + disturbance * np.array([1, 1, 0.25]) * np.sqrt(1 - keep**2) * rng.normal(size=push.shape)
         history.append(x.copy())
         for _ in range(SUBSTEPS):
             x = _rk4(plant, x, u, push, TICK / SUBSTEPS)
-    return _logs(plant, rows, rng, noise, measure_rotors)
+    return _logs(plant, rows, row * TICK, rng, noise, measure_rotors)
 
 
 def _rk4(plant, x, u, push, dt):
@@ -127,13 +134,13 @@ def _rk4(plant, x, u, push, dt):
 
 def _hover(plant: Plant) -> np.ndarray:
     grid = np.linspace(0.2, 1.0, 20001)
-    return np.interp(plant.mass * GRAVITY / 4, cubic(THRUST, grid), grid)
+    return np.interp(plant.mass * GRAVITY / 4 / plant.thrust_scale, cubic(THRUST, grid), grid)
 
 
-def _logs(plant, rows, rng, noise, measure_rotors) -> list[FlightLog]:
+def _logs(plant, rows, interval, rng, noise, measure_rotors) -> list[FlightLog]:
     now, command, late = (np.stack([row[i] for row in rows]) for i in range(3))  # (n, F, .)
-    time = np.arange(len(rows)) * TICK * ROW
-    thrust = np.maximum(cubic(THRUST, now[..., 13:17] / SIGMA), 0).sum(-1) / plant.mass
+    time = np.arange(len(rows)) * interval
+    thrust = np.maximum(cubic(THRUST, now[..., 13:17] / SIGMA), 0).sum(-1) * plant.thrust_scale / plant.mass
     logs = []
     for i in range(now.shape[1]):
 

@@ -59,6 +59,7 @@ def problem():
         rotor=jnp.asarray(3.0),
         rotor_walk=jnp.asarray(30.0),
         rotor_disturbance=jnp.asarray(10.0),
+        command=jnp.asarray(1e-3),
     )
     return Problem.of(MODEL, UNKNOWNS, noise, LIMITS, False)
 

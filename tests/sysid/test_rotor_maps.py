@@ -108,3 +108,26 @@ def test_too_little_for_a_cubic_is_refused():
     motor = np.array([1] * 11 + [2])
     with pytest.raises(CfbError, match=r"motor 2 has a single point"):
         fit_map(np.linspace(500, 2700, 12), np.ones(12), motor, per_motor=True, name="bench")
+
+
+def test_a_scale_that_was_not_tared_is_seen_and_kept_out_of_the_curve():
+    """15 mN at every point: without an offset the curve is many of its standard deviations off."""
+    rng = np.random.default_rng(12)
+    speed, value = points(rng, 0.002)
+    found = fit_map(speed, value + 0.015)
+    assert abs(found.offset - 0.015) < 3 * found.offset_std
+    assert found.offset_std < 0.003
+    assert np.all(np.abs(found.coefficients - PAPER_THRUST) < 3 * found.std)
+    assert np.abs(found.residual).max() < 0.01
+    tared = fit_map(speed, value)
+    assert (tared.offset, tared.offset_std) == (0.0, 0.0)
+
+
+def test_an_offset_is_common_to_motors_that_differ():
+    rng = np.random.default_rng(13)
+    speed, value = points(rng, 0.0005, count=120)
+    motor = np.tile([1, 2, 3, 4], 30)
+    factor = np.array([0.95, 1.0, 1.02, 1.03])
+    found = fit_map(speed, value * factor[motor - 1] + 0.01, motor, per_motor=True)
+    assert abs(found.offset - 0.01) < 3 * found.offset_std
+    assert np.all(np.abs(found.scale - factor) < 3.5 * found.scale_std)

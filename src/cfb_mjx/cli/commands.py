@@ -113,6 +113,7 @@ def fit(
     commands_only: bool = False,
     compare: bool = False,
     devices: int = 1,
+    mass_std: float | None = None,
 ) -> None:
     """Refit the model to flights, with uncertainty, and judge it on data kept from the fit.
 
@@ -136,6 +137,8 @@ def fit(
         commands_only: do not use measured rotor speeds to drive the body.
         compare: show what the other estimator would say; multiple shooting is blind to feedback.
         devices: of this machine that share the flights.
+        mass_std: standard deviation of the mass as weighed, kg; 5 % of it where nothing is said. Inertia, J_m and the
+            scales of thrust and torque are known no better than the mass.
     """
     if not logs:
         raise CfbError("fit needs at least one log; see 'cfb fit --help'.")
@@ -155,6 +158,7 @@ def fit(
         robust,
         figure,
         devices,
+        mass_std,
     )
 
 

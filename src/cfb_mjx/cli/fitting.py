@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -31,12 +32,15 @@ def run_fit(
     robust: bool = False,
     figure: Path | None = None,
     devices: int = 1,
+    mass_std: float | None = None,
 ) -> None:
     """Fit, print a table, write the model and what else was asked for.
 
     Raises:
         CfbError: bad logs, parameters or outputs.
     """
+    if mass_std is not None and not 0 <= mass_std < math.inf:
+        raise CfbError(f"--mass-std {mass_std:g}: give the standard deviation of the mass in kg, 0 or more.")
     require_folder(output, json, figure)
     require_model_path(output)
     logs = [read_log(path) for path in paths]
@@ -51,7 +55,10 @@ def run_fit(
 
     base, over = changed_model(model, changes), Devices.take(devices)
     kept = [path.name for path in held_out] or f"last {HELD_OUT_SHARE:.0%} of each log"
-    result = fit(fitted, base.parameters(), parameters, not commands_only, robust, estimator, Progress("fitting"), over)
+    if mass_std is None and base.entries["mass"].std is not None:
+        mass_std = float(base.entries["mass"].std)
+    bar = Progress("fitting")
+    result = fit(fitted, base.parameters(), parameters, not commands_only, robust, estimator, bar, over, mass_std)
     corrected = replace(
         result.model_file(base, f"cfb fit on {len(paths)} log(s), {date.today().isoformat()}"),
         name=output.stem,
@@ -97,11 +104,8 @@ def _other(result, logs, base, use_measured, robust, over):
 _NAMES = {"innovation": "innovations", "shooting": "multiple shooting"}
 
 
-def _estimates(result) -> dict:
-    return {
-        name: {"value": e.value, "std": e.std, "unit": e.unit, "preset": e.preset}
-        for name, e in result.estimates.items()
-    }
+def _numbers(estimates) -> dict:
+    return {name: {"value": e.value, "std": e.std, "unit": e.unit, "preset": e.preset} for name, e in estimates.items()}
 
 
 def _json(result, other, before, after) -> dict:
@@ -110,14 +114,17 @@ def _json(result, other, before, after) -> dict:
         held_out[stage] = evaluation.metrics("commands_in")
         held_out[f"{stage}_rotor_speed_in"] = evaluation.metrics("rotor_speed_in")
     return {
-        "parameters": _estimates(result),
+        "parameters": _numbers(result.estimates),
         "unidentifiable": list(result.unidentifiable),
         "unidentifiable_because": result.unidentifiable,
-        "correlation": {"names": result.names, "matrix": result.uncertainty.correlation},
+        "combinations": _numbers(result.combinations),
+        "held_fixed_contradicted": list(result.contradicted),
+        "command_hold_s": result.hold,
+        "correlation": {"names": result.uncertainty.order, "matrix": result.uncertainty.correlation},
         "estimator": result.estimator,
         "other_estimator": None
         if other is None
-        else {"estimator": other.estimator, "parameters": _estimates(other)}
+        else {"estimator": other.estimator, "parameters": _numbers(other.estimates)}
         | {"values": other.values, "unidentifiable": other.unidentifiable},
         "feedback": result.feedback
         and {"correlation": result.feedback.correlation, "p_value": result.feedback.p_value},
@@ -139,6 +146,10 @@ def _print(result, other, before, after) -> None:
         print(f"{f'{other.values[name]:.4g}{doubt}':>20}" if other else "")
     for reason in dict.fromkeys(result.unidentifiable.values()):
         print(f"not identifiable: {reason}")
+    for name, e in result.combinations.items():
+        print(f"known better together: {name} = {e.value:.6g} +- {e.std:.2g}")
+    for name in result.contradicted:
+        print(f"{name} was to be held, but the flights contradict its value: it was fitted too.")
     feedback = result.feedback or (other and other.feedback)
     if feedback and feedback.present:
         print(f"flown under feedback: the commands answer the gyro (correlation {feedback.correlation:.2f});", end=" ")

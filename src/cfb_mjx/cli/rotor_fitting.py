@@ -168,6 +168,8 @@ def _coefficients(maps: dict[str, MapFit], base: ModelFile) -> dict[str, dict]:
         old = base.entries[f"{name}_polynomial"].value * np.mean(base.entries[f"{name}_scale"].value)
         for power, value, std, preset in zip("321", fitted.coefficients, fitted.std, old, strict=True):
             rows[f"{name}_s{power}"] = {"value": value, "std": std, "unit": unit, "preset": preset}
+        if fitted.offset_std:
+            rows[f"{name}_offset"] = {"value": fitted.offset, "std": fitted.offset_std, "unit": unit, "preset": 0.0}
         scales = base.entries[f"{name}_scale"].value
         for motor, value, std in zip(fitted.motors, fitted.scale, fitted.scale_std, strict=True):
             rows[f"{name}_scale_M{motor}"] = {"value": value, "std": std, "unit": "1", "preset": scales[motor - 1]}
@@ -211,6 +213,8 @@ def _json(motors: MotorFit | None, maps: dict[str, MapFit], base: ModelFile, wri
             "covariance": m.covariance,
             "reference_rotor_speed_radps": m.sigma,
             "noise": m.noise[0],
+            "offset": m.offset,
+            "offset_std": m.offset_std,
             "increasing_where_measured": m.shape.increasing_where_measured,
             "notes": m.shape.notes(),
             "scales_equal_p_value": m.scale_p_value,
@@ -254,6 +258,11 @@ def _print(motors: MotorFit | None, maps: dict[str, MapFit], base: ModelFile, as
     for name, m in maps.items():
         unit = "N" if name == "thrust" else "N m"
         print(f"{name}: {len(m.value)} points, noise {m.noise[0]:.2g} {unit}, {len(m.outliers)} outliers")
+        if m.offset_std:
+            print(
+                f"{name}: every point reads {m.offset:+.3g} {unit} too much ({abs(m.offset) / m.offset_std:.0f} std): "
+                "a scale that was not tared; fitted as an offset and left out of the curve."
+            )
         for note in m.shape.notes():
             print(f"{name}: {note}")
         if np.isfinite(m.scale_p_value):

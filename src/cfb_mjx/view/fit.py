@@ -96,9 +96,10 @@ def _draw_correlation(panel, result: Fit) -> None:
     correlation = np.asarray(result.uncertainty.correlation)
     panel.imshow(correlation, vmin=-1, vmax=1, cmap="RdBu_r")
     panel.grid(False)
-    ticks = np.arange(len(result.names))
-    panel.set_xticks(ticks, result.names, rotation=60, ha="right", fontsize=7)
-    panel.set_yticks(ticks, result.names, fontsize=7)
+    names = result.uncertainty.order
+    ticks = np.arange(len(names))
+    panel.set_xticks(ticks, names, rotation=60, ha="right", fontsize=7)
+    panel.set_yticks(ticks, names, fontsize=7)
     for i in ticks:
         for j in ticks:
             strong = abs(correlation[i, j]) > 0.6

@@ -21,62 +21,92 @@ CORRELATION_TIME = 0.5
 """Of the wandering offsets of specific force and steady rotor speed, s: battery and inflow, below about 0.3 Hz."""
 
 
+class Unlogged(NamedTuple):
+    """What commands that were not logged do to the body: an error of the rotor speeds that decays with their lag.
+
+    On each axis of the body, and along z, the error is one number: the sum over the rotors with their signs, rad/s.
+    """
+
+    variance: Float[Array, "n"]
+    """What every interval adds to the error's variance."""
+    decay: Float[Array, "n"]
+    jump: Float[Array, "n 3"]
+    """Body rate per error, within the interval in which it arises."""
+    later: Float[Array, "n 3"]
+    """Body rate per error, over an interval at whose start it was there."""
+    force: Float[Array, ""]
+    """Specific force along z per error, m/s^2 per rad/s."""
+
+
 def rate_innovations(
-    parameters: Parameters, noise: Noise, piece: Segments, torque: Float[Array, "n 3"], robust: bool
+    parameters: Parameters, noise: Noise, piece: Segments, torque: Float[Array, "n 3"], unlogged: Unlogged, robust: bool
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-    """Three filters with state (body rate, disturbance), one per axis, coupled through the gyroscopic term."""
+    """Three filters with state (body rate, disturbance, rotor error), one per axis, coupled by the gyroscopic term."""
     inertia = parameters.inertia
     r, q, d = noise.gyro**2, noise.rate_walk**2, noise.disturbance**2
 
+    def turning(w):
+        return -jnp.cross(w, inertia * w) / inertia
+
     def row(carry, inputs):
-        w, a, pww, pwa, paa = carry
-        dt, tau, measured = inputs
+        w, a, o, pww, pwa, pwo, paa, pao, poo = carry
+        dt, tau, measured, more, decay, jump, later = inputs
         keep = jnp.exp(-dt / noise.correlation_time)
-        w = w + dt * ((tau - jnp.cross(w, inertia * w)) / inertia + a)
-        a = keep * a
-        pww, pwa, paa = (
-            pww + 2 * dt * pwa + dt**2 * paa + q * dt,
-            keep * (pwa + dt * paa),
-            keep**2 * paa + d * (1 - keep**2),
-        )
+        # Heun: at 100 Hz the gyroscopic torque of the row before is 5 ms old, and it alone tells the scale of J_zz.
+        ahead = w + dt * (tau / inertia + a + turning(w))
+        w = w + dt * (tau / inertia + a + 0.5 * (turning(w) + turning(ahead))) + later * o
+        a, o = keep * a, decay * o
+        # F P, with F = [[1, dt, later], [0, keep, 0], [0, 0, decay]]; its first row, then F P F^T + Q.
+        fww, fwa, fwo = pww + dt * pwa + later * pwo, pwa + dt * paa + later * pao, pwo + dt * pao + later * poo
+        pww = fww + dt * fwa + later * fwo + q * dt + jump**2 * more
+        pwa, pwo = keep * fwa, decay * fwo + jump * more
+        paa, pao, poo = keep**2 * paa + d * (1 - keep**2), keep * decay * pao, decay**2 * poo + more
         s, e = pww + r, measured - w
-        kw, ka = pww / s, pwa / s
+        kw, ka, ko = pww / s, pwa / s, pwo / s
         step = limited(e, s, robust)
-        w, a = w + kw * step, a + ka * step
-        pww, pwa, paa = (1 - kw) * pww, (1 - kw) * pwa, paa - ka * pwa
-        return (w, a, pww, pwa, paa), (e, s)
+        w, a, o = w + kw * step, a + ka * step, o + ko * step
+        paa, pao, poo = paa - ka * pwa, pao - ka * pwo, poo - ko * pwo
+        pww, pwa, pwo = (1 - kw) * pww, (1 - kw) * pwa, (1 - kw) * pwo
+        return (w, a, o, pww, pwa, pwo, paa, pao, poo), (e, s)
 
     zero = jnp.zeros(3)
-    start = (piece.body_rate[0], zero, r, zero, d)
-    _, (error, variance) = jax.lax.scan(row, start, (piece.interval[1:], torque, piece.body_rate[1:]))
+    start = (piece.body_rate[0], zero, zero, r, zero, zero, d, zero, zero)
+    rows = (piece.interval[1:], torque, piece.body_rate[1:], *unlogged[:4])
+    _, (error, variance) = jax.lax.scan(row, start, rows)
     return error, variance
 
 
 def force_innovations(
-    parameters: Parameters, noise: Noise, piece: Segments, thrust: Float[Array, "n"], robust: bool
+    noise: Noise, piece: Segments, force: Float[Array, "n"], unlogged: Unlogged, robust: bool
 ) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
-    """Specific force along z against thrust over mass behind the accelerometer's low-pass, with a wandering offset.
+    """Specific force along z against the model's ``force`` (m/s^2) behind the accelerometer's low-pass.
+
+    What the model misses is an offset that wanders, and a rotor error.
 
     Without the low-pass (30 Hz on the Crazyflie) the slope of thrust over rotor speed comes out too small.
     """
+    slope = unlogged.force
     r, d, lag = noise.accelerometer**2, noise.force_disturbance**2, noise.accelerometer_lag
 
     def row(carry, inputs):
-        shown, a, p = carry
-        dt, before, now, measured = inputs
+        shown, a, o, paa, pao, poo = carry
+        dt, before, now, measured, more, decay = inputs
         keep, fade = jnp.exp(-dt / CORRELATION_TIME), jnp.exp(-dt / lag)
         # Exact for a force that changes linearly between rows.
         trail = lag * (now - before) / jnp.where(dt > 0, dt, 1.0)
         shown = jnp.where(dt > 0, now - trail + fade * (shown - before + trail), shown)
-        a, p = keep * a, keep**2 * p + d * (1 - keep**2)
-        s, e = p + r, measured - shown - a
-        k = p / s
-        return (shown, a + k * limited(e, s, robust), (1 - k) * p), (e, s)
+        a, o = keep * a, decay * o
+        paa, pao, poo = keep**2 * paa + d * (1 - keep**2), keep * decay * pao, decay**2 * poo + more
+        pa, po = paa + slope * pao, pao + slope * poo
+        s, e = pa + slope * po + r, measured - shown - a - slope * o
+        ka, ko = pa / s, po / s
+        step = limited(e, s, robust)
+        return (shown, a + ka * step, o + ko * step, paa - ka * pa, pao - ka * po, poo - ko * po), (e, s)
 
-    force = thrust / parameters.mass
     before = jnp.concatenate([force[:1], force[:-1]])
-    inputs = (piece.interval[1:], before, force, piece.specific_force[1:, 2])
-    _, (error, variance) = jax.lax.scan(row, (force[0], jnp.zeros(()), d), inputs)
+    inputs = (piece.interval[1:], before, force, piece.specific_force[1:, 2], unlogged.variance, unlogged.decay)
+    zero = jnp.zeros(())
+    _, (error, variance) = jax.lax.scan(row, (force[0], zero, zero, d, zero, zero), inputs)
     return error[:, None], variance[:, None]
 
 
@@ -133,8 +163,10 @@ def _rotor_filter(parameters: Parameters, noise: Noise, piece: Segments, robust:
     r, q, d = noise.rotor**2, noise.rotor_walk**2, noise.rotor_disturbance**2
     target = parameters.motor_gain * piece.command + parameters.motor_speed_offset
 
+    missed = jax.lax.stop_gradient(parameters.motor_gain) * noise.command * piece.doubt
+
     def row(at, inputs):
-        dt, goal, measured, valid = inputs
+        dt, goal, measured, valid, miss = inputs
         keep, decay = jnp.exp(-dt / CORRELATION_TIME), jnp.exp(-dt / parameters.motor_time_constant)
         mix = 1 - decay
         x, b = decay * at.x + mix * (goal + at.b), keep * at.b
@@ -142,7 +174,7 @@ def _rotor_filter(parameters: Parameters, noise: Noise, piece: Segments, robust:
             x,
             b,
             # The floor keeps the padding's covariance invertible for the smoother.
-            decay**2 * at.pxx + 2 * decay * mix * at.pxb + mix**2 * at.pbb + q * dt + 1e-6,
+            decay**2 * at.pxx + 2 * decay * mix * at.pxb + mix**2 * (at.pbb + miss**2) + q * dt + 1e-6,
             keep * (decay * at.pxb + mix * at.pbb),
             keep**2 * at.pbb + d * (1 - keep**2) + 1e-6,
         )
@@ -161,6 +193,6 @@ def _rotor_filter(parameters: Parameters, noise: Noise, piece: Segments, robust:
 
     zero = jnp.zeros(4)
     start = _Belief(piece.rotor_speed[0], zero, zero + r, zero, zero + d)
-    rows = (piece.interval[1:], target[:-1], piece.rotor_speed[1:], piece.valid[1:])
+    rows = (piece.interval[1:], target[:-1], piece.rotor_speed[1:], piece.valid[1:], missed[:-1])
     _, found = jax.lax.scan(row, start, rows)
     return start, found

@@ -25,6 +25,9 @@ class Segments(eqx.Module):
     valid: Float[Array, "s n"]
     """1 for rows that are measured, 0 for the padding."""
     command: Float[Array, "s n 4"]
+    doubt: Float[Array, "s n 4"]
+    """Of a command's step to the next row, the part that the steps about it do not foretell: what may have been sent
+    between the rows is uncertain by a share of it."""
     rotor_speed: Float[Array, "s n 4"]
     """Measured, rad/s; what it holds where ``measured`` is 0 means nothing."""
     measured: Float[Array, "s"]
@@ -114,6 +117,8 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> di
         else:
             speed[:, motor] = np.interp(np.arange(count), np.flatnonzero(good), speed[good, motor])
 
+    doubt = _unforetold(log.time[rows], np.clip(log.command[rows], 0, 1))
+
     def pad(values):
         return np.concatenate([values, np.repeat(values[-1:], width - count, axis=0)])
 
@@ -122,12 +127,27 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> di
         "interval": np.where(padding, 0.0, pad(np.concatenate([[0.0], np.diff(log.time[rows])]))),
         "valid": (~padding).astype(float),
         "command": pad(np.clip(log.command[rows], 0, 1)),
+        "doubt": np.concatenate([doubt, np.zeros((1 + width - count, 4))]),
         "rotor_speed": pad(speed),
         "measured": np.array(float(measured)),
         "warm_up": (np.arange(width) < lead).astype(float),
         "body_rate": pad(log.body_rate[rows]),
         "specific_force": pad(log.specific_force[rows]),
     }
+
+
+def _unforetold(time: np.ndarray, command: np.ndarray) -> np.ndarray:
+    """(n - 1, 4) steps of the command without what the mean slope of the steps before and after would make.
+
+    A step far larger than the others (a new set-point) came at one moment that no row tells, always the same one where
+    rows and set-points are in step: it counts for still more, or a handful of them would decide the motors' lag.
+    """
+    interval, step = np.diff(time)[:, None], np.diff(command, axis=0)
+    slope = step / interval
+    before, after = np.concatenate([slope[:1], slope[:-1]]), np.concatenate([slope[1:], slope[-1:]])
+    left = np.abs(step - 0.5 * (before + after) * interval)
+    usual = np.maximum(np.median(left, axis=0), 0.3 * np.sqrt(np.mean(left**2, axis=0)))
+    return left * np.maximum(1.0, left / np.maximum(4 * usual, 1e-12))
 
 
 def _runs(mask: np.ndarray):

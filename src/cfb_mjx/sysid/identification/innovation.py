@@ -22,10 +22,11 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.devices import mapped
 from cfb_mjx.model import rotors
-from cfb_mjx.model.quadrotor import wrench_of
+from cfb_mjx.model.quadrotor import at_rotor_center, wrench_of
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.identification.filters import (
+    Unlogged,
     force_innovations,
     rate_innovations,
     rotor_innovations,
@@ -43,8 +44,8 @@ class Drive(eqx.Module):
 
     torque: Float[Array, "s n 3"]
     """Mean over the interval before a row, about the centre of gravity, N m."""
-    thrust: Float[Array, "s n"]
-    """At the row, N."""
+    force: Float[Array, "s n"]
+    """Specific force along z at the row and at the rotors' centre, where the accelerometer is, m/s^2."""
 
 
 def drive(
@@ -60,16 +61,20 @@ def drive(
         speed = _modelled_speed(parameters, piece)
         if use_measured:
             speed = jnp.where(share > 0, smoothed_rotor_speed(parameters, noise, piece, robust), speed)
-        torque, thrust = jax.vmap(lambda *x: _loads(parameters, *x, share))(
-            piece.interval[1:], speed[:-1], speed[1:], piece.command[:-1]
-        )
-        return Drive(torque, thrust)
+        rows = (piece.interval[1:], speed[:-1], speed[1:], piece.body_rate[1:])
+        torque, force = jax.vmap(lambda *x: _loads(parameters, *x))(*rows)
+        return Drive(torque, force)
 
     return mapped(one, segments.over)(segments)
 
 
 def innovations(
-    parameters: Parameters, noise: Noise, segments: Segments, driven: Drive, robust: bool = False
+    parameters: Parameters,
+    noise: Noise,
+    segments: Segments,
+    driven: Drive,
+    use_measured: bool = True,
+    robust: bool = False,
 ) -> tuple[Float[Array, "s n 8"], Float[Array, "s n 8"]]:
     """Innovations and their variances (`CHANNELS`), zero and one where a row does not count.
 
@@ -80,13 +85,16 @@ def innovations(
         noise: noise levels.
         segments: flight data.
         driven: `drive` of the same parameters and segments.
+        use_measured: as it was driven.
         robust: let no reading move a filter by more than three standard deviations.
     """
 
     def one(piece: Segments, loads: Drive):
+        # As weights these are not differentiated by the parameters (`whitened`).
+        unlogged = _unlogged(jax.lax.stop_gradient(parameters), noise, piece, use_measured)
         filters = [
-            rate_innovations(parameters, noise, piece, loads.torque, robust),
-            force_innovations(parameters, noise, piece, loads.thrust, robust),
+            rate_innovations(parameters, noise, piece, loads.torque, unlogged, robust),
+            force_innovations(noise, piece, loads.force, unlogged, robust),
             rotor_innovations(parameters, noise, piece, robust),
         ]
         error, variance = (jnp.concatenate([f[i] for f in filters], axis=1) for i in range(2))
@@ -109,16 +117,68 @@ def _modelled_speed(parameters: Parameters, piece: Segments) -> Float[Array, "n 
     return jnp.concatenate([target[:1], later])
 
 
-def _loads(parameters, dt, start, end, command, measured):
-    """Mean torque about the centre of gravity over an interval (N m), and thrust at its end (N)."""
+def _loads(parameters, dt, start, end, body_rate):
+    """Mean torque about the centre of gravity over an interval (N m), and specific force along z at its end (m/s^2)."""
     constants = rotors.prepare(parameters, dt)
     risen = -jnp.expm1(-dt / parameters.motor_time_constant)
     # Towards the steady speed whose exponential passes through both ends: a straight line would be off by its sag.
-    through = start + (end - start) / jnp.where(risen > 0, risen, 1.0)
-    goal = jnp.where(measured > 0, through, parameters.motor_gain * command + parameters.motor_speed_offset)
-    wrench = wrench_of(parameters, rotors.path_to(constants, Vec.unstack(start), Vec.unstack(goal)).mean)
-    torque = wrench.torque - Vec.unstack(parameters.center_of_gravity).cross(wrench.force)
-    return torque.stack(), jnp.sum(rotors.thrust(parameters, end))
+    goal = start + (end - start) / jnp.where(risen > 0, risen, 1.0)
+    mean = wrench_of(parameters, rotors.path_to(constants, Vec.unstack(start), Vec.unstack(goal)).mean)
+    torque = mean.torque - Vec.unstack(parameters.center_of_gravity).cross(mean.force)
+    # At the rotors' centre: 3 mm off it, turning at 100 rad/s^2 reads 0.3 m/s^2, twice the accelerometer's noise.
+    last = wrench_of(parameters, rotors.loads_at(constants, Vec.unstack(end), 0.0 * Vec.unstack(end)))
+    apart = jax.tree.map(lambda x: Vec.unstack(x) if x.ndim else x, parameters)
+    return torque.stack(), at_rotor_center(apart, last, Vec.unstack(body_rate))[1].components[2]
+
+
+def _unlogged(parameters: Parameters, noise: Noise, piece: Segments, use_measured: bool) -> Unlogged:
+    interval, lag = piece.interval[1:], jnp.mean(parameters.motor_time_constant)
+    decay = jnp.exp(-interval / lag)
+    counts = 1.0 - piece.measured * use_measured
+    missed = noise.command * (parameters.motor_gain * piece.doubt[:-1]) * (1 - decay)[:, None]
+    speed = jnp.mean(parameters.motor_gain * piece.command + parameters.motor_speed_offset, axis=0)
+    lift, drag = (
+        jnp.mean(jax.jvp(lambda x, load=load: load(parameters, x), (speed,), (jnp.ones(4),))[1])
+        for load in (rotors.thrust, rotors.torque)
+    )
+    half = 0.5 * parameters.rotor_spacing * lift
+    kick = jnp.array([0.0, 0.0, 1.0]) * parameters.rotor_inertia / parameters.inertia
+    pull = jnp.stack([half, half, drag]) / parameters.inertia - kick / lag
+    return Unlogged(
+        variance=counts * jnp.sum(missed**2, axis=1),
+        decay=decay,
+        jump=kick + 0.5 * pull * interval[:, None],
+        later=pull * lag * (1 - decay)[:, None],
+        force=lift / parameters.mass,
+    )
+
+
+def as_held(parameters: Parameters, hold: Float[Array, ""] | None, segments: Segments) -> Segments:
+    """Commands replaced by constants over the interval after each row that move the rotors as far as the true ones did.
+
+    A controller faster than the log sends commands between rows. Each logged one acts for ``hold`` seconds (the
+    controller's period); the others are taken to lie on the parabola through the two logged about them and the one
+    before (a line would make fast commands too small: 4 % at 11 Hz of rows 10 ms apart).
+
+    Args:
+        parameters: the drone; only the motors' lag matters, by which later commands count for more.
+        hold: s; None takes every command to act until the next row.
+        segments: flight data.
+    """
+    if hold is None:
+        return eqx.tree_at(lambda s: s.doubt, segments, jnp.zeros_like(segments.doubt))
+    interval = segments.interval[:, 1:, None]
+    safe = jnp.where(interval > 0, interval, 1.0)
+    held = jnp.clip(hold / safe, -0.5, 1.5)
+    share = 0.5 * (1 - held) * (1 + (1 + held) * interval / (6 * parameters.motor_time_constant))
+    step = jnp.diff(segments.command, axis=1)
+    ratio = jnp.concatenate([jnp.ones_like(safe[:, :1]), safe[:, :-1] / safe[:, 1:]], axis=1)
+    bend = (step - jnp.concatenate([step[:, :1], step[:, :-1]], axis=1) / ratio) / (1 + ratio)
+    between = share * step - (1 - held**2) / 6 * bend
+    command = segments.command.at[:, :-1].add(jnp.where(interval > 0, between, 0.0))
+    unsure = jnp.sqrt(jnp.clip(1 - held**2, 0.0, 1.0)) * segments.doubt[:, :-1]
+    doubt = segments.doubt.at[:, :-1].set(jax.lax.stop_gradient(unsure))
+    return eqx.tree_at(lambda s: (s.command, s.doubt), segments, (command, doubt))
 
 
 def whitened(
@@ -126,24 +186,26 @@ def whitened(
 ) -> Float[Array, "s n 8"]:
     """Innovations over their standard deviations, which as weights are not differentiated."""
     driven = drive(parameters, noise, segments, use_measured, robust)
-    error, variance = innovations(parameters, noise, segments, driven, robust)
+    error, variance = innovations(parameters, noise, segments, driven, use_measured, robust)
     # The variance follows the parameters a little (the motors' lag); as a weight it must not be fitted.
     return error / jnp.sqrt(jax.lax.stop_gradient(variance))
 
 
-def negative_log_likelihood(parameters, noise, segments, driven: Drive, robust: bool = False) -> Float[Array, ""]:
+def negative_log_likelihood(
+    parameters, noise, segments, driven: Drive, use_measured: bool = True, robust: bool = False
+) -> Float[Array, ""]:
     """Of all innovations, per row, without the constant; over devices differentiable by the noise alone."""
     rows = jnp.maximum(jnp.sum(segments.valid), 1.0)
     if segments.over is None:
-        return _surprisal(parameters, noise, segments, driven, robust) / rows
+        return _surprisal(parameters, noise, segments, driven, use_measured, robust) / rows
 
     def share(noise, parameters, segments, driven):
-        return _surprisal(parameters, noise, segments, driven, robust)
+        return _surprisal(parameters, noise, segments, driven, use_measured, robust)
 
     batch = replace(segments, over=None), driven
     return segments.over.summed(share, (parameters,), batch)(noise) / rows
 
 
-def _surprisal(parameters, noise, segments, driven: Drive, robust: bool) -> Float[Array, ""]:
-    error, variance = innovations(parameters, noise, segments, driven, robust)
+def _surprisal(parameters, noise, segments, driven: Drive, use_measured: bool, robust: bool) -> Float[Array, ""]:
+    error, variance = innovations(parameters, noise, segments, driven, use_measured, robust)
     return 0.5 * jnp.sum(jnp.log(variance) + surprise(error / jnp.sqrt(variance), robust))

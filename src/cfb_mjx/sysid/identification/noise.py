@@ -37,7 +37,10 @@ class Noise(eqx.Module):
     rotor_disturbance: Float[Array, ""]
     """Wandering error of the steady rotor speed, rad/s."""
 
-    def to_vector(self) -> Float[Array, "16"]:
+    command: Float[Array, ""]
+    """Error of the mean command between two rows, as a share of `Segments.doubt`: commands that were not logged."""
+
+    def to_vector(self) -> Float[Array, "17"]:
         """Unconstrained numbers, for optimisation."""
         middle = jnp.sqrt(_SHORTEST * _LONGEST)
         time = jnp.log(self.correlation_time / middle) / jnp.log(_LONGEST / middle)
@@ -56,6 +59,7 @@ class Noise(eqx.Module):
                             self.rotor,
                             self.rotor_walk,
                             self.rotor_disturbance,
+                            self.command,
                         ]
                     )
                 ),
@@ -63,7 +67,7 @@ class Noise(eqx.Module):
         )
 
     @staticmethod
-    def from_vector(vector: Float[Array, "16"]) -> Noise:
+    def from_vector(vector: Float[Array, "17"]) -> Noise:
         """Inverse of `to_vector`; a floor keeps a vanishing level from flattening the likelihood."""
         x = jnp.exp(vector)
         middle = jnp.sqrt(_SHORTEST * _LONGEST)
@@ -78,6 +82,7 @@ class Noise(eqx.Module):
             rotor=x[13] + 1e-2,
             rotor_walk=x[14] + 1e-2,
             rotor_disturbance=x[15] + 1e-2,
+            command=x[16] + 1e-4,
         )
 
     @staticmethod
@@ -95,6 +100,7 @@ class Noise(eqx.Module):
             rotor=max(rotor, 1.0),
             rotor_walk=30.0,
             rotor_disturbance=20.0,
+            command=0.2,
         )
         # An explicit type: weakly typed numbers would compile every program twice.
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), levels)

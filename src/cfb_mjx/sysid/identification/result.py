@@ -10,8 +10,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters import SPECIFICATIONS, Entry, ModelFile, Parameters
 from cfb_mjx.sysid.identification.feedback import Feedback
 from cfb_mjx.sysid.identification.noise import Noise
-from cfb_mjx.sysid.identification.uncertainty import Uncertainty
-from cfb_mjx.sysid.identification.unknowns import UNITS, Unknowns
+from cfb_mjx.sysid.identification.uncertainty import Uncertainty, power_product
+from cfb_mjx.sysid.identification.unknowns import OFFSETS, UNITS, Unknowns
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,8 @@ class Fit:
     """Identified parameters."""
     unidentifiable: dict[str, str]
     """What the data cannot tell: name to explanation."""
+    combinations: dict[str, Estimate]
+    """Products that are known better than what is in them, as ``inertia_xx / mass``; SI."""
     parameters: Parameters
     """With every fitted value, also of what cannot be told alone: together they describe the flights."""
     uncertainty: Uncertainty
@@ -41,9 +43,13 @@ class Fit:
     values: dict[str, float]
     """Every fitted value, SI, whether it can be told or not."""
     vector: np.ndarray
-    """(k,) the optimiser's numbers, see `cfb_mjx.sysid.identification.unknowns`."""
+    """(k,) of all that may move, the optimiser's numbers, see `cfb_mjx.sysid.identification.unknowns`."""
     rows: int
     """Measured rows (innovation) or windows (shooting) that were fitted."""
+    hold: float | None = None
+    """How long a logged command acted, s (innovation)."""
+    contradicted: tuple[str, ...] = ()
+    """What was to be held but is fitted, because the flights contradict the value it had."""
     noise: Noise | None = None
     """Noise levels (innovation)."""
     whiteness: dict[str, float] | None = None
@@ -63,27 +69,66 @@ class Fit:
         return _describe(base, self, source)
 
 
-def summarise(unknowns: Unknowns, vector, uncertainty: Uncertainty, estimator: str, rows: int, **more) -> Fit:
-    """A `Fit` that gives numbers only to what the data can tell."""
-    values = np.asarray(unknowns.values(vector))
-    std = uncertainty.std * unknowns.scale(vector)
-    preset = np.asarray(unknowns.values(unknowns.start))
-    known = [i for i, name in enumerate(unknowns.names) if name not in uncertainty.names]
+def summarise(
+    unknowns: Unknowns,
+    vector,
+    uncertainty: Uncertainty,
+    estimator: str,
+    rows: int,
+    names: tuple[str, ...] | None = None,
+    impossible: dict[str, str] | None = None,
+    **more,
+) -> Fit:
+    """A `Fit` that gives numbers only to what the data can tell; of the unknowns, only ``names`` are shown.
+
+    Those in ``impossible`` get its reasons instead of a number.
+    """
+    impossible = impossible or {}
+    names = unknowns.names if names is None else names
+    every = dict(zip(unknowns.names, map(float, np.asarray(unknowns.values(vector))), strict=True))
+    preset = dict(zip(unknowns.names, map(float, np.asarray(unknowns.values(unknowns.start))), strict=True))
+    scale = dict(zip(unknowns.names, unknowns.scale(vector), strict=True))
+    std = dict(zip(uncertainty.order, uncertainty.std, strict=True))
     return Fit(
         estimator=estimator,
         estimates={
-            unknowns.names[i]: Estimate(float(values[i]), float(std[i]), UNITS[unknowns.names[i]], float(preset[i]))
-            for i in known
+            name: Estimate(every[name], float(std[name] * scale[name]), UNITS[name], preset[name])
+            for name in names
+            if name not in uncertainty.names and name not in impossible
         },
-        unidentifiable=_reasons(uncertainty),
+        unidentifiable={name: reason for name, reason in (_reasons(uncertainty) | impossible).items() if name in names},
+        combinations=_combinations(uncertainty, every, tuple(name for name in names if name not in impossible)),
         parameters=unknowns.apply(vector),
         uncertainty=uncertainty,
-        names=unknowns.names,
-        values=dict(zip(unknowns.names, map(float, values), strict=True)),
+        names=names,
+        values={name: every[name] for name in names},
         vector=np.asarray(vector),
         rows=rows,
+        hold=every["command_hold"] if "command_hold" in std else None,
         **more,
     )
+
+
+def _combinations(uncertainty: Uncertainty, values: dict[str, float], names: tuple[str, ...]) -> dict[str, Estimate]:
+    """Products of powers that are known better than the quantities in them."""
+    order, covariance, found = uncertainty.order, uncertainty.covariance, {}
+
+    def put(powers: dict[str, float], std: float):
+        value = float(np.prod([values[name] ** power for name, power in powers.items()]))
+        found[power_product(powers)] = Estimate(value, value * std, "SI", np.nan)
+
+    for powers, std in uncertainty.products:
+        if all(name in names and name not in OFFSETS for name in powers):
+            put(powers, std)
+    if "mass" in order and "mass" not in names:
+        m = order.index("mass")
+        for i, name in enumerate(order):
+            slope = covariance[i, m] / covariance[m, m]
+            shared = slope * covariance[i, m]
+            told = name in names and name not in uncertainty.names and name not in OFFSETS
+            if told and shared > 0.5 * covariance[i, i]:
+                put({name: 1.0, "mass": -float(f"{slope:.3g}")}, float(np.sqrt(covariance[i, i] - shared)))
+    return found
 
 
 def _reasons(uncertainty: Uncertainty) -> dict[str, str]:

@@ -21,8 +21,12 @@ FIRST_DAMPING = 1e-3
 MAX_STEPS = 60
 
 
-def least_squares(residual: Callable[[Array], PyTree], start: Float[Array, "k"]) -> Float[Array, "k"]:
+def least_squares(
+    residual: Callable[[Array], PyTree], start: Float[Array, "k"], ridge: Float[Array, "k"] | float = RIDGE
+) -> Float[Array, "k"]:
     """The minimum of the sum of squares, from ``start``; forward-mode Jacobian.
+
+    ``ridge`` is one over the standard deviation of each unknown's prior about zero; a large one holds it.
 
     A full Gauss-Newton step is tried first; where it raises the cost (or makes it NaN) the diagonal is raised as in
     Marquardt (1963) until a step lowers it. Normal equations, not QR: they are what costs, and the uncertainty, which
@@ -35,7 +39,8 @@ def least_squares(residual: Callable[[Array], PyTree], start: Float[Array, "k"])
             return jax.jvp(residual, (x,), (direction,))
 
         values, slopes = jax.vmap(both, out_axes=(None, 0))(directions)
-        cost, slope, curvature = RIDGE**2 * (x @ x), RIDGE**2 * x, RIDGE**2 * directions
+        prior = jnp.broadcast_to(jnp.asarray(ridge) ** 2, x.shape)
+        cost, slope, curvature = x @ (prior * x), prior * x, jnp.diag(prior)
         for value, part in zip(jax.tree.leaves(values), jax.tree.leaves(slopes), strict=True):
             value, part = value.ravel(), part.reshape(directions.shape[0], -1)
             cost, slope, curvature = cost + value @ value, slope + part @ value, curvature + part @ part.T

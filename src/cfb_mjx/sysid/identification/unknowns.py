@@ -31,9 +31,11 @@ UNITS = {
     "cog_x": "m",
     "cog_y": "m",
     "pose_delay": "s",
+    "command_hold": "s",
 }
 """Names a fit knows, with their units. Motor quantities are common to the four motors; ``thrust_linear`` is the
-coefficient of s in the thrust cubic: with ``thrust_scale`` it sets level and slope of the thrust near hover."""
+coefficient of s in the thrust cubic: with ``thrust_scale`` it sets level and slope of the thrust near hover.
+``command_hold`` is no constant of the drone but of its log, see `Unknowns.hold`."""
 GROUPS = {
     "inertia": ("inertia_xx", "inertia_yy", "inertia_zz"),
     "motor": ("motor_time_constant", "motor_gain"),
@@ -47,9 +49,12 @@ OFFSETS = {
     "cog_x": 0.01,
     "cog_y": 0.01,
     "pose_delay": 0.004,
+    "command_hold": 0.002,
 }
 """Quantities that may be zero: changed by so much, not by a factor, for one unit of the optimiser's number."""
 _AXES = ("inertia_xx", "inertia_yy", "inertia_zz")
+HOLD = 0.002
+"""How long a logged command acts where nothing else is known, s: the firmware's rate loop runs at 500 Hz."""
 _FACTORS = ("mass", "rotor_inertia", "motor_time_constant", "motor_gain", "thrust_scale", "torque_scale")
 
 
@@ -91,6 +96,12 @@ class Unknowns(eqx.Module):
             ),
         )
 
+    def hold(self, vector: Float[Array, "k"]) -> Float[Array, ""] | None:
+        """How long a logged command acts before the next one that was sent, s; None where that is not fitted."""
+        if "command_hold" not in self.names:
+            return None
+        return HOLD + OFFSETS["command_hold"] * vector[self.names.index("command_hold")]
+
     def values(self, vector: Float[Array, "k"]) -> Float[Array, "k"]:
         """The chosen quantities at ``vector``, SI (means over the motors); differentiable."""
         p = self.apply(vector)
@@ -100,6 +111,7 @@ class Unknowns(eqx.Module):
             "thrust_linear": p.thrust_polynomial[2],
             "cog_x": p.center_of_gravity[0],
             "cog_y": p.center_of_gravity[1],
+            "command_hold": self.hold(vector),
         }
         return jnp.stack([known[name] for name in self.names])
 
@@ -143,6 +155,27 @@ def _inertia(nominal: Float[Array, "3"], change: tuple[Array | None, ...]) -> Fl
         own = most * jax.nn.sigmoid(jnp.log(moments[i] / (most - moments[i])) - change[i])
         moments = moments.at[i].set(own).at[j].set(nominal[k] - own).at[k].set(nominal[j] - own)
     return jnp.sum(moments) - moments
+
+
+BORDER = 0.01
+"""A second moment of the mass below this share of their sum is at the border of what a rigid body can be."""
+
+
+def at_the_border(parameters: Parameters) -> dict[str, str]:
+    """What no number can be given of an inertia that only the possibility of the body stopped, with the reason.
+
+    Empty for a body well inside. Yaw tells J_zz, J_m and the torque scale as ratios, so these go together.
+    """
+    inertia = np.asarray(parameters.inertia)
+    worst = int(np.argmax(inertia))
+    if 0.5 * inertia.sum() - inertia[worst] > BORDER * 0.5 * inertia.sum():
+        return {}
+    others = [axis for i, axis in enumerate(_AXES) if i != worst]
+    reason = (
+        f"these flights ask for {_AXES[worst]} > {others[0]} + {others[1]}, which no rigid body has: something "
+        "else that turns the drone is not in the model"
+    )
+    return dict.fromkeys((*_AXES, "rotor_inertia", "torque_scale"), reason)
 
 
 def choose(request: str | tuple[str, ...], nominal: Parameters) -> Unknowns:

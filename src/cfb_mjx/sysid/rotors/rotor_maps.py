@@ -1,7 +1,8 @@
 """Thrust and torque of a rotor from bench points: a cubic through the origin by linear least squares (paper eqs. 8-9).
 
-``y(Omega) = c3 s^3 + c2 s^2 + c1 s`` with ``s = Omega / sigma``. Optionally every motor has a factor of its own on the
-common curve (mean one), and outliers are weighed down (Huber, Robust Statistics, 1981, chapter 7).
+``y(Omega) = c3 s^3 + c2 s^2 + c1 s`` with ``s = Omega / sigma``. A scale that was not tared adds a constant to every
+point, which bends the whole curve: it is fitted wherever the points ask for it. Optionally every motor has a factor of
+its own on the common curve (mean one), and outliers are weighed down (Huber, Robust Statistics, 1981, chapter 7).
 """
 
 from __future__ import annotations
@@ -16,6 +17,10 @@ from cfb_mjx.sysid.rotors.map_shape import SIGMA, Shape, shape_of
 HUBER = 1.345
 """Residuals beyond this many standard deviations count linearly: 95 % efficient on normal noise."""
 FEWEST_POINTS = 6
+TARE = 3.0
+"""An offset of all points is kept from so many of its standard deviations on."""
+_TARE_LEVELS = 5
+"""Different rotor speeds from which an offset can be told beside three coefficients, with one to spare."""
 _ITERATIONS = 50
 
 
@@ -32,7 +37,10 @@ class MapFit:
         scale_p_value: that all factors are one (F test); NaN without factors.
         rotor_speed: (n,) points, rad/s.
         value: (n,) measured, N or N m.
-        residual: (n,) measured minus fitted.
+        residual: (n,) measured minus fitted, N or N m.
+        offset: what the points read too much at every speed (a scale that was not tared), N or N m; 0 unless they show
+            it by `TARE` standard deviations. Not part of the curve.
+        offset_std: its standard deviation; 0 where it is not fitted.
         weight: (n,) 1, or less for what the robust fit takes for outliers.
         motor: (n,) motor numbers.
         noise: standard deviation of a point, from the residuals (robustly if asked) or as given, N or N m; (n,).
@@ -49,6 +57,8 @@ class MapFit:
     rotor_speed: np.ndarray
     value: np.ndarray
     residual: np.ndarray
+    offset: float
+    offset_std: float
     weight: np.ndarray
     motor: np.ndarray
     noise: np.ndarray
@@ -115,23 +125,29 @@ def fit_map(
     unit = np.ones(len(speed)) if given is None else given
     weight, noise = np.ones(len(speed)), unit
     member = np.array([motor == m for m in motors], float).T if motors else np.zeros((len(speed), 0))
-    design = powers(speed, sigma)
-    theta, scale = np.zeros(3), np.ones(len(motors))
-    for _ in range(_ITERATIONS):
-        before = np.concatenate([theta, scale])
-        theta, scale = _least_squares(design, member, value, np.sqrt(weight) / unit, scale)
-        residual = value - _factor(member, scale) * (design @ theta)
-        free = len(speed) - 3 - max(len(motors) - 1, 0)
-        noise = given if given is not None else np.full(len(speed), _spread(residual, free, robust))
-        if robust:
-            ratio = np.abs(residual) / noise
-            weight = np.where(ratio > HUBER, HUBER / np.maximum(ratio, HUBER), 1.0)
-        if np.abs(np.concatenate([theta, scale]) - before).max() <= 1e-12 * (1 + np.abs(before).max()):
+    shared = _levels(speed) >= _TARE_LEVELS and len(speed) > FEWEST_POINTS + len(motors)
+    while True:
+        weight, noise = np.ones(len(speed)), unit
+        design = np.concatenate([powers(speed, sigma), np.ones((len(speed), int(shared)))], axis=1)
+        theta, scale = np.zeros(design.shape[1]), np.ones(len(motors))
+        for _ in range(_ITERATIONS):
+            before = np.concatenate([theta, scale])
+            theta, scale = _least_squares(design, member, value, np.sqrt(weight) / unit, scale)
+            residual = value - _slopes(design, member, scale) @ theta
+            free = len(speed) - design.shape[1] - max(len(motors) - 1, 0)
+            noise = given if given is not None else np.full(len(speed), _spread(residual, free, robust))
+            if robust:
+                ratio = np.abs(residual) / noise
+                weight = np.where(ratio > HUBER, HUBER / np.maximum(ratio, HUBER), 1.0)
+            if np.abs(np.concatenate([theta, scale]) - before).max() <= 1e-12 * (1 + np.abs(before).max()):
+                break
+        covariance = _covariance(design, member, theta, scale, residual, noise, robust)
+        if not shared or abs(theta[3]) > TARE * np.sqrt(covariance[3, 3]):
             break
-    covariance = _covariance(design, member, theta, scale, residual, noise, robust)
-    spread = covariance[3:, 3:]
+        shared = False
+    spread = covariance[design.shape[1] :, design.shape[1] :]
     return MapFit(
-        coefficients=theta,
+        coefficients=theta[:3],
         covariance=covariance[:3, :3],
         scale=scale,
         scale_std=np.sqrt(np.diag(spread)),
@@ -140,20 +156,26 @@ def fit_map(
         rotor_speed=speed,
         value=value,
         residual=residual,
+        offset=float(theta[3]) if shared else 0.0,
+        offset_std=float(np.sqrt(covariance[3, 3])) if shared else 0.0,
         weight=weight,
         motor=motor,
         noise=noise,
-        shape=shape_of(theta, (float(speed.min()), float(speed.max())), sigma),
+        shape=shape_of(theta[:3], (float(speed.min()), float(speed.max())), sigma),
         sigma=sigma,
     )
+
+
+def _levels(speed: np.ndarray) -> int:
+    """How many different rotor speeds there are: points closer than 2 % of full speed repeat one setting."""
+    ordered = np.sort(speed[speed > 0])
+    return 1 + int(np.sum(np.diff(ordered) > 0.02 * SIGMA)) if len(ordered) else 0
 
 
 def _enough(speed: np.ndarray, motor: np.ndarray, motors: tuple[int, ...], name: str) -> None:
     if len(speed) < FEWEST_POINTS:
         raise CfbError(f"{name}: has {len(speed)} points, a cubic needs at least {FEWEST_POINTS}; measure more.")
-    ordered = np.sort(speed[speed > 0])
-    # Points closer than 2 % of full speed are repetitions of one setting.
-    levels = 1 + int(np.sum(np.diff(ordered) > 0.02 * SIGMA)) if len(ordered) else 0
+    levels = _levels(speed)
     if levels < 3:
         raise CfbError(
             f"{name}: holds {levels} different rotor speeds, the three coefficients of a cubic need at least 3; "
@@ -164,18 +186,21 @@ def _enough(speed: np.ndarray, motor: np.ndarray, motors: tuple[int, ...], name:
             raise CfbError(f"{name}: motor {m} has a single point; measure more, or fit without --per-motor.")
 
 
-def _factor(member: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    return member @ scale if member.shape[1] else np.ones(len(member))
+def _slopes(design, member, scale) -> np.ndarray:
+    """(n, 3 or 4) derivatives by the coefficients, which a motor's factor multiplies, and by the offset, which it does
+    not."""
+    factor = member @ scale if member.shape[1] else np.ones(len(member))
+    return np.concatenate([factor[:, None] * design[:, :3], design[:, 3:]], axis=1)
 
 
 def _least_squares(design, member, value, root, scale):
     """One round: the curve given the factors, then the factors given the curve, with their mean moved to the curve."""
-    rows = (root * _factor(member, scale))[:, None] * design
+    rows = root[:, None] * _slopes(design, member, scale)
     theta = np.linalg.lstsq(rows, root * value, rcond=None)[0]
     if member.shape[1]:
-        curve = root * (design @ theta)
-        scale = (member.T @ (curve * root * value)) / (member.T @ curve**2)
-        theta, scale = theta * scale.mean(), scale / scale.mean()
+        curve = root * (design[:, :3] @ theta[:3])
+        scale = (member.T @ (curve * root * (value - design[:, 3:] @ theta[3:]))) / (member.T @ curve**2)
+        theta, scale = np.concatenate([theta[:3] * scale.mean(), theta[3:]]), scale / scale.mean()
     return theta, scale
 
 
@@ -187,14 +212,15 @@ def _spread(residual: np.ndarray, free: int, robust: bool) -> float:
 
 
 def _covariance(design, member, theta, scale, residual, noise, robust: bool) -> np.ndarray:
-    """(3 + m, 3 + m) of the coefficients and the factors; the factors' mean is fixed."""
-    count = member.shape[1]
-    slopes = np.concatenate([_factor(member, scale)[:, None] * design, member * (design @ theta)[:, None]], axis=1)
+    """Of the coefficients, the offset if there is one, and the factors, whose mean is fixed."""
+    count, k = member.shape[1], design.shape[1]
+    curve = (design[:, :3] @ theta[:3])[:, None]
+    slopes = np.concatenate([_slopes(design, member, scale), member * curve], axis=1)
     # The factors live in the space orthogonal to a common change.
-    basis = np.eye(3 + count)
+    basis = np.eye(k + count)
     if count:
         within = np.linalg.svd(np.ones((1, count)))[2][1:].T
-        basis = np.block([[np.eye(3), np.zeros((3, count - 1))], [np.zeros((count, 3)), within]])
+        basis = np.block([[np.eye(k), np.zeros((k, count - 1))], [np.zeros((count, k)), within]])
     triangle = np.linalg.qr((slopes / noise[:, None]) @ basis, mode="r")
     inverse = np.linalg.inv(triangle)
     covariance = basis @ (inverse @ inverse.T) @ basis.T
