@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.csv
 import pytest
 
-from cfb_mjx.cli.interrupts import held_back
+from cfb_mjx.interrupts import held_back
 
 CFB = str(Path(sys.executable).with_name("cfb"))
 

@@ -7,9 +7,10 @@ import os
 import sys
 
 from cfb_mjx import __version__
-from cfb_mjx.cli.interrupts import heard
 from cfb_mjx.cli.runtime import set_up_xla
+from cfb_mjx.cli.terminal import shown
 from cfb_mjx.errors import CfbError
+from cfb_mjx.interrupts import heard
 
 SUMMARY = {
     "import": "convert a flight log to MCAP",
@@ -90,5 +91,5 @@ def _help() -> str:
 
 
 def _fail(message: str, status: int) -> int:
-    print(f"cfb: {message}", file=sys.stderr)
+    print(shown(f"cfb: {message}"), file=sys.stderr)
     return status

@@ -13,7 +13,7 @@ import numpy as np
 
 from cfb_mjx import __version__
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import write_json
+from cfb_mjx.files import remove, write_json
 from cfb_mjx.model.effects import effect_from_mapping, effect_to_mapping
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
@@ -79,4 +79,4 @@ class Checkpoint:
     def discard(self) -> None:
         """The search is done."""
         if self.path is not None:
-            self.path.unlink(missing_ok=True)
+            remove(self.path)
