@@ -25,8 +25,7 @@ def site(tmp_path_factory) -> Path:
     if MISSING:
         pytest.skip(f"{', '.join(MISSING)} not installed; pip install '.[docs]'")
     out = tmp_path_factory.mktemp("site")
-    # What `make docs` does, by this Python, into another folder. A process of its own: third-party deprecations are none
-    # of our tests' warnings.
+    # What `make docs` does, by this Python and into another folder.
     recipe = re.search(r"^docs:.*\n\t(.+)\n", (ROOT / "Makefile").read_text(), flags=re.M)[1]
     assert "--strict" in recipe
     assert "$(BIN)/mkdocs " in recipe
