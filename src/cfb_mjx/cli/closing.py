@@ -40,7 +40,7 @@ def run_close_loop(
 
     base = changed_model(model, changes)
     output_folder(output)
-    checkpoint = Checkpoint.open(output / "search.json", fit, base)
+    checkpoint = Checkpoint.open(output / "search.json", fit, base, say)
     outcome = close_loop(logs, judged, base, say, checkpoint)
     judged_on = [path.name for path in held_out]
     story = provenance("close-loop", base.name, "fit_logs_sha256", fit, arguments, held_out=judged_on)
