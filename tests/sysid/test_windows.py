@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.windows import find_starts, find_windows
 
 HORIZONS = (0.05, 0.1, 0.2, 0.5)
@@ -66,6 +68,50 @@ def test_gaps_end_windows(gap_begin, gap_end, lost):
     if gap_begin == 2.104:
         lost = [1.6, *lost]
     assert missing == lost
+
+
+def with_step(begin, step, interval=0.004, end=4.0):
+    """Rows every ``interval``, but for one step, which begins at ``begin``."""
+    before = np.append(np.arange(0, begin - 1e-9, interval), begin)
+    return np.concatenate([before, np.arange(begin + step, end + 1e-9, interval)])
+
+
+@pytest.mark.parametrize("interval", [0.002, 0.004, 0.01])
+def test_a_gap_is_longer_than_three_intervals_and_half_a_millisecond(interval):
+    longest = 3 * interval + 0.5e-3
+    whole = find_starts(make_log(np.arange(0, 4.0001, interval)), HORIZONS, 0.008)
+    for step, lost in ((longest - 1e-5, 0), (longest + 1e-5, 4)):
+        # 2.15 lies within [t0 - 0.3, t0 + 0.5] of 1.8, 2.0, 2.2 and 2.4.
+        starts = find_starts(make_log(with_step(2.15, step, interval)), HORIZONS, 0.008)
+        assert len(whole) - len(starts) == lost
+
+
+def test_a_window_lasts_530_milliseconds():
+    """0.5 s of prediction and 30 ms for readings that come late."""
+    for last, expected in ((1.93, 1.4), (1.929, 1.2)):
+        starts = find_starts(make_log(np.append(np.arange(0, last - 1e-9, 0.004), last)), HORIZONS, 0.008)
+        assert starts[-1] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("begin", "step", "lost"),
+    [
+        # 300 ms before 2.4 ...
+        (2.099, 0.05, [1.6, 1.8, 2.0, 2.2]),
+        (2.1085, 0.05, [1.8, 2.0, 2.2, 2.4]),
+        # ... 500 ms after 1.6, though nothing is read within the gap, and after that where a late pose is.
+        (2.086, 0.0126, [1.6, 1.8, 2.0, 2.2]),
+        (2.1005, 0.0126, [1.6, 1.8, 2.0, 2.2, 2.4]),
+    ],
+)
+def test_gaps_count_from_300_ms_before_a_start_to_500_ms_after(begin, step, lost):
+    starts = find_starts(make_log(with_step(begin, step)), HORIZONS, 0.008)
+    every = 0.6 + 0.2 * np.arange(15)
+    assert [round(t, 3) for t in every if not np.any(np.abs(starts - t) < 1e-9)] == lost
+
+
+def test_errors_are_taken_after_50_100_200_and_500_ms():
+    assert evaluate(Quadrotor.from_file("cfb"), [make_log(np.arange(0, 2.0, 0.004))]).horizons == HORIZONS
 
 
 def test_pose_is_read_late_by_the_delay_and_gyro_is_not():
