@@ -11,9 +11,11 @@ import secrets
 import stat
 from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
+from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 
+from cfb_mjx import __version__
 from cfb_mjx.errors import CfbError
 from cfb_mjx.interrupts import held_back
 
@@ -292,6 +294,15 @@ def plain(value):
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def code_identity() -> str:
+    """Version of the library, and a hash of its source: what is half done is gone on with by the same code only."""
+    package = Path(__file__).resolve().parent
+    digest = sha256()
+    for path in sorted(package.rglob("*.py")):
+        digest.update(path.relative_to(package).as_posix().encode() + sha256(path.read_bytes()).digest())
+    return f"{__version__} {digest.hexdigest()[:16]}"
 
 
 def shipped(*parts: str) -> Path:

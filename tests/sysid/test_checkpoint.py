@@ -58,7 +58,7 @@ def test_a_search_of_something_else_is_kept_aside_and_said(tmp_path, nothing, lo
         path.write_text(kept)
         with monkeypatch.context() as patched:
             if what == "code":
-                patched.setattr(checkpoint.cfb_mjx, "__version__", "0.0.0")
+                patched.setattr(checkpoint, "code_identity", lambda: "0.0.0")
             opened = Checkpoint.open(path, flights, model, said.append)
         assert opened.restore(nothing) is None
         assert f"was interrupted with other {what}: beginning anew; it is kept as search.json.old" in said.pop()

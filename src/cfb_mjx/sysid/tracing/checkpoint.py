@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-import cfb_mjx
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import remove, write_json
+from cfb_mjx.files import code_identity, remove, write_json
 from cfb_mjx.model.effects import effect_from_mapping, effect_to_mapping
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
@@ -131,12 +130,10 @@ class Checkpoint:
 def identity(logs: list[Path], base: ModelFile) -> dict[str, str]:
     """What a search depends on, each as a hash or a version."""
     model = {name: entry.value.tolist() for name, entry in base.entries.items()}
-    package = Path(cfb_mjx.__file__).parent
-    code = [path.relative_to(package).as_posix().encode() + path.read_bytes() for path in sorted(package.rglob("*.py"))]
     return {
         "flights": _hash(log.name.encode() + log.read_bytes() for log in logs),
         "model": _hash([json.dumps([model, [dict(e) for e in base.effects]], default=str).encode()]),
-        "code": f"{cfb_mjx.__version__} {_hash(code)}",
+        "code": code_identity(),
         "libraries": ", ".join(f"{name} {metadata.version(name)}" for name in ("jax", "jaxlib", "numpy", "scipy")),
     }
 
