@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from cfb_mjx import documents
 from cfb_mjx.cli.commands import COMMANDS
+from cfb_mjx.cli.flying import Outputs, Turn, run_fly
 from cfb_mjx.control.manoeuvre_file import load_manoeuvre
 from cfb_mjx.documents import load_yaml, parse_yaml, told
 from cfb_mjx.errors import CfbError
@@ -23,7 +24,7 @@ from cfb_mjx.logs.variables import load_mapping
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file, load_randomisation
 from cfb_mjx.sweep import load_sweep, tasks_of
-from cfb_mjx.train.config import FlipTrainingConfig, TrainingConfig, load_config
+from cfb_mjx.train.config import FlipTrainingConfig, TrainingConfig, load_config, with_changes
 from cfb_mjx.train.plants import load_plants
 
 SWEEP = {
@@ -206,5 +207,10 @@ def test_changes_on_the_command_line_are_read_as_strictly(change):
 
 def test_seeds_that_jax_would_cut_short_are_refused():
     assert load_config("target", (f"seed={2**32 - 1}",)).seed == 2**32 - 1
-    with pytest.raises(CfbError, match="seed = 4294967296 must be at most"):
-        load_config("target", (f"seed={2**32}",))
+    for seed in (-1, 2**32):
+        with pytest.raises(CfbError, match=f"seed = {seed} must be from 0 to"):
+            load_config("target", (f"seed={seed}",))
+        with pytest.raises(CfbError, match=f"--seed {seed} must be from 0 to"):
+            with_changes(load_config("target"), seed=seed)
+        with pytest.raises(CfbError, match=f"--seed {seed} must be from 0 to"):
+            run_fly("pid", None, "cfb", 1, 0.0, "paper", None, True, seed, Outputs(), Turn())

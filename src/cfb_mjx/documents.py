@@ -14,6 +14,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
 
 LARGEST_INT = 2**63 - 1
+LARGEST_SEED = 2**32 - 1
+"""In single precision jax takes no more of a seed than that, and would draw the same for others."""
 _REPR = reprlib.Repr()
 _REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 3, 80, 80
 LONGEST = 160
@@ -78,7 +80,9 @@ def parse_yaml(text: str, where: str) -> Any:
         _require_plain(document, (), set())
     # PyYAML lets through whatever its parts raise: !!bool x a KeyError, a thirteenth month a ValueError, and so on.
     except Exception as error:
-        said = " ".join(str(error).split()) if isinstance(error, yaml.YAMLError | ValueError) else type(error).__name__
+        said = "nested too deeply" if isinstance(error, RecursionError) else "a value that does not fit its tag"
+        if isinstance(error, yaml.YAMLError | ValueError):
+            said = " ".join(str(error).split())
         raise CfbError(f"{where}: is not valid YAML ({said}).") from None
     return document
 
@@ -87,6 +91,16 @@ def told(value: Any) -> str:
     """A value as messages quote it: on one line, and not longer than can be read."""
     text = _REPR.repr(value)
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def require_seed(seed: int, where: str) -> None:
+    """Refuse a seed of which jax would take a part only.
+
+    Raises:
+        CfbError: it is negative or above `LARGEST_SEED`.
+    """
+    if not 0 <= seed <= LARGEST_SEED:
+        raise CfbError(f"{where} {seed} must be from 0 to {LARGEST_SEED}.")
 
 
 def is_named(value: Any) -> bool:

@@ -9,6 +9,7 @@ from typing import Literal
 
 from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.cli.terminal import print_paths
+from cfb_mjx.documents import require_seed
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, together, write_json
 
@@ -77,6 +78,7 @@ def run_fly(
         raise CfbError(f"--plants {plants}: at least one drone must fly.")
     if magnitude < 0:
         raise CfbError(f"--magnitude {magnitude}: must be zero or positive.")
+    require_seed(seed, "--seed")
     configure_jax(x64=False, devices=devices)
     import equinox as eqx
     import jax

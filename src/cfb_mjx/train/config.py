@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from cfb_mjx.documents import load_named, parse_yaml, told
+from cfb_mjx.documents import load_named, parse_yaml, require_seed, told
 from cfb_mjx.envs import FlipReward, FlipStarts, FlipTask, Layout, Noise, PaperReward, Setpoints, Starts, TargetTask
 from cfb_mjx.envs.flip import FLIP_LAYOUT
 from cfb_mjx.errors import CfbError
@@ -205,8 +205,14 @@ def config_from(mapping: dict[str, Any], where: str) -> TrainingConfig:
 
 
 def with_changes(config: TrainingConfig, **values: Any) -> TrainingConfig:
-    """A copy with some top-level settings replaced; None leaves one as it is."""
-    return replace(config, **{key: value for key, value in values.items() if value is not None})
+    """A copy with some top-level settings replaced; None leaves one as it is.
+
+    Raises:
+        CfbError: a seed out of range.
+    """
+    changed = replace(config, **{key: value for key, value in values.items() if value is not None})
+    require_seed(changed.seed, "--seed")
+    return changed
 
 
 def _change(document: dict, change: str) -> None:
@@ -228,7 +234,6 @@ _AT_LEAST = {
     "observation.past_commands": 0,
     "observation.estimate_stride": 1,
     "randomisation.magnitude": 0,
-    "seed": 0,
     "analytic.drones": 1,
     "analytic.updates": 1,
     "ppo.drones": 1,
@@ -237,8 +242,6 @@ _AT_LEAST = {
     "ppo.epochs": 1,
     "ppo.steps": 1,
 }
-LARGEST_SEED = 2**32 - 1
-"""In single precision jax takes no more of a seed than that, and would draw the same for others."""
 _POSITIVE = (
     "episode_s",
     "observation.control_dt_s",
@@ -279,8 +282,7 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
     for key, least in _AT_LEAST.items():
         if _at(config, key) < least:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be at least {least}.")
-    if config.seed > LARGEST_SEED:
-        raise CfbError(f"{where}: seed = {config.seed} must be at most {LARGEST_SEED}.")
+    require_seed(config.seed, f"{where}: seed =")
     for key in _POSITIVE + _POSITIVE_OF[config.task]:
         if not _at(config, key) > 0:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be positive.")
