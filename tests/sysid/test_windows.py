@@ -1,5 +1,7 @@
 """Prediction windows follow the protocol: starts, gaps, delay, what is held and what is interpolated."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -57,6 +59,7 @@ def test_too_short_a_log_has_no_window():
         (2.104, 2.150, [1.8, 2.0, 2.2, 2.4]),  # 1.6 + 0.508 = 2.108 falls in the gap too
         (2.0, 2.012, []),  # three missing intervals are no gap
         (2.0, 2.5, [1.6, 1.8, 2.0, 2.2, 2.4]),  # 2.4 starts inside the gap
+        (2.0, 2.404, [1.6, 1.8, 2.0, 2.2, 2.4]),  # its gyro does, its late pose does not
     ],
 )
 def test_gaps_end_windows(gap_begin, gap_end, lost):
@@ -115,8 +118,17 @@ def test_errors_are_taken_after_50_100_200_and_500_ms():
 
 
 def test_pose_is_read_late_by_the_delay_and_gyro_is_not():
-    delay = 0.0065
-    windows = find_windows(make_log(np.arange(0, 3.0, 0.004)), HORIZONS, delay)
+    delay, time = 0.0065, np.arange(0, 3.0, 0.004)
+    zero = 0 * time
+    turning = np.stack([np.cos(time / 2), zero, zero, np.sin(time / 2)], axis=1)
+    log = replace(make_log(time), velocity=np.stack([3 * time, zero, zero], axis=1), quaternion=turning)
+    windows = find_windows(log, HORIZONS, delay)
+    for late, velocity, quaternion in (
+        (windows.start + delay, windows.velocity, windows.quaternion),
+        (windows.start[:, None] + np.array(HORIZONS) + delay, windows.true_velocity, windows.true_quaternion),
+    ):
+        np.testing.assert_allclose(velocity[..., 0], 3 * late, atol=1e-12)
+        np.testing.assert_allclose(2 * np.arctan2(quaternion[..., 3], quaternion[..., 0]), late, atol=1e-6)
     np.testing.assert_allclose(windows.position[:, 0], windows.start + delay, atol=1e-12)
     np.testing.assert_allclose(windows.body_rate[:, 0], windows.start, atol=1e-12)
     ends = windows.start[:, None] + np.array(HORIZONS)
