@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+import reprlib
+from collections.abc import Hashable, Mapping
 from pathlib import Path
+from typing import Any
 
 import yaml
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
+
+LARGEST_INT = 2**63 - 1
+LARGEST_SEED = 2**32 - 1
+"""In single precision jax takes no more of a seed than that, and would draw the same for others."""
+_REPR = reprlib.Repr()
+_REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 3, 80, 80
+LONGEST = 160
 
 
 def shipped_names(*folder: str) -> list[str]:
@@ -37,7 +46,7 @@ def load_named(name_or_path: str | Path, what: str, format: str, *folder: str) -
         path = shipped("configs", *folder, f"{name_or_path}.yaml")
     document = load_yaml(path)
     if document.get("format") != format:
-        raise CfbError(f"{path}: 'format' must be '{format}', found {document.get('format')!r}.")
+        raise CfbError(f"{path}: 'format' must be '{format}', found {told(document.get('format'))}.")
     return path, document
 
 
@@ -45,7 +54,8 @@ def load_yaml(path: str | Path) -> dict:
     """Read a YAML mapping.
 
     Raises:
-        CfbError: the file is missing, unreadable, not YAML, not a mapping, or has a key twice.
+        CfbError: the file is missing, unreadable, not YAML, not a mapping, has a key twice, holds itself, or a whole
+            number of more than 64 bits.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -53,14 +63,61 @@ def load_yaml(path: str | Path) -> dict:
         raise CfbError(f"{path}: no such file.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise CfbError(f"{path}: cannot be read as text ({error}).") from None
-    try:
-        document = yaml.load(text, Loader=_StrictLoader)
-    # PyYAML lets through ValueError (a thirteenth month, !!int abc) and the interpreter's recursion limit.
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise CfbError(f"{path}: is not valid YAML ({' '.join(str(error).split())}).") from None
+    document = parse_yaml(text, str(path))
     if not isinstance(document, dict):
         raise CfbError(f"{path}: must hold a YAML mapping, found {type(document).__name__}.")
     return document
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """What a YAML text says, read as strictly as a file.
+
+    Raises:
+        CfbError: it is not valid, named by ``where``.
+    """
+    try:
+        document = yaml.load(text, Loader=_StrictLoader)
+        _require_plain(document, (), set())
+    # PyYAML lets through whatever its parts raise: !!bool x a KeyError, a thirteenth month a ValueError, and so on.
+    except Exception as error:
+        said = "nested too deeply" if isinstance(error, RecursionError) else "a value that does not fit its tag"
+        if isinstance(error, yaml.YAMLError | ValueError):
+            said = " ".join(str(error).split())
+        raise CfbError(f"{where}: is not valid YAML ({said}).") from None
+    return document
+
+
+def told(value: Any) -> str:
+    """A value as messages quote it: on one line, and not longer than can be read."""
+    text = _REPR.repr(value)
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def require_seed(seed: int, where: str) -> None:
+    """Refuse a seed of which jax would take a part only.
+
+    Raises:
+        CfbError: it is negative or above `LARGEST_SEED`.
+    """
+    if not 0 <= seed <= LARGEST_SEED:
+        raise CfbError(f"{where} {seed} must be from 0 to {LARGEST_SEED}.")
+
+
+def is_named(value: Any) -> bool:
+    """Whether this is a mapping with a ``name``, all its keys text: an effect, for instance."""
+    return isinstance(value, dict) and all(isinstance(k, str) for k in value) and isinstance(value.get("name"), str)
+
+
+def _require_plain(value: Any, within: tuple[int, ...], known: set[int]) -> None:
+    if isinstance(value, int) and abs(value) > LARGEST_INT:
+        raise yaml.YAMLError("a whole number of more than 64 bits; write it with a decimal point")
+    if isinstance(value, dict | list | tuple | set) and id(value) not in known:
+        if id(value) in within:
+            raise yaml.YAMLError("something that contains itself")
+        for part in (*value, *value.values()) if isinstance(value, dict) else value:
+            _require_plain(part, (*within, id(value)), known)
+        # What anchors repeat is looked at once.
+        known.add(id(value))
 
 
 class _StrictLoader(yaml.SafeLoader):
@@ -70,7 +127,7 @@ class _StrictLoader(yaml.SafeLoader):
         seen = set()
         for key_node, _ in node.value:
             key = self.construct_object(key_node, deep=True)
-            if isinstance(key, list | dict):
+            if not isinstance(key, Hashable):
                 raise yaml.YAMLError("a key must be plain text")
             if key in seen:
                 raise yaml.YAMLError(f"the key '{key}' appears twice (line {key_node.start_mark.line + 1})")

@@ -13,7 +13,7 @@ import pyarrow.csv
 import pytest
 
 from cfb_mjx.cli import unusual_said_once
-from cfb_mjx.cli.interrupts import held_back
+from cfb_mjx.interrupts import held_back
 from cfb_mjx.parameters import load_model_file
 
 CFB = str(Path(sys.executable).with_name("cfb"))

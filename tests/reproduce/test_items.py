@@ -3,7 +3,9 @@
 import csv
 import importlib.util
 import re
+from collections import defaultdict
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -15,9 +17,9 @@ from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.files import shipped
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.reproduce import ITEMS
+from cfb_mjx.reproduce import ITEMS, brushed, manoeuvres
 from cfb_mjx.reproduce.document import markdown, page
-from cfb_mjx.reproduce.flights import generated, real_flights
+from cfb_mjx.reproduce.flights import Given, generated, real_flights
 from cfb_mjx.reproduce.item import Result, Row
 from cfb_mjx.reproduce.manoeuvres import bands
 from cfb_mjx.train.flying import STEP_DISTANCE_M, back_and_forth, six_metres
@@ -31,6 +33,8 @@ def test_shipped_parameters_are_the_papers(tmp_path):
     stated = [row for row in result.rows if row.paper]
     assert len(stated) >= 20
     assert all(row.paper == row.ours for row in stated)
+    # Files that repeat the paper are no second measurement of it.
+    assert {row.kind for row in stated} == {"input"}
     follows = {row.what: float(row.ours) for row in result.rows if not row.paper}
     assert follows["command in hover with guards"] == pytest.approx(0.550, abs=1e-3)
     assert follows["thrust to weight without guards"] == pytest.approx(2.95, abs=0.01)
@@ -44,6 +48,7 @@ def test_curves_go_through_what_was_put_in_and_come_out_the_same_twice(tmp_path)
     assert (first / "rotor-curves.csv").read_bytes() == (second / "rotor-curves.csv").read_bytes()
     assert (first / "rotor-curves.png").read_bytes() == (second / "rotor-curves.png").read_bytes()
     assert len(result.rows) == 6
+    assert {row.kind for row in result.rows} == {"input"}
     for row in result.rows:
         ours, std = map(float, row.ours.split(" +- "))
         assert abs(ours - float(row.paper)) < 4 * std
@@ -74,6 +79,46 @@ def test_bands_enclose_a_flight_that_another_program_flew(name, start):
     np.testing.assert_array_equal(piece.simulated, again.simulated)
 
 
+def test_the_useful_horizon_is_evidence_on_flights_that_are_given_only(tmp_path, monkeypatch):
+    for name in ("SIMULATIONS", "FEWER"):
+        monkeypatch.setattr(manoeuvres, name, 64)
+    given = Given((generated("figure8"), generated("drag")), 0.05)
+    result = manoeuvres.hover_to_forward(tmp_path, None, given)
+    own, measured = (row for row in result.rows if row.what.startswith("useful horizon"))
+    assert (own.kind, measured.kind) == ("own", "result")
+    assert "given; median and quartiles of 2 flights" in measured.what
+    # A drone declared six grams too heavy is foretold worse.
+    assert float(measured.ours.split()[0]) < float(own.ours.removeprefix("more than "))
+    assert any("a mass of 0.05 kg, as weighed" in text for text in result.text)
+    assert (tmp_path / "hover-to-forward-given.png").exists()
+
+
+def test_given_brushed_flights_are_predicted_by_the_brushed_model_alone(tmp_path, monkeypatch):
+    asked = []
+
+    def evaluated(drone, logs):
+        asked.append((round(float(drone.parameters.mass), 4), [log.name for log in logs]))
+        return SimpleNamespace(metrics=lambda kind: defaultdict(lambda: 1.0))
+
+    monkeypatch.setattr("cfb_mjx.sysid.evaluate", evaluated)
+    monkeypatch.setattr(brushed, "_draw", lambda *_: None)
+    result = brushed.brushed(tmp_path, None, Given((generated("drag"),), 0.0347))
+    assert asked == [(0.044, ["figure8"]), (0.027, ["figure8"]), (0.0347, ["drag"])]
+    named = [row.what for row in result.rows if "(brushed flights)" in row.what]
+    assert len(named) == 3
+    assert all(what.endswith("(brushed flights): brushed, hold") for what in named)
+    assert "brushed model on brushless flights" in " ".join(brushed.brushed(tmp_path, None).text)
+
+
+def test_flights_of_a_brushed_drone_are_read_from_its_cards():
+    folder = ROOT.parent / "shared" / "real2" / "brushed"
+    if not folder.is_dir():
+        pytest.skip("../shared/real2 is not beside this checkout")
+    logs = Given.read(folder, None).logs
+    assert [log.name for log in logs] == ["run00", "run10", "run23", "run30"]
+    assert all(0.3 < log.command.min() < 0.75 < log.command.max() < 1 for log in logs)
+
+
 def test_a_target_that_jumps_is_reached_every_time_and_the_first_time_as_in_a_single_step():
     nominal = Quadrotor.from_file("cfb-guards")
     pilot, task, key = find_pilot("target", nominal), TargetTask(noise=QUIET), jax.random.PRNGKey(0)
@@ -96,13 +141,15 @@ def test_every_study_policy_is_there():
 
 
 def test_pages_hold_every_row(tmp_path):
-    rows = [Row("a | b", "1", "2", "because"), Row("<c>", "", "3")]
+    rows = [Row("a | b", "1", "2", "because"), Row("<c>", "", "3"), Row("<d>", "5", "5", kind="input")]
     results = {"some": Result("Title", ["Text."], rows)}
     text = markdown(results, {"date": "today"}, "a command")
-    assert "1 comparisons with numbers of the paper" in text
+    assert "1 comparisons with numbers of the paper; beside them 1 inputs" in text
+    assert "and 0 predictions by the model of its own flights" in text
     table = [line for line in text.splitlines() if line.startswith("| ")]
-    assert len(table) == 3
-    assert {line.count("|") for line in table} == {5}
+    assert len(table) == 4
+    assert {line.count("|") for line in table} == {6}
+    assert "| <d> | 5 | 5 | an input, no result |  |" in table
     html = page(results, {"date": "today"})
     assert "&lt;c&gt;" in html
     assert not re.search(r'(src|href)="(?!data:)', html)

@@ -1,9 +1,13 @@
 """Prediction windows follow the protocol: starts, gaps, delay, what is held and what is interpolated."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.windows import find_starts, find_windows
 
@@ -56,6 +60,7 @@ def test_too_short_a_log_has_no_window():
         (2.104, 2.150, [1.8, 2.0, 2.2, 2.4]),  # 1.6 + 0.508 = 2.108 falls in the gap too
         (2.0, 2.012, []),  # three missing intervals are no gap
         (2.0, 2.5, [1.6, 1.8, 2.0, 2.2, 2.4]),  # 2.4 starts inside the gap
+        (2.0, 2.404, [1.6, 1.8, 2.0, 2.2, 2.4]),  # its gyro does, its late pose does not
     ],
 )
 def test_gaps_end_windows(gap_begin, gap_end, lost):
@@ -69,9 +74,62 @@ def test_gaps_end_windows(gap_begin, gap_end, lost):
     assert missing == lost
 
 
+def with_step(begin, step, interval=0.004, end=4.0):
+    """Rows every ``interval``, but for one step, which begins at ``begin``."""
+    before = np.append(np.arange(0, begin - 1e-9, interval), begin)
+    return np.concatenate([before, np.arange(begin + step, end + 1e-9, interval)])
+
+
+@pytest.mark.parametrize("interval", [0.002, 0.004, 0.01])
+def test_a_gap_is_longer_than_three_intervals_and_half_a_millisecond(interval):
+    longest = 3 * interval + 0.5e-3
+    whole = find_starts(make_log(np.arange(0, 4.0001, interval)), HORIZONS, 0.008)
+    for step, lost in ((longest - 1e-5, 0), (longest + 1e-5, 4)):
+        # 2.15 lies within [t0 - 0.3, t0 + 0.5] of 1.8, 2.0, 2.2 and 2.4.
+        starts = find_starts(make_log(with_step(2.15, step, interval)), HORIZONS, 0.008)
+        assert len(whole) - len(starts) == lost
+
+
+def test_a_window_lasts_530_milliseconds():
+    """0.5 s of prediction and 30 ms for readings that come late."""
+    for last, expected in ((1.93, 1.4), (1.929, 1.2)):
+        starts = find_starts(make_log(np.append(np.arange(0, last - 1e-9, 0.004), last)), HORIZONS, 0.008)
+        assert starts[-1] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("begin", "step", "lost"),
+    [
+        # 300 ms before 2.4 ...
+        (2.099, 0.05, [1.6, 1.8, 2.0, 2.2]),
+        (2.1085, 0.05, [1.8, 2.0, 2.2, 2.4]),
+        # ... 500 ms after 1.6, though nothing is read within the gap, and after that where a late pose is.
+        (2.086, 0.0126, [1.6, 1.8, 2.0, 2.2]),
+        (2.1005, 0.0126, [1.6, 1.8, 2.0, 2.2, 2.4]),
+    ],
+)
+def test_gaps_count_from_300_ms_before_a_start_to_500_ms_after(begin, step, lost):
+    starts = find_starts(make_log(with_step(begin, step)), HORIZONS, 0.008)
+    every = 0.6 + 0.2 * np.arange(15)
+    assert [round(t, 3) for t in every if not np.any(np.abs(starts - t) < 1e-9)] == lost
+
+
+def test_errors_are_taken_after_50_100_200_and_500_ms():
+    assert evaluate(Quadrotor.from_file("cfb"), [make_log(np.arange(0, 2.0, 0.004))]).horizons == HORIZONS
+
+
 def test_pose_is_read_late_by_the_delay_and_gyro_is_not():
-    delay = 0.0065
-    windows = find_windows(make_log(np.arange(0, 3.0, 0.004)), HORIZONS, delay)
+    delay, time = 0.0065, np.arange(0, 3.0, 0.004)
+    zero = 0 * time
+    turning = np.stack([np.cos(time / 2), zero, zero, np.sin(time / 2)], axis=1)
+    log = replace(make_log(time), velocity=np.stack([3 * time, zero, zero], axis=1), quaternion=turning)
+    windows = find_windows(log, HORIZONS, delay)
+    for late, velocity, quaternion in (
+        (windows.start + delay, windows.velocity, windows.quaternion),
+        (windows.start[:, None] + np.array(HORIZONS) + delay, windows.true_velocity, windows.true_quaternion),
+    ):
+        np.testing.assert_allclose(velocity[..., 0], 3 * late, atol=1e-12)
+        np.testing.assert_allclose(2 * np.arctan2(quaternion[..., 3], quaternion[..., 0]), late, atol=1e-6)
     np.testing.assert_allclose(windows.position[:, 0], windows.start + delay, atol=1e-12)
     np.testing.assert_allclose(windows.body_rate[:, 0], windows.start, atol=1e-12)
     ends = windows.start[:, None] + np.array(HORIZONS)

@@ -14,7 +14,9 @@ import jax
 import numpy as np
 import pytest
 
+from cfb_mjx.cli.hosts import BOUND, Hosts, _arguments
 from cfb_mjx.control.policy_file import load_policy
+from cfb_mjx.errors import CfbError
 from cfb_mjx.train.checkpoint import read_about
 from cfb_mjx.train.run import CHECKPOINT, CURVE, POLICY
 
@@ -128,6 +130,43 @@ def test_two_processes_train_what_one_does(cache, alone, tmp_path):
     assert {p.name for p in folder.iterdir()} == {p.name for p in alone.iterdir()}
     assert str(folder / POLICY) in ends[0][1]
     assert ends[1][1:] == ("", "")
+
+
+LISTENING = """
+import sys
+from pathlib import Path
+from cfb_mjx.cli.hosts import Hosts, _join
+_join(Hosts(sys.argv[1], 1, 0))
+for table in ("tcp", "tcp6"):
+    for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:
+        _, place, _, state = line.split()[:4]
+        address, _, port = place.partition(":")
+        if state == "0A" and int(port, 16) == int(sys.argv[1].rpartition(":")[2]):
+            print(table, address)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/net/tcp").exists(), reason="needs Linux's table of sockets")
+def test_process_0_listens_where_it_is_told_to_and_nowhere_else():
+    command = [sys.executable, "-c", LISTENING, f"127.0.0.1:{_free_port()}"]
+    environment = {key: value for key, value in os.environ.items() if key != BOUND}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    assert done.stdout.split("\n")[0] in ("tcp 0100007F", "tcp6 0000000000000000FFFF00000100007F")
+    assert done.stdout.count("\n") == 1
+
+
+def test_a_name_that_other_machines_cannot_reach_is_refused(monkeypatch):
+    def resolve(name, port):
+        return [(socket.AF_INET, None, 0, "", ({"localhost": "127.0.0.1"}.get(name, "127.0.1.1"), 0))]
+
+    monkeypatch.setattr(socket, "getaddrinfo", resolve)
+    monkeypatch.delenv(BOUND, raising=False)
+    assert _arguments(Hosts("localhost:99", 2, 0))["coordinator_bind_address"] == "localhost:99"
+    with pytest.raises(CfbError, match=r"here node-a is 127\.0\.1\.1, where no other machine can reach"):
+        _arguments(Hosts("node-a:99", 2, 0))
+    _arguments(Hosts("node-a:99", 2, 1))  # only process 0 listens
+    monkeypatch.setenv(BOUND, "10.0.0.1:99")
+    assert _arguments(Hosts("node-a:99", 2, 0))["coordinator_bind_address"] == "10.0.0.1:99"
 
 
 @pytest.mark.parametrize(("killed", "goes_on"), [(1, 2), pytest.param(0, 1, marks=pytest.mark.long)])

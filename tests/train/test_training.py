@@ -189,6 +189,23 @@ def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, 
         assert {k: v for k, v in a.items() if k != "seconds"} == {k: v for k, v in b.items() if k != "seconds"}
 
 
+def test_a_training_stopped_between_its_files_is_as_it_was_before_them(tmp_path, monkeypatch):
+    before, table = {}, run._csv
+
+    def stop_at_the_second(rows):
+        if len(rows) == 2:
+            before.update((path.name, path.read_bytes()) for path in tmp_path.iterdir() if path.name[0] != ".")
+            raise KeyboardInterrupt
+        return table(rows)
+
+    monkeypatch.setattr(run, "_csv", stop_at_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        train(small("analytic"), tmp_path, evaluate=False)
+    assert {POLICY, CURVE, CHECKPOINT} <= set(before)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert run.read_about(tmp_path / CHECKPOINT)["updates"] == 2
+
+
 def test_a_training_goes_on_after_its_folder_and_its_models_have_moved(tmp_path):
     old, new = tmp_path / "old", tmp_path / "new"
     old.mkdir()

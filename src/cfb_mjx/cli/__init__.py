@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from cfb_mjx import __version__
-from cfb_mjx.cli.interrupts import heard
 from cfb_mjx.cli.runtime import set_up_xla
+from cfb_mjx.cli.terminal import shown
 from cfb_mjx.errors import CfbError, CfbWarning
+from cfb_mjx.interrupts import heard
 
 SUMMARY = {
     "import": "convert a flight log to MCAP",
@@ -74,7 +75,7 @@ def unusual_said_once() -> Iterator[None]:
             before(message, category, *where, **more)
         elif str(message) not in said:
             said.add(str(message))
-            print(f"cfb: {message}", file=sys.stderr, flush=True)
+            print(f"cfb: {shown(str(message))}", file=sys.stderr, flush=True)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", CfbWarning)
@@ -111,5 +112,5 @@ def _help() -> str:
 
 
 def _fail(message: str, status: int) -> int:
-    print(f"cfb: {message}", file=sys.stderr)
+    print(shown(f"cfb: {message}"), file=sys.stderr)
     return status

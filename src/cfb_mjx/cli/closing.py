@@ -7,7 +7,7 @@ from pathlib import Path
 from cfb_mjx.cli.fitted_model import provenance, require_apart
 from cfb_mjx.cli.runtime import configure_jax, environment, say
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import output_folder, require_no_file, write_json
+from cfb_mjx.files import output_folder, require_no_file, together, write_json
 from cfb_mjx.logs import FlightLog, read_log, require_own_names
 
 LEAST_SECONDS = 10.0
@@ -40,7 +40,7 @@ def run_close_loop(
 
     base = changed_model(model, changes)
     output_folder(output)
-    checkpoint = Checkpoint.open(output / "search.json", fit, base)
+    checkpoint = Checkpoint.open(output / "search.json", fit, base, say)
     outcome = close_loop(logs, judged, base, say, checkpoint)
     judged_on = [path.name for path in held_out]
     story = provenance("close-loop", base.name, "fit_logs_sha256", fit, arguments, held_out=judged_on)
@@ -48,11 +48,11 @@ def run_close_loop(
     facts = environment()
     report = {"case": output.resolve().name} | outcome.to_json() | {"model": base.name, "environment": facts}
     say("writing the report")
-    save_model_file(corrected, output / "model.yaml")
-    write_report(outcome, output, facts, logs, judged)
-    # Last, so that a report.json is always one of a whole report.
-    write_json(output / "report.json", report)
-    checkpoint.discard()
+    with together():
+        save_model_file(corrected, output / "model.yaml")
+        write_report(outcome, output, facts, logs, judged)
+        write_json(output / "report.json", report)
+        checkpoint.discard()
     _print(report, output)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
+from functools import wraps
 from inspect import signature
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,6 +15,7 @@ from cfb_mjx.cli.deploying_commands import export
 from cfb_mjx.cli.learning_commands import fly, train
 from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce, view
 from cfb_mjx.cli.sweep_commands import sweep
+from cfb_mjx.cli.terminal import escaped, shown
 from cfb_mjx.errors import CfbError
 
 
@@ -389,4 +392,15 @@ COMMANDS = {name: with_plugins(command) for name, command in COMMANDS.items()}
 
 def run(name: str, arguments: list[str]) -> None:
     """Parse the arguments of subcommand ``name`` and run it."""
-    tyro.cli(COMMANDS[name], prog=f"cfb {name}", args=arguments)
+    command = COMMANDS[name]
+
+    @wraps(command)
+    def given(**values):
+        return values
+
+    # The parser's own words are coloured; it repeats what was typed, or what the shell put there.
+    harmless = all(shown(argument) == argument for argument in arguments)
+    with nullcontext() if harmless else escaped():
+        values = tyro.cli(given, prog=f"cfb {name}", args=arguments)
+    with escaped():
+        command(**values)

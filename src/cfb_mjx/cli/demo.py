@@ -11,7 +11,7 @@ import numpy as np
 
 from cfb_mjx.cli.runtime import environment
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import shipped, write_json, write_text
+from cfb_mjx.files import shipped, together, write_json, write_text
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.parameters import ModelFile, load_model_file, load_randomisation, sample_parameters
 from cfb_mjx.view import Section, html_page, prediction_figure, spread_figure
@@ -30,6 +30,7 @@ _VARIANTS = {"commands_in": "model, commands in", "rotor_speed_in": "model, roto
 _ROWS = (("position", "m", "m"), ("velocity", "mps", "m/s"), ("attitude", "deg", "deg"), ("rate", "radps", "rad/s"))
 
 
+@together()
 def run_demo(output: Path, real: Path | None = None, *, rollouts: int = 4096) -> None:
     """Evaluate a flight, fly randomised drones, evaluate a real flight if there is one, and write a page.
 

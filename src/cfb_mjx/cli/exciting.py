@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Literal
 
 from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment
+from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import output_folder, require_folder, require_no_file, write_json, write_text
+from cfb_mjx.files import output_folder, require_folder, require_no_file, together, write_json, write_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -93,10 +94,13 @@ def run_excite(
     chosen = trials[manoeuvre]
     result = _json(manoeuvre, trials, described.name, repetitions, duration, limits, conditions)
     _print(result, trials)
-    _write(output, chosen, result, limits, f"{manoeuvre} on {described.name}")
-    if json is not None:
-        write_json(json, result)
-        print(f"results: {json}")
+    with together():
+        _write(output, chosen, result, limits, f"{manoeuvre} on {described.name}")
+        if json is not None:
+            write_json(json, result)
+    print(f"files: {', '.join(str(output / n) for n in ('commands.csv', 'flight.mcap', 'excitation.png'))}")
+    print(f"results: {output / 'excitation.json'}")
+    print_paths(results=json)
 
 
 def _trials(manoeuvre, described, parameters, repetitions, duration, limits, conditions) -> dict[str, Trial]:
@@ -232,5 +236,3 @@ def _write(folder: Path, chosen: Trial, result: dict, limits, title: str) -> Non
     bounds = {"tilt": limits.tilt_deg, "rate": limits.rate, "height": limits.altitude_loss}
     excitation_figure(chosen.calm, chosen.flown, folder / "excitation.png", bounds, title)
     write_json(folder / "excitation.json", result)
-    print(f"files: {', '.join(str(folder / n) for n in ('commands.csv', 'flight.mcap', 'excitation.png'))}")
-    print(f"results: {folder / 'excitation.json'}")

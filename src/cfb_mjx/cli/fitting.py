@@ -10,8 +10,9 @@ from pathlib import Path
 from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.cli.fitted_model import provenance, require_model_path
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment
+from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import require_folder, write_json
+from cfb_mjx.files import require_folder, together, write_json
 from cfb_mjx.logs import FlightLog, read_log
 
 HELD_OUT_SHARE = 0.25
@@ -68,17 +69,16 @@ def run_fit(
     other = _other(result, fitted, base, not commands_only, robust, over) if compare else None
     before = evaluate(Quadrotor.from_file(base), judged, over=over)
     after = evaluate(Quadrotor.from_file(corrected), judged, over=over)
-    save_model_file(corrected, output)
-    _print(result, other, before, after)
-    print(f"model: {output}")
-    if json is not None:
-        write_json(json, _json(result, other, before, after))
-        print(f"results: {json}")
-    if figure is not None:
-        from cfb_mjx.view.fit import fit_figure
+    with together():
+        save_model_file(corrected, output)
+        if json is not None:
+            write_json(json, _json(result, other, before, after))
+        if figure is not None:
+            from cfb_mjx.view.fit import fit_figure
 
-        fit_figure(result, other, before, after, figure)
-        print(f"figure: {figure}")
+            fit_figure(result, other, before, after, figure)
+    _print(result, other, before, after)
+    print_paths(model=output, results=json, figure=figure)
 
 
 def _first(log: FlightLog) -> FlightLog:

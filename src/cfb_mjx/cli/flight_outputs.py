@@ -33,13 +33,11 @@ def write_flights(outputs: Outputs, flown: Flight, dt: float, nominal: Quadrotor
         from cfb_mjx.view.flip import flip_figure
 
         (flip_figure if turning else flight_figure)(flown, dt, outputs.figure, title)
-        print(f"figure: {outputs.figure}")
     if outputs.recording is not None:
         from cfb_mjx.view.flight_recording import write_flight_recording
 
         thrust = np.asarray(rotors.thrust(parameters, flown.rotor_speed[:1]))
         write_flight_recording(outputs.recording, flown, dt, thrust)
-        print(f"recording: {outputs.recording}")
     if outputs.video is not None:
         from cfb_mjx.view.film import Path3D, write_film
 
@@ -51,11 +49,9 @@ def write_flights(outputs: Outputs, flown: Flight, dt: float, nominal: Quadrotor
         time = dt * (1 + np.arange(len(position)))
         flight = Path3D(time[rows], position[rows] + above, np.asarray(flown.quaternion[0])[rows], thrust[rows])
         write_film(outputs.video, flight)
-        print(f"video: {outputs.video}")
     if outputs.log is not None:
         from cfb_mjx.logs import write_mcap
         from cfb_mjx.train.flight_logs import flight_log
 
         log = flight_log(flown, dt, outputs.log.stem, float(parameters.gravity))
         write_mcap(log, outputs.log)
-        print(f"log: {outputs.log}")

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Literal
 
 from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.cli.terminal import print_paths
+from cfb_mjx.documents import require_seed
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import require_folder, write_json
+from cfb_mjx.files import require_folder, together, write_json
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 DEFAULT_TASK = "hover"
@@ -77,6 +79,7 @@ def run_fly(
         raise CfbError(f"--plants {plants}: at least one drone must fly.")
     if magnitude < 0:
         raise CfbError(f"--magnitude {magnitude}: must be zero or positive.")
+    require_seed(seed, "--seed")
     configure_jax(x64=False, devices=devices)
     import equinox as eqx
     import jax
@@ -121,11 +124,11 @@ def run_fly(
     test, course = flips if task in FLIPS else flying.TESTS[task], with_room(course, nominal)
     keys = jax.random.split(jax.random.PRNGKey(seed), plants)
     over = Devices.take(devices)
-    together = over.divided(lambda pilot, drone, keys: test(pilot, course, drone, keys), (None, None, 0), 0)
+    divided = over.divided(lambda pilot, drone, keys: test(pilot, course, drone, keys), (None, None, 0), 0)
 
     def fly(drone):
         if over.several:
-            found = over.here(eqx.filter_jit(together)(pilot, drone, over.along(over.padded(keys))))
+            found = over.here(eqx.filter_jit(divided)(pilot, drone, over.along(over.padded(keys))))
             measured, flown = jax.tree.map(lambda x: x[:plants], found)
         else:
             measured, flown = test(pilot, course, drone, keys)
@@ -149,14 +152,16 @@ def run_fly(
         for name, drone in drones.items():
             result["on"][name], _ = fly(drone)
             _print_row(name, result["on"][name], max(map(len, drones)))
-    if outputs.json is not None:
-        write_json(outputs.json, result | {"environment": environment()})
-        print(f"results: {outputs.json}")
-    if outputs.of_one_model:
-        from cfb_mjx.cli.flight_outputs import write_flights
+    with together():
+        if outputs.json is not None:
+            write_json(outputs.json, result | {"environment": environment()})
+        if outputs.of_one_model:
+            from cfb_mjx.cli.flight_outputs import write_flights
 
-        title = f"{controller}, {task}, {model}"
-        write_flights(outputs, flown, pilot.control_dt_s, nominal, title, turning=rotations is not None)
+            title = f"{controller}, {task}, {model}"
+            write_flights(outputs, flown, pilot.control_dt_s, nominal, title, turning=rotations is not None)
+    written = {"results": outputs.json, "figure": outputs.figure, "recording": outputs.recording}
+    print_paths(**written, video=outputs.video, log=outputs.log)
 
 
 def asks_for_setpoints(pilot) -> bool:

@@ -5,16 +5,20 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from ipaddress import ip_address
 
 from cfb_mjx.cli.supervising import supervised
 from cfb_mjx.errors import CfbError
 
+BOUND = "JAX_COORDINATOR_BIND_ADDRESS"
+"""The environment variable that says where process 0 listens, if not where the others find it."""
 LOST = 3
 """Exit status of a process whose fellows are gone."""
 HEARTBEAT_S = 20
@@ -122,18 +126,38 @@ def _join(hosts: Hosts) -> None:
         ) from None
     except RuntimeError as error:
         raise CfbError(
-            f"--coordinator {hosts.coordinator}: cannot listen there ({error}); take another port."
+            f"--coordinator {hosts.coordinator}: cannot listen there ({error}); take another port, or set "
+            f"{BOUND} to the HOST:PORT that this machine has for it."
         ) from None
 
 
 def _arguments(hosts: Hosts) -> dict:
+    if hosts.process == 0 and BOUND not in os.environ:
+        _require_reachable(hosts.coordinator)
     return {
         "coordinator_address": hosts.coordinator,
         "num_processes": hosts.processes,
         "process_id": hosts.process,
+        # Left alone, jax listens on all addresses of the machine, to whoever can reach one of them.
+        "coordinator_bind_address": os.environ.get(BOUND, hosts.coordinator),
         # All is said: whatever cluster this may be is not to be asked.
         "cluster_detection_method": "deactivate",
     }
+
+
+def _require_reachable(coordinator: str) -> None:
+    """Refuse the machine's own name where, as on many, only the machine itself can reach it by that name."""
+    name = coordinator.rpartition(":")[0]
+    try:
+        addresses = {str(found[4][0]) for found in socket.getaddrinfo(name.strip("[]"), None)}
+    except OSError as error:
+        raise CfbError(f"--coordinator {coordinator}: {name} has no address here ({error.strerror}).") from None
+    typed = name == "localhost" or addresses == {name.strip("[]")}
+    if not typed and all(ip_address(a.partition("%")[0]).is_loopback for a in addresses):
+        raise CfbError(
+            f"--coordinator {coordinator}: here {name} is {', '.join(sorted(addresses))}, where no other machine can "
+            f"reach process 0; give its address, or set {BOUND} to the HOST:PORT to listen on."
+        )
 
 
 def _explained(hosts: Hosts, goes_on: str, status: int, printed: str) -> tuple[int, str] | None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment, say
-from cfb_mjx.files import require_no_file, write_json, write_text
+from cfb_mjx.files import require_no_file, together, write_json, write_text
 
 RESULTS, PAGE, FIGURE = "loop.json", "index.html", "loop.png"
 DEFAULT_EFFECT = "payload"
@@ -48,10 +48,11 @@ def write_results(results: dict[str, Any], output: Path) -> None:
     from cfb_mjx.view import html_page
     from cfb_mjx.view.closed_loop import TITLE, lead, loop_figure, sections
 
-    write_json(output / RESULTS, results)
-    loop_figure(results, output / FIGURE)
     facts = list(results["cells"].values())[-1]["trials"]["environment"]
-    write_text(output / PAGE, html_page(TITLE, lead(results), sections(results, output / FIGURE), facts))
+    with together():
+        write_json(output / RESULTS, results)
+        loop_figure(results, output / FIGURE)
+        write_text(output / PAGE, html_page(TITLE, lead(results), sections(results, output / FIGURE), facts))
 
 
 def _close(fit: list[Path], held_out: list[Path], output: Path) -> None:

@@ -11,8 +11,9 @@ import numpy as np
 from cfb_mjx.cli.evaluating import changed_model, print_table
 from cfb_mjx.cli.fitted_model import provenance, require_apart, require_model_path
 from cfb_mjx.cli.runtime import configure_jax, environment, say
+from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import require_folder, write_json
+from cfb_mjx.files import require_folder, together, write_json
 from cfb_mjx.logs import FlightLog, read_log, require_own_names
 
 if TYPE_CHECKING:
@@ -66,16 +67,17 @@ def run_refine(
     refined, report = fit(base, logs, names, progress=say, **extra)
     origin = provenance("refine", base.name, "fit_logs_sha256", paths, held_out=[path.name for path in held_out])
     refined = replace(refined, name=output.stem, provenance=origin)
-    save_model_file(refined, output)
-    _print(report)
-    print(f"model: {output}" + (" (a predictor, not a plant)" if predictor else ""))
     if judged:
         report |= {"held_out": {"before": judge(base, judged), "after": judge(refined, judged)}}
-        for result in report["held_out"].values():
-            print_table(result)
-    if json is not None:
-        write_json(json, report | {"model": refined.name, "estimator": estimator, "environment": environment()})
-        print(f"results: {json}")
+    with together():
+        save_model_file(refined, output)
+        if json is not None:
+            write_json(json, report | {"model": refined.name, "estimator": estimator, "environment": environment()})
+    _print(report)
+    print(f"model: {output}" + (" (a predictor, not a plant)" if predictor else ""))
+    for result in report.get("held_out", {}).values():
+        print_table(result)
+    print_paths(results=json)
 
 
 def by_innovations(

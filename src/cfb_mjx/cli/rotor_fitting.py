@@ -12,8 +12,9 @@ import numpy as np
 from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.cli.fitted_model import provenance, require_model_path
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment
+from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import read_bytes, require_folder, write_json
+from cfb_mjx.files import read_bytes, require_folder, together, write_json
 from cfb_mjx.logs import read_log
 from cfb_mjx.logs.bench_tables import MapTable, MotorRecord, from_columns, recognises
 from cfb_mjx.logs.tabular import read_table
@@ -69,20 +70,20 @@ def run_fit_rotors(
     if not written:
         reasons = "; ".join(motors.common.unidentifiable.values()) if motors else ""
         raise CfbError(f"{', '.join(p.name for p in paths)}: cannot tell any constant of the model ({reasons}).")
-    save_model_file(corrected, output)
+    with together():
+        save_model_file(corrected, output)
+        if json is not None:
+            write_json(json, _json(motors, maps, base, written))
+        if figure is not None:
+            from cfb_mjx.sysid.rotors.motor_replay import replay
+            from cfb_mjx.view.rotors import rotor_figure
+
+            rotor_figure(replay(motors) if motors else [], maps, figure, output.stem)
     _print(motors, maps, base, {name for name, on in extras.items() if on})
     print(f"model: {output} ({', '.join(written)})")
     if motors and motors.common.extras - {"offset"}:
         print(f"spin-up and spin-down constants and dead time are reported only: {_LIMIT}.")
-    if json is not None:
-        write_json(json, _json(motors, maps, base, written))
-        print(f"results: {json}")
-    if figure is not None:
-        from cfb_mjx.sysid.rotors.motor_replay import replay
-        from cfb_mjx.view.rotors import rotor_figure
-
-        rotor_figure(replay(motors) if motors else [], maps, figure, output.stem)
-        print(f"figure: {figure}")
+    print_paths(results=json, figure=figure)
 
 
 def _read(paths: list[Path]) -> tuple[list[MotorRecord], list[MapTable]]:

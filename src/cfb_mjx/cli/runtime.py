@@ -9,7 +9,8 @@ from datetime import date
 from importlib import metadata
 from pathlib import Path
 
-from cfb_mjx.cli.interrupts import held_back
+from cfb_mjx.cli.terminal import shown
+from cfb_mjx.interrupts import held_back
 
 XLA_CPU_FLAGS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
 """On CPU a time step then becomes a few kernels that share what they compute, instead of some thirty that repeat it:
@@ -104,5 +105,13 @@ class Progress:
         filled = round(30 * done / max(total, 1))
         end = "\n" if done >= total else ""
         # The rest of an earlier, longer line is wiped.
-        line = f"\r{self.what} [{'#' * filled}{'.' * (30 - filled)}] {done}/{total} {more}\x1b[K"
-        print(line, end=end, file=sys.stderr, flush=True)
+        line = shown(f"{self.what} [{'#' * filled}{'.' * (30 - filled)}] {done}/{total} {more}")
+        self._write(f"\r{line}\x1b[K{end}")
+
+    def clear(self) -> None:
+        """Wipe the line, for another text to stand there."""
+        if self.live:
+            self._write("\r\x1b[K")
+
+    def _write(self, text: str) -> None:
+        print(text, end="", file=getattr(sys.stderr, "unescaped", sys.stderr), flush=True)

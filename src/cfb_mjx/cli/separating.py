@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.cli.runtime import Progress, configure_jax, environment
+from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import output_folder, require_folder, require_no_file, write_json, write_text
+from cfb_mjx.files import output_folder, require_folder, require_no_file, together, write_json, write_text
 
 if TYPE_CHECKING:
     from cfb_mjx.sysid.excitation.separation import Told
@@ -58,10 +59,14 @@ def run_separate(
         raise CfbError(
             f"no path tells {' from '.join(names)} at the strengths assumed; weigh, remove a part or measure it apart."
         )
-    _write(output, told[0], result)
-    if json is not None:
-        write_json(json, result)
-        print(f"results: {json}")
+    with together():
+        _write(output, told[0], result)
+        if json is not None:
+            write_json(json, result)
+    best = told[0]
+    print(f"\nfly: {best.path}, {best.flights} time{'s' * (best.flights != 1)}, then cfb close-loop again")
+    print(f"files: {', '.join(str(output / name) for name in FILES)}")
+    print_paths(results=json)
 
 
 def _json(told: list[Told], names: list[str], model: str, conditions: dict) -> dict:
@@ -95,5 +100,3 @@ def _write(folder: Path, best: Told, result: dict) -> None:
     write_text(folder / "setpoints.csv", "\n".join(lines) + "\n")
     write_mcap(best.flown.log, folder / "flight.mcap")
     write_json(folder / "separation.json", result)
-    print(f"\nfly: {best.path}, {best.flights} time{'s' * (best.flights != 1)}, then cfb close-loop again")
-    print(f"files: {', '.join(str(folder / name) for name in FILES)}")

@@ -57,11 +57,15 @@ def reproduce(
     names: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = ("all",),
     output: Output = Path("out/paper"),
     real: Path | None = None,
+    flights: Path | None = None,
+    mass: float | None = None,
 ) -> None:
     """Make the paper's figures and tables, its numbers beside ours.
 
     For each a figure (PNG), the numbers behind it (CSV) and rows of "paper, ours, how it differs and why"; index.html
-    shows all of it, paper.md and paper.json hold the rows.
+    shows all of it, paper.md and paper.json hold the rows. They are written after each; interrupted, the same command
+    goes on with what is left. Rows that repeat a constant of the paper, and predictions by the model of its own
+    flights, are marked.
 
     parameters, motor-step, rotor-curves, hover-to-forward, yaw-disturbance, brushed, back-and-forth, controllers,
     randomisation, flips, double-flip; all of them by default, which takes minutes.
@@ -71,10 +75,13 @@ def reproduce(
         output: folder to write to.
         real: folder with real flights in the IDSIA layout (fit/*.parquet, validation/*.parquet), to stand beside the
             shipped ones.
+        flights: folder with flight logs of your drone: brushless for hover-to-forward and yaw-disturbance, whose useful
+            horizon is then measured on them; brushed for brushed.
+        mass: of the drone of --flights as weighed, kg; that of the preset by default.
     """
     from cfb_mjx.cli.reproducing import run_reproduce
 
-    run_reproduce(names, output, real)
+    run_reproduce(names, output, real, flights, mass)
 
 
 def demo_loop(

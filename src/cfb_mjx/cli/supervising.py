@@ -13,6 +13,8 @@ import sys
 import threading
 from collections.abc import Callable
 
+from cfb_mjx.cli.terminal import Escaped
+
 KEPT_BYTES = 1 << 16
 _FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -59,8 +61,8 @@ def _begin(say: int, waited: int) -> None:
     """In the child: Python prints where it did, libraries into the pipe; and the parent's end is the child's."""
     # A Ctrl-C in the terminal goes to the parent alone, which passes it on.
     os.setpgid(0, 0)
-    sys.stdout = os.fdopen(os.dup(1), "w", buffering=1)
-    sys.stderr = os.fdopen(os.dup(2), "w", buffering=1)
+    sys.stdout = Escaped(os.fdopen(os.dup(1), "w", buffering=1))
+    sys.stderr = Escaped(os.fdopen(os.dup(2), "w", buffering=1))
     os.dup2(say, 1)
     os.dup2(say, 2)
     os.close(say)

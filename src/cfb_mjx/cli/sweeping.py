@@ -6,7 +6,6 @@ import io
 import re
 import shlex
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from functools import wraps
@@ -159,8 +158,7 @@ def _say_what_is_left_over(folder: Folder, tasks: tuple[Task, ...]) -> None:
 
 def _over(bar: Progress, text: str) -> None:
     """A line of its own, not at the end of the bar."""
-    if bar.live:
-        print("\r\x1b[K", end="", file=sys.stderr)
+    bar.clear()
     say(text)
 
 

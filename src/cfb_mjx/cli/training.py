@@ -7,7 +7,7 @@ from pathlib import Path
 from cfb_mjx.cli.hosts import Hosts, joined
 from cfb_mjx.cli.runtime import Progress, configure_jax, differentiate_mjx, environment, say
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import require_no_file, write_json
+from cfb_mjx.files import require_no_file, together, write_json
 
 NEWEST = "training.json"
 _JUDGED = (
@@ -68,8 +68,9 @@ def run_train(
         rows = train(training, output, resume, advanced, reported, devices=devices)
         if not first():
             return
-        learning_figure(rows, output / "curve.png", f"{settings.algorithm}, {training.described.name}")
-        write_json(output / NEWEST, {"environment": facts, "last": rows[-1]})
+        with together():
+            learning_figure(rows, output / "curve.png", f"{settings.algorithm}, {training.described.name}")
+            write_json(output / NEWEST, {"environment": facts, "last": rows[-1]})
         print(f"policy: {output / POLICY}\nlearning curve: {output / 'curve.csv'}, {output / 'curve.png'}")
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from cfb_mjx.control.manoeuvre import Knobs
-from cfb_mjx.documents import load_named, refuse_unknown, shipped_names
+from cfb_mjx.documents import load_named, parse_yaml, refuse_unknown, shipped_names, told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_text
 
@@ -44,16 +44,16 @@ def load_manoeuvre(name_or_path: str | Path, changes: tuple[str, ...] = ()) -> M
     refuse_unknown(document, {"format", "description", "rotations", "knobs"}, path, "")
     rotations, raw = document.get("rotations"), document.get("knobs")
     if not isinstance(rotations, int) or isinstance(rotations, bool) or rotations < 1:
-        raise CfbError(f"{path}: rotations must be a whole number from 1, found {rotations!r}.")
+        raise CfbError(f"{path}: rotations must be a whole number from 1, found {told(rotations)}.")
     if not isinstance(raw, dict):
-        raise CfbError(f"{path}: knobs must be a mapping, found {raw!r}.")
+        raise CfbError(f"{path}: knobs must be a mapping, found {told(raw)}.")
     refuse_unknown(raw, set(Knobs._fields), path, "knobs.")
     knobs = dict(raw)
     for change in changes:
         name, equals, text = change.partition("=")
         if not equals or name not in Knobs._fields:
             raise CfbError(f"--set {change}: write KNOB=VALUE, with one of {', '.join(Knobs._fields)}.")
-        knobs[name] = yaml.safe_load(text)
+        knobs[name] = parse_yaml(text, f"--set {change}")
     missing = [name for name in Knobs._fields if name not in knobs and name not in _OPTIONAL]
     if missing:
         raise CfbError(f"{path}: knobs.{missing[0]} is missing.")
@@ -79,7 +79,7 @@ def save_manoeuvre(manoeuvre: ManoeuvreFile, path: str | Path) -> None:
 
 def _number(value: Any, name: str, path: Path) -> float:
     if not isinstance(value, int | float) or isinstance(value, bool) or math.isnan(value):
-        raise CfbError(f"{path}: knobs.{name} must be a number, found {value!r}.")
+        raise CfbError(f"{path}: knobs.{name} must be a number, found {told(value)}.")
     if math.isinf(value) and name not in _OPTIONAL:
         raise CfbError(f"{path}: knobs.{name} must be finite.")
     if name in _NOT_NEGATIVE and value < 0:

@@ -14,7 +14,7 @@ from cfb_mjx import __version__
 from cfb_mjx.control.policy_file import PolicyFile
 from cfb_mjx.deploy.contract import BLIND_STEPS, LARGEST, contract
 from cfb_mjx.deploy.deployment import CATCH_S, Deployment
-from cfb_mjx.files import output_folder, plain, write_texts
+from cfb_mjx.files import output_folder, plain, remove, together, write_texts
 
 FIXED = ("cfb_network.h", "cfb_network.c", "cfb_pilot.h", "cfb_policy.h", "cfb_policy.c", "controller_out_of_tree.c")
 BUILD = ("Kbuild", "Makefile", "app-config", "README.md")
@@ -47,9 +47,10 @@ def export_policy(deployment: Deployment, folder: str | Path) -> Exported:
         CfbError: the folder cannot be made or written; what it held before is as it was.
     """
     folder = output_folder(folder)
-    write_texts(folder, sources(deployment))
-    # It was about what has just been overwritten.
-    (folder / RESULTS).unlink(missing_ok=True)
+    with together():
+        write_texts(folder, sources(deployment))
+        # It is about what is overwritten.
+        remove(folder / RESULTS)
     return Exported(folder, deployment)
 
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from cfb_mjx.documents import load_yaml, told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
 from cfb_mjx.logs.assembly import Import, assemble
@@ -31,7 +32,7 @@ from cfb_mjx.logs.ros_bag import (
     read_messages,
 )
 from cfb_mjx.logs.streams import RADIO_WRAP_MS, Stream, ordered, unwrap
-from cfb_mjx.logs.variables import FIELDS, VariableMap, load_mapping, read_yaml
+from cfb_mjx.logs.variables import FIELDS, VariableMap, load_mapping
 
 _TICK = 0.001  # s: the firmware's stamps are no finer, nor can another clock be brought closer to them
 _OVERTAKING = 0.1  # s by which messages may overtake each other on their way into the bag
@@ -126,14 +127,16 @@ def _robot(messages: list[BagMessage], robot: str | None, path: Path) -> str:
 
 def _custom_topics(path: Path, robot: str) -> dict[str, list[str]]:
     """Variable names per custom topic of the robot."""
-    document = read_yaml(path)
+    document = load_yaml(path)
     robots = _mapping(document.get("robots"), path, "robots")
     own = _mapping(robots.get(robot), path, f"robots.{robot}")
-    types = _mapping(document.get("robot_types"), path, "robot_types")
+    types, kind = _mapping(document.get("robot_types"), path, "robot_types"), own.get("type")
+    if not isinstance(kind, str | int | None):
+        raise CfbError(f"{path}: robots.{robot}.type must be a name, found {told(kind)}.")
     topics: dict[str, list[str]] = {}
     blocks = {
         "all": document.get("all"),
-        f"robot_types.{own.get('type')}": types.get(own.get("type")),
+        f"robot_types.{kind}": types.get(kind),
         f"robots.{robot}": own,
     }
     for where, block in blocks.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
@@ -21,7 +22,7 @@ _OPTIONS = {
 _MCAP_MAGIC = b"\x89MCAP"
 
 
-def read_log(path: str | os.PathLike, format: str | None = None, **options) -> FlightLog:
+def read_log(path: str | os.PathLike, format: str | None = None, **options: Any) -> FlightLog:
     """Read and validate a flight log.
 
     Args:

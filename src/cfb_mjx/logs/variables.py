@@ -13,6 +13,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+from cfb_mjx.documents import load_yaml, told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
 from cfb_mjx.logs.flight_log import OPTIONAL, REQUIRED
@@ -124,7 +125,7 @@ def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
         CfbError: missing file, broken YAML, unknown keys, fields or units, wrong number of variables.
     """
     path = shipped("configs", "logs", f"{DEFAULT}.yaml") if source is None else Path(source)
-    document = read_yaml(path)
+    document = load_yaml(path)
     _only(document, {"format", "name", "fields", "firmware", "observation_delay"}, path, "the file")
     if document.get("format") != FORMAT:
         raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
@@ -143,34 +144,13 @@ def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
     _only(firmware, set(_FIRMWARE_KEYS), path, "firmware")
     delay = document.get("observation_delay")
     if delay is not None and not (_is_number(delay) and 0.0 <= delay < 1.0):
-        raise CfbError(f"{path}: 'observation_delay' must be in seconds, from 0 to 1, or null; found {delay!r}.")
+        raise CfbError(f"{path}: 'observation_delay' must be in seconds, from 0 to 1, or null; found {told(delay)}.")
     return VariableMap(
         name=str(document.get("name", path.stem)),
         choices=choices,
         firmware={k: firmware.get(k) for k in _FIRMWARE_KEYS},
         observation_delay=None if delay is None else float(delay),
     )
-
-
-def read_yaml(path: str | os.PathLike) -> dict:
-    """Read a YAML file that holds a mapping.
-
-    Raises:
-        CfbError: the file is missing, unreadable, not YAML, or holds something else.
-    """
-    import yaml
-
-    try:
-        document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise CfbError(f"{path}: there is no such file; check the path.") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise CfbError(f"{path}: cannot be read as text ({error}).") from None
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise CfbError(f"{path}: is not valid YAML ({' '.join(str(error).split())}).") from None
-    if not isinstance(document, dict):
-        raise CfbError(f"{path}: must hold a YAML mapping, found {type(document).__name__}.")
-    return document
 
 
 def _choice(field: str, raw: dict, path: Path) -> Choice:
@@ -181,14 +161,16 @@ def _choice(field: str, raw: dict, path: Path) -> Choice:
         return Choice(())
     _only(raw, _CHOICE_KEYS, path, where)
     form = raw.get("form", "components") if field == "quaternion" else ""
-    if (field != "quaternion" and "form" in raw) or (form and form not in _FORM_WIDTH):
+    if (field != "quaternion" and "form" in raw) or form not in ("", *_FORM_WIDTH):
         raise CfbError(f"{path}: {where}: 'form' is for quaternions and one of {', '.join(_FORM_WIDTH)}.")
     frame = raw.get("frame", _FRAMES.get(field, ""))
     if frame not in (("world", "body") if field in _FRAMES else ("",)):
-        raise CfbError(f"{path}: {where}: 'frame' is for velocity and specific_force, world or body; found {frame!r}.")
+        raise CfbError(
+            f"{path}: {where}: 'frame' is for velocity and specific_force, world or body; found {told(frame)}."
+        )
     names, width = raw.get("variables"), _FORM_WIDTH.get(form) or _WIDTH.get(field, 3)
     if not isinstance(names, list) or len(names) != width or not all(isinstance(v, str) for v in names):
-        raise CfbError(f"{path}: {where}: 'variables' must list {width} name{'s' * (width > 1)}; found {names!r}.")
+        raise CfbError(f"{path}: {where}: 'variables' must list {width} name{'s' * (width > 1)}; found {told(names)}.")
     unit = str(raw.get("unit", "1" if "1" in UNITS[field] else ""))
     if unit not in UNITS[field] or (field == "quaternion" and (unit == "1") == (form == "euler")):
         raise CfbError(f"{path}: {where}: unit {unit!r} is not one of {', '.join(UNITS[field])} or does not fit.")
@@ -196,9 +178,9 @@ def _choice(field: str, raw: dict, path: Path) -> Choice:
         raise CfbError(f"{path}: {where}: a compressed quaternion has no 'sign'; leave it out.")
     sign, invalid = raw.get("sign", [1] * width), raw.get("invalid", [])
     if not isinstance(sign, list) or len(sign) != width or any(isinstance(s, bool) or s not in (1, -1) for s in sign):
-        raise CfbError(f"{path}: {where}: 'sign' must list {width} times 1 or -1; found {sign!r}.")
+        raise CfbError(f"{path}: {where}: 'sign' must list {width} times 1 or -1; found {told(sign)}.")
     if not isinstance(invalid, list) or not all(_is_number(v) for v in invalid):
-        raise CfbError(f"{path}: {where}: 'invalid' must be a list of numbers; found {invalid!r}.")
+        raise CfbError(f"{path}: {where}: 'invalid' must be a list of numbers; found {told(invalid)}.")
     factors = tuple(s * UNITS[field][unit] for s in sign)
     return Choice(tuple(names), unit, factors, frame, form, tuple(float(v) for v in invalid))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -149,10 +150,10 @@ def in_components(prepared: Prepared, state: State, commands: Array) -> Componen
 def in_chunks(
     function: Callable,
     size: int,
-    *arguments,
+    *arguments: Any,
     progress: Callable[[int, int], None] | None = None,
     over: Devices | None = None,
-):
+) -> Any:
     """``vmap(function)(*arguments)`` executed ``size`` examples at a time, results gathered in host memory.
 
     Let ``function`` draw what is large (parameters, commands) from a PRNG key and return what is small: then a million

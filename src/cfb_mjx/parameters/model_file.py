@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from cfb_mjx.documents import load_named, refuse_unknown, shipped_names
+from cfb_mjx.documents import is_named, load_named, refuse_unknown, shipped_names
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_text
 from cfb_mjx.parameters.parameters import DEFAULTS, SPECIFICATIONS, Parameters, current_names
@@ -118,10 +118,10 @@ def load_model_file(name_or_path: str | Path) -> ModelFile:
         if key not in entries:
             entries[key] = Entry(_value(key, DEFAULTS[key], path), "neutral value (not given in the file)")
     effects = document.get("effects") or []
-    if not isinstance(effects, list) or not all(isinstance(e, dict) and "name" in e for e in effects):
+    if not isinstance(effects, list) or not all(map(is_named, effects)):
         raise CfbError(f"{path}: 'effects' must be a list of mappings, each with a 'name'.")
     provenance = document.get("provenance") or {}
-    if not isinstance(provenance, dict):
+    if not isinstance(provenance, dict) or not all(isinstance(key, str) for key in provenance):
         raise CfbError(f"{path}: 'provenance' must be a mapping.")
     return ModelFile(
         name=str(document.get("name", path.stem)),

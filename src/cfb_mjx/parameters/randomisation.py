@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cfb_mjx.documents import load_named, refuse_unknown
+from cfb_mjx.documents import load_named, refuse_unknown, told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters.limits import concrete
 from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters, current_names
@@ -66,12 +66,12 @@ def _range(key: str, raw, path: Path) -> Range:
     refuse_unknown(raw, {"half_width", "unit", "shared", "source"}, path, f"ranges.{key}.")
     unit = SPECIFICATIONS[key].unit
     if raw.get("unit") not in ("relative", unit):
-        raise CfbError(f"{path}: ranges.{key}.unit must be 'relative' or '{unit}', found {raw.get('unit')!r}.")
+        raise CfbError(f"{path}: ranges.{key}.unit must be 'relative' or '{unit}', found {told(raw.get('unit'))}.")
     width = raw.get("half_width")
     widths = width if isinstance(width, list) else [width]
     size = SPECIFICATIONS[key].shape
     if not all(isinstance(w, int | float) and not isinstance(w, bool) and 0 <= w < float("inf") for w in widths):
-        raise CfbError(f"{path}: ranges.{key}.half_width = {width!r} must be zero or positive.")
+        raise CfbError(f"{path}: ranges.{key}.half_width = {told(width)} must be zero or positive.")
     if len(widths) not in (1, *size):
         raise CfbError(f"{path}: ranges.{key}.half_width must have 1 or {size[0] if size else 1} numbers.")
     relative = raw["unit"] == "relative"
@@ -79,10 +79,12 @@ def _range(key: str, raw, path: Path) -> Range:
     if not relative and (specification.limits.hard_low >= 0 or specification.together):
         raise CfbError(f"{path}: ranges.{key}.unit must be 'relative': a width in {unit} would allow the wrong sign.")
     if relative and max(widths) >= 1:
-        raise CfbError(f"{path}: ranges.{key}.half_width = {width!r} relative would allow values of the wrong sign.")
+        raise CfbError(
+            f"{path}: ranges.{key}.half_width = {told(width)} relative would allow values of the wrong sign."
+        )
     shared = raw.get("shared", False)
     if not isinstance(shared, bool):
-        raise CfbError(f"{path}: ranges.{key}.shared must be true or false, found {shared!r}.")
+        raise CfbError(f"{path}: ranges.{key}.shared must be true or false, found {told(shared)}.")
     return Range(tuple(float(w) for w in widths), relative, shared)
 
 

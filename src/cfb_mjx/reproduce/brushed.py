@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cfb_mjx.reproduce.flights import GENERATED, REAL_MASS_KG, SOURCE, generated, real_flights
+from cfb_mjx.reproduce.flights import GENERATED, REAL_MASS_KG, SOURCE, Given, generated, real_flights
 from cfb_mjx.reproduce.item import Result, Row, write_csv
 
 DRONES = {"brushless": "cfb-guards", "brushed": "cf2x"}
@@ -18,8 +18,8 @@ ABILITIES = {
 QUANTITIES = (("velocity", "mps", "m/s"), ("attitude", "deg", "deg"), ("rate", "radps", "rad/s"))
 
 
-def brushed(folder: Path, real: Path | None) -> Result:
-    """Thrust and agility of both, and how well each predicts flights of the brushless one."""
+def brushed(folder: Path, real: Path | None, given: Given | None = None) -> Result:
+    """Thrust and agility of both, how well each predicts flights of the brushless one, and the brushed one its own."""
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid import evaluate
@@ -37,6 +37,16 @@ def brushed(folder: Path, real: Path | None) -> Result:
         heavy = files | {"brushless": files["brushless"].with_values("weighed, with two decks", mass=REAL_MASS_KG)}
         flights["real"] = (real_logs, heavy)
         text.append(f"Real: {len(real_logs)} flights, {SOURCE}; the brushless model with the mass as weighed.")
+    if given is not None:
+        flights["brushed flights"] = (list(given.logs), {"brushed": given.drone(DRONES["brushed"])})
+        text.append(
+            f"Brushed: {given.said()}. This is the paper's comparison: the brushed model on flights of a brushed drone."
+        )
+    else:
+        text.append(
+            "The paper compares a brushed model on brushed flights. None are shipped: give a folder of them with "
+            "--flights, and the drone's weight with --mass. What stands here is a brushed model on brushless flights."
+        )
     errors: dict[tuple[str, str], dict] = {}
     for where, (logs, models) in flights.items():
         for name, file in models.items():
@@ -52,17 +62,18 @@ def brushed(folder: Path, real: Path | None) -> Result:
     for key, what in ABILITIES.items():
         ours = f"{able['brushless'][key]:.3g} and {able['brushed'][key]:.3g}"
         rows.append(Row(f"{what}, brushless and brushed", "", ours))
-    for where in flights:
+    for where, (_, models) in flights.items():
         for quantity, unit, label in QUANTITIES:
-            of = [errors[where, name][f"{quantity}_rmse_{unit}@0.2s"] for name in (*DRONES, "hold")]
-            what = f"{quantity} error after 200 ms, {label} ({where}): brushless, brushed, hold"
+            names = (*models, "hold")
+            of = [errors[where, name][f"{quantity}_rmse_{unit}@0.2s"] for name in names]
+            what = f"{quantity} error after 200 ms, {label} ({where}): {', '.join(names)}"
             rows.append(Row(what, "", ", ".join(f"{x:.3g}" for x in of)))
     write_csv(
         folder / "brushed.csv",
         ("flights", "model", "metric", "value"),
         [(*which, key, float(x)) for which, of in errors.items() for key, x in of.items()],
     )
-    _draw(files, errors, list(flights), folder / "brushed.png")
+    _draw(files, errors, {where: (*models, "hold") for where, (_, models) in flights.items()}, folder / "brushed.png")
     return Result("The brushed Crazyflie", text, rows, [(folder / "brushed.png", "thrust and prediction errors")])
 
 
@@ -80,7 +91,7 @@ def _abilities(p) -> dict[str, float]:
     }
 
 
-def _draw(files: dict, errors: dict, places: list[str], path: Path) -> None:
+def _draw(files: dict, errors: dict, places: dict[str, tuple[str, ...]], path: Path) -> None:
     from cfb_mjx.model.rotors import thrust
     from cfb_mjx.view.style import COLOURS, context, new_figure, save
 
@@ -91,10 +102,11 @@ def _draw(files: dict, errors: dict, places: list[str], path: Path) -> None:
         axes = figure.subplots(len(places), 4, squeeze=False)
         for row, where in zip(axes, places, strict=True):
             for axis, (quantity, unit, label) in zip(row[1:], QUANTITIES, strict=True):
-                for name, colour in colours.items():
+                for name in places[where]:
+                    colour = colours[name]
                     values = [errors[where, name][f"{quantity}_rmse_{unit}@{h:g}s"] for h in horizons]
                     axis.plot([1e3 * h for h in horizons], values, "o-", markersize=3, color=colour, label=name)
-                axis.set_title(f"{where} flights: {quantity}")
+                axis.set_title(f"{where.removesuffix(' flights')} flights: {quantity}")
                 axis.set_ylabel(f"RMS error, {label}")
                 axis.set_xlabel("horizon, ms")
                 axis.set_yscale("log")

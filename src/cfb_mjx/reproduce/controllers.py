@@ -105,7 +105,7 @@ def back_and_forth(folder: Path, real: Path | None) -> Result:
     slower = "to within 10 cm, median of 64 flights; ours flies faster"
     limit = "nothing in the reward asks to fly slower than the 10 m/s at which an episode ends"
     rows = [
-        Row("distance, m", "6", f"{STEP_DISTANCE_M:g}"),
+        Row("distance, m", "6", f"{STEP_DISTANCE_M:g}", kind="input"),
         Row("time, s", "2", f"{arrival:.2f}", slower),
         Row("largest speed, m/s", "about 5", f"{peak:.1f}", limit),
         Row("beyond the target, m", "", f"{float(np.median(step.overshoot_m)):.2f}"),

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
 from cfb_mjx.logs import FlightLog, read_log
+
+if TYPE_CHECKING:
+    from cfb_mjx.parameters import ModelFile
+
+NO_LOGS = (".md", ".txt", ".yaml", ".yml", ".json", ".png")
 
 REAL_MASS_KG = 0.045
 """The drone of the public flights carries an AI-deck and a flow deck."""
@@ -19,6 +27,41 @@ GENERATED = "a flight that comes with the project, made by another program (`dat
 def generated(name: str) -> FlightLog:
     """A flight log that is shipped."""
     return read_log(shipped("data", "flight_logs", f"{name}.mcap"))
+
+
+@dataclass(frozen=True)
+class Given:
+    """Flights that the user gives for an item."""
+
+    logs: tuple[FlightLog, ...]
+    mass: float | None = None
+    """Of the drone as it was weighed, kg; None: that of the model."""
+
+    @classmethod
+    def read(cls, folder: Path, mass: float | None) -> Given:
+        """All flight logs in a folder and the folders in it.
+
+        Raises:
+            CfbError: there are none, or one cannot be read.
+        """
+        if not folder.is_dir():
+            raise CfbError(f"{folder}: there is no such folder; --flights takes a folder of flight logs.")
+        paths = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.name[0] != "." and p.suffix not in NO_LOGS]
+        if not paths:
+            raise CfbError(f"{folder}: holds no flight logs.")
+        return cls(tuple(map(read_log, paths)), mass)
+
+    def drone(self, preset: str) -> ModelFile:
+        """A preset with the mass as weighed."""
+        from cfb_mjx.parameters import load_model_file
+
+        file = load_model_file(preset)
+        return file if self.mass is None else file.with_values("weighed", mass=self.mass)
+
+    def said(self) -> str:
+        """Which flights, and with which mass."""
+        mass = "the mass of the preset" if self.mass is None else f"a mass of {self.mass:g} kg, as weighed"
+        return f"{len(self.logs)} flights given with --flights ({', '.join(log.name for log in self.logs)}), {mass}"
 
 
 def real_flights(folder: Path | None) -> list[FlightLog]:

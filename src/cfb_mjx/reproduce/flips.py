@@ -59,7 +59,7 @@ def four_flips(folder: Path, real: Path | None) -> Result:
         figure.subplots_adjust(left=0.07, right=0.99, bottom=0.13, top=0.91, wspace=0.22)
         save(figure, folder / "flips.png")
     write_csv(folder / "flips.csv", ("flip", "time_s", "y_m", "z_m", "roll_deg", "roll_rate_dps", "phase"), numbers)
-    rows.insert(0, Row("shapes of single flips", "4", str(len(SHAPES))))
+    rows.insert(0, Row("shapes of single flips", "4", str(len(SHAPES)), kind="input"))
     text = [f"{SIMULATED} One policy, four settings of when it is switched and what it is asked for."]
     return Result("Single flips", text, rows, [(folder / "flips.png", "four single flips in the YZ plane")])
 

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from cfb_mjx.files import replacing
 
@@ -20,12 +21,15 @@ class Row:
         paper: what the paper states; empty where it does not state it.
         ours: what came out.
         why: how the two differ, and why.
+        kind: what ours is: a ``result``; an ``input``, a constant of the paper that files here repeat or that was put
+            into the data; or the model's prediction of its ``own`` flights, which says nothing of a drone.
     """
 
     what: str
     paper: str
     ours: str
     why: str = ""
+    kind: Literal["result", "input", "own"] = "result"
 
 
 @dataclass(frozen=True)
@@ -54,13 +58,15 @@ class Item:
     Attributes:
         about: one line for the help.
         make: draws into a folder; takes that folder and the folder of real flights (None: there is none).
+        given: whether it can be made with flights that the user gives; ``make`` then takes them as ``given``.
         x64: whether it is computed in double precision: identification is, flights of policies are not, for those were
             trained in single.
     """
 
     about: str
-    make: Callable[[Path, Path | None], Result]
+    make: Callable[..., Result]
     x64: bool
+    given: bool = False
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:

@@ -48,7 +48,8 @@ def motor_step(folder: Path, real: Path | None) -> Result:
     for name, fit in fits.items():
         for key, (what, paper) in PAPER.items():
             found = fit.common.estimates[key]
-            rows.append(Row(f"{what} ({name})", f"{paper:g}", with_std(found.value, found.std), _why(name, key)))
+            kind = "input" if name == "bench" else "result"
+            rows.append(Row(f"{what} ({name})", f"{paper:g}", with_std(found.value, found.std), _why(name, key), kind))
     if flights:
         offset = fits["real flights"].common.estimates.get("motor_speed_offset")
         if offset is not None:
@@ -121,7 +122,8 @@ def rotor_curves(folder: Path, real: Path | None) -> Result:
     for name, ((unit, scale), paper) in CUBICS.items():
         for power, value, ours, std in zip("321", paper, fitted[name].coefficients, fitted[name].std, strict=True):
             what = f"{name} cubic, (Omega/2900)^{power}, {unit} (bench)"
-            rows.append(Row(what, f"{value:g}", with_std(scale * ours, scale * std), "made with the paper's value"))
+            back = with_std(scale * ours, scale * std)
+            rows.append(Row(what, f"{value:g}", back, "made with the paper's value", "input"))
     speed = np.linspace(0.0, 2900.0, 117)
     curves = {}
     for preset, label in (("cfb-guards", "paper"), ("cf21b-500", "drone-models"), ("cf2x", "brushed")):

@@ -9,7 +9,7 @@ from glob import glob
 from pathlib import Path
 from typing import Any
 
-from cfb_mjx.documents import load_named, refuse_unknown
+from cfb_mjx.documents import load_named, refuse_unknown, told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.sweep.kinds import KINDS
 from cfb_mjx.sweep.parameters import Parameters
@@ -64,8 +64,8 @@ def load_sweep(name_or_path: str | Path, functions: Mapping[str, Callable], file
     path, raw = load_named(name_or_path, "sweep", FORMAT, FOLDER)
     refuse_unknown(raw, _KEYS, path, "")
     command = raw.get("command")
-    if command not in KINDS:
-        raise CfbError(f"{path}: 'command' must be one of {', '.join(KINDS)}, found {command!r}.")
+    if not isinstance(command, str) or command not in KINDS:
+        raise CfbError(f"{path}: 'command' must be one of {', '.join(KINDS)}, found {told(command)}.")
     parameters = Parameters.of(command, functions[command], KINDS[command])
     arguments = _flat(_mapping(raw, "arguments", path), parameters, f"{path}: arguments")
     if files:
@@ -74,7 +74,7 @@ def load_sweep(name_or_path: str | Path, functions: Mapping[str, Callable], file
     over = _flat(_mapping(raw, "over", path), parameters, f"{path}: over")
     for key, values in over.items():
         if not isinstance(values, list) or not values:
-            raise CfbError(f"{path}: over.{key} must be a list of values, found {values!r}.")
+            raise CfbError(f"{path}: over.{key} must be a list of values, found {told(values)}.")
     each = _each(raw.get("each"), parameters, path)
     if not over and not each:
         raise CfbError(f"{path}: nothing varies; list values under 'over', or cases under 'each'.")
@@ -92,7 +92,7 @@ def load_sweep(name_or_path: str | Path, functions: Mapping[str, Callable], file
 def _mapping(raw: Mapping, key: str, path: Path) -> dict:
     value = raw.get(key) or {}
     if not isinstance(value, dict):
-        raise CfbError(f"{path}: '{key}' must be a mapping, found {value!r}.")
+        raise CfbError(f"{path}: '{key}' must be a mapping, found {told(value)}.")
     return value
 
 
@@ -104,7 +104,7 @@ def _flat(mapping: Mapping, parameters: Parameters, where: str) -> dict[str, Any
         name = name.replace("-", "_")
         if not dot and parameters.shapes.get(name) == "pairs":
             if not isinstance(value, dict):
-                raise CfbError(f"{where}.{name} must be a mapping NAME: VALUE, found {value!r}.")
+                raise CfbError(f"{where}.{name} must be a mapping NAME: VALUE, found {told(value)}.")
             entries = {f"{name}.{key}": v for key, v in value.items()}
         else:
             entries = {f"{name}{dot}{rest}": value}
@@ -153,8 +153,8 @@ def _share(raw: Mapping, key: str, default: float, path: Path) -> float:
     least = "positive" if key == "cpus" else "zero or positive"
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number or not 0 <= value < math.inf or (key == "cpus" and value == 0):
-        raise CfbError(f"{path}: '{key}' must be a {least} number, found {value!r}.")
+        raise CfbError(f"{path}: '{key}' must be a {least} number, found {told(value)}.")
     # Ray shares a processor, not several and a half.
     if value > 1 and value != int(value):
-        raise CfbError(f"{path}: '{key}' above 1 must be a whole number, found {value!r}.")
+        raise CfbError(f"{path}: '{key}' above 1 must be a whole number, found {told(value)}.")
     return float(value)

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import yaml
 
+from cfb_mjx.documents import told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.sweep.kinds import CHOSEN_HERE, REPEATED, Kind
 
@@ -78,11 +79,11 @@ class Parameters:
         option = f"--{_dashed(name)}"
         if shape == "flag":
             if not isinstance(value, bool):
-                raise CfbError(f"{where} must be true or false, found {value!r}.")
+                raise CfbError(f"{where} must be true or false, found {told(value)}.")
             said = option if value else f"--no-{_dashed(name)}"
             return [] if value == self.defaults.get(name) else [said]
         if isinstance(value, list | dict) and shape not in ("files", "texts"):
-            raise CfbError(f"{where} takes one value, found {value!r}; what varies belongs under 'over' or 'each'.")
+            raise CfbError(f"{where} takes one value, found {told(value)}; what varies belongs under 'over' or 'each'.")
         return [option, *_texts(value, where)]
 
     def _changed(self, value: Any) -> str:
@@ -104,7 +105,7 @@ def text(value: Any) -> str:
 def _texts(value: Any, where: str) -> list[str]:
     values = value if isinstance(value, list) else [value]
     if not values or any(v is None or isinstance(v, list | dict) for v in values):
-        raise CfbError(f"{where} must be a value or a list of values, found {value!r}.")
+        raise CfbError(f"{where} must be a value or a list of values, found {told(value)}.")
     return [text(v) for v in values]
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from cfb_mjx.files import write_json, write_text
+from cfb_mjx.files import together, write_json, write_text
 from cfb_mjx.sweep.folder import Folder, read_record
 from cfb_mjx.sweep.kinds import KINDS
 from cfb_mjx.sweep.parameters import text
@@ -67,8 +67,9 @@ class Summary:
         # Read and written under one lock: of several drivers the last to write has seen what all of them landed.
         with self.folder.summing():
             rows = [self._row(task) for task in self.tasks]
-            write_json(self.folder.path / JSON, {"tasks": rows})
-            write_text(self.folder.path / CSV, _csv(rows))
+            with together():
+                write_json(self.folder.path / JSON, {"tasks": rows})
+                write_text(self.folder.path / CSV, _csv(rows))
         self._written = time.monotonic()
 
     def _row(self, task: Task) -> dict[str, Any]:

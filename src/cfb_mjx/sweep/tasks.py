@@ -11,6 +11,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from cfb_mjx.documents import told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.sweep.config import Sweep
 from cfb_mjx.sweep.kinds import EXTRA_FILES, Kind
@@ -137,7 +138,9 @@ def _checked(key: str, value: Any, parameters: Parameters, where: str) -> Any:
     """Files that are read must be there; patterns and folders become the files they stand for."""
     if key in EXTRA_FILES and value is not None:
         if not isinstance(value, str) or Path(value).name != value or value in _taken(parameters.kind):
-            raise CfbError(f"{where}: {key} must be the name of a file of its own, without a folder, found {value!r}.")
+            raise CfbError(
+                f"{where}: {key} must be the name of a file of its own, without a folder, found {told(value)}."
+            )
         return value
     shape = parameters.shapes.get(key)
     if shape == "files" and value is not None:

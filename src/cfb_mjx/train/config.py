@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
-from cfb_mjx.documents import load_named
+from cfb_mjx.documents import load_named, parse_yaml, require_seed, told
 from cfb_mjx.envs import FlipReward, FlipStarts, FlipTask, Layout, Noise, PaperReward, Setpoints, Starts, TargetTask
 from cfb_mjx.envs.flip import FLIP_LAYOUT
 from cfb_mjx.errors import CfbError
@@ -204,22 +201,24 @@ def config_from(mapping: dict[str, Any], where: str) -> TrainingConfig:
         CfbError: an unknown key or a value of the wrong type, named with ``where``.
     """
     task = mapping.get("task", "target")
-    if task not in _KINDS:
-        raise CfbError(f"{where}: task must be one of {', '.join(_KINDS)}, found {task!r}.")
+    if not isinstance(task, str) or task not in _KINDS:
+        raise CfbError(f"{where}: task must be one of {', '.join(_KINDS)}, found {told(task)}.")
     return build(_KINDS[task], mapping, where)
 
 
 def with_changes(config: TrainingConfig, **values: Any) -> TrainingConfig:
-    """A copy with some top-level settings replaced; None leaves one as it is."""
-    return replace(config, **{key: value for key, value in values.items() if value is not None})
+    """A copy with some top-level settings replaced; None leaves one as it is.
+
+    Raises:
+        CfbError: a seed out of range.
+    """
+    changed = replace(config, **{key: value for key, value in values.items() if value is not None})
+    require_seed(changed.seed, "--seed")
+    return changed
 
 
 def _change(document: dict, change: str) -> None:
     dotted, equals, text = change.partition("=")
-    try:
-        value = yaml.safe_load(text)
-    except yaml.YAMLError:
-        equals = ""
     if not equals or not dotted:
         raise CfbError(f"--set {change}: write KEY=VALUE, for instance randomisation.magnitude=0.5.")
     *path, last = dotted.split(".")
@@ -228,11 +227,7 @@ def _change(document: dict, change: str) -> None:
         inner = inner.setdefault(key, {})
         if not isinstance(inner, dict):
             raise CfbError(f"--set {change}: {key} is no group of settings.")
-    # YAML 1.1 reads 1e-3 as text.
-    if isinstance(value, str):
-        with suppress(ValueError):
-            value = float(value)
-    inner[last] = value
+    inner[last] = parse_yaml(text, f"--set {change}")
 
 
 _AT_LEAST = {
@@ -241,7 +236,6 @@ _AT_LEAST = {
     "observation.past_commands": 0,
     "observation.estimate_stride": 1,
     "randomisation.magnitude": 0,
-    "seed": 0,
     "analytic.drones": 1,
     "analytic.updates": 1,
     "ppo.drones": 1,
@@ -290,6 +284,7 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
     for key, least in _AT_LEAST.items():
         if _at(config, key) < least:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be at least {least}.")
+    require_seed(config.seed, f"{where}: seed =")
     for key in _POSITIVE + _POSITIVE_OF[config.task]:
         if not _at(config, key) > 0:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be positive.")
@@ -297,7 +292,7 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
         for key in _PAIRS:
             pair = _at(config, key)
             if len(pair) != 2 or pair[0] > pair[1]:
-                raise CfbError(f"{where}: {key} must be two numbers, the smaller first, found {list(pair)}.")
+                raise CfbError(f"{where}: {key} must be two numbers, the smaller first, found {told(list(pair))}.")
         if len(config.reward.axis_direction) != 3:
             raise CfbError(f"{where}: reward.axis_direction must be three numbers.")
     if len(config.observation.setpoint_scales) != (2 if config.task == "flip" else 0):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from cfb_mjx.documents import load_named
+from cfb_mjx.documents import is_named, load_named, refuse_unknown, told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters import ModelFile
@@ -21,11 +21,19 @@ def load_plants(base: ModelFile, name_or_path: str | Path = "off-nominal") -> di
     """
     path, document = load_named(name_or_path, "set of plants", FORMAT, "plants")
     plants = {}
-    for item in document.get("plants") or []:
-        if not isinstance(item, dict) or not isinstance(item.get("effects"), list) or "name" not in item:
-            raise CfbError(f"{path}: every plant needs a name and a list of effects, found {item!r}.")
-        where, effects = f"{path}: plant {item['name']}", (*base.effects, *item["effects"])
-        described = replace(base, name=str(item["name"]), effects=effects, path=where)
+    refuse_unknown(document, {"format", "name", "description", "plants"}, path, "")
+    listed = document.get("plants") or []
+    if not isinstance(listed, list):
+        raise CfbError(f"{path}: 'plants' must be a list, found {told(listed)}.")
+    for item in listed:
+        effects = item.get("effects") if isinstance(item, dict) else None
+        if not isinstance(effects, list) or not all(map(is_named, effects)) or "name" not in item:
+            raise CfbError(f"{path}: every plant needs a name and a list of effects, found {told(item)}.")
+        refuse_unknown(item, {"name", "why", "effects"}, path, "plants.")
+        if str(item["name"]) in plants:
+            raise CfbError(f"{path}: two plants are called {item['name']}; give each a name of its own.")
+        where = f"{path}: plant {item['name']}"
+        described = replace(base, name=str(item["name"]), effects=(*base.effects, *effects), path=where)
         plants[described.name] = Quadrotor.from_file(described)
     if not plants:
         raise CfbError(f"{path}: names no plants.")

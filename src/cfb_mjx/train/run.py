@@ -22,7 +22,7 @@ from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
 from cfb_mjx.devices import Devices
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import output_folder, write_text
+from cfb_mjx.files import output_folder, together, write_text
 from cfb_mjx.hosts import as_first, first, from_first
 from cfb_mjx.model.effects import KNOWN
 from cfb_mjx.model.effects.catalogue import outside, written
@@ -192,11 +192,12 @@ def train(
                 lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, algorithm.controller(whole)
             )
             row |= _judged(controller, training, task, nominal) if evaluate else {}
-            save_policy(training.policy(controller), output / POLICY)
-            write_text(output / CURVE, _csv([*rows, row]))
-            # Last: what it says is done must be on disk.
             about = {"updates": done, "seconds": seconds, "rows": [*rows, row]}
-            save_checkpoint(checkpoint, whole, training.identity() | about)
+            with together():
+                # The first is never missing: from it an interrupted training goes on.
+                save_checkpoint(checkpoint, whole, training.identity() | about)
+                save_policy(training.policy(controller), output / POLICY)
+                write_text(output / CURVE, _csv([*rows, row]))
             report(row)
         rows.append(row)
     return rows
@@ -215,7 +216,8 @@ def build(config: TrainingConfig, task, nominal: Quadrotor, over: Devices | None
 
 def segments(updates: int, count: int) -> list[int]:
     """After which updates checkpoints are written; the last is ``updates``."""
-    return sorted({round(updates * (i + 1) / count) for i in range(count)} - {0})
+    count = min(count, updates)
+    return sorted({round(updates * (i + 1) / count) for i in range(count)})
 
 
 def spread(state: Any, over: Devices) -> Any:

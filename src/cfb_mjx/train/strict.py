@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import math
+import sys
 import types
 import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
+from cfb_mjx.documents import LARGEST_INT, told
 from cfb_mjx.errors import CfbError
 
 T = TypeVar("T")
@@ -21,7 +22,7 @@ def build(kind: type[T], raw: Mapping[str, Any], where: str, prefix: str = "") -
         CfbError: an unknown key, or a value of the wrong type, named with ``where`` and its dotted path.
     """
     if not isinstance(raw, Mapping):
-        raise CfbError(f"{where}: {prefix.rstrip('.') or 'the file'} must be a mapping, found {raw!r}.")
+        raise CfbError(f"{where}: {prefix.rstrip('.') or 'the file'} must be a mapping, found {told(raw)}.")
     fields = {field.name: field for field in dataclasses.fields(kind)}
     unknown = [f"'{prefix}{key}'" for key in raw if key not in fields]
     if unknown:
@@ -52,15 +53,17 @@ def _value(kind: Any, raw: Any, where: str, key: str) -> Any:
         return tuple(_value(arguments[0], x, where, key) for x in raw)
     number = isinstance(raw, int | float) and not isinstance(raw, bool)
     if kind is float:
-        return float(_checked(number and math.isfinite(raw), raw, "a finite number", where, key))
+        # Compared, not math.isfinite: that overflows on a huge int.
+        finite = number and abs(raw) <= sys.float_info.max
+        return float(_checked(finite, raw, "a finite number", where, key))
     if kind is int:
         # 2e7 is a float to Python, and a count to whoever writes it.
-        whole = number and (isinstance(raw, int) or raw.is_integer())
-        return int(_checked(whole, raw, "a whole number", where, key))
+        whole = number and (isinstance(raw, int) or raw.is_integer()) and abs(raw) <= LARGEST_INT
+        return int(_checked(whole, raw, "a whole number of at most 64 bits", where, key))
     return _checked(isinstance(raw, kind), raw, {bool: "true or false", str: "text"}[kind], where, key)
 
 
 def _checked(holds: bool, raw: Any, wanted: str, where: str, key: str) -> Any:
     if not holds:
-        raise CfbError(f"{where}: {key} must be {wanted}, found {raw!r}.")
+        raise CfbError(f"{where}: {key} must be {wanted}, found {told(raw)}.")
     return raw

@@ -53,7 +53,11 @@ class Fit:
 
 def fitted(search: Search, hypothesis: Hypothesis, whole: bool = True) -> Fit:
     """Fit everything a hypothesis holds; derivatives by the catalogue only if ``whole``."""
-    hypothesis = search.settled(hypothesis)
+    return as_it_is(search, search.settled(hypothesis), whole)
+
+
+def as_it_is(search: Search, hypothesis: Hypothesis, whole: bool = True) -> Fit:
+    """A hypothesis that is fitted already, with what it leaves."""
     linear = search.whole(hypothesis) if whole else None
     evaluation = predicted(search, hypothesis)
     flights = [errors_of(one) for one in evaluation.each if len(one.logs[0].windows)]

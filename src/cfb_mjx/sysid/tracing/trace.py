@@ -12,12 +12,12 @@ from cfb_mjx.model.effects import KNOWN, Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.acceptance import CLEAR, LEAST_GAIN, material, significant, worth_it
-from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
+from cfb_mjx.sysid.tracing.checkpoint import Checkpoint, Progress
 from cfb_mjx.sysid.tracing.columns import SHIFT, Column
 from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.contenders import CLOSE, contenders
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
-from cfb_mjx.sysid.tracing.fits import ERRORS, Fit, completed, fitted
+from cfb_mjx.sysid.tracing.fits import ERRORS, Fit, as_it_is, completed, fitted
 from cfb_mjx.sysid.tracing.hypothesis import LEAD_SPREAD, Hypothesis, Linear
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
@@ -81,9 +81,9 @@ class LeftOut:
     """For the effect itself; None if its best value makes no sense."""
 
 
-def leave_out(search: Search, fit: Fit, name: str) -> LeftOut:
+def leave_out(search: Search, hypothesis: Hypothesis, name: str) -> LeftOut:
     """Fit without an effect and see what would come in its place."""
-    less = fitted(search, fit.hypothesis.without(name))
+    less = fitted(search, hypothesis.without(name))
     ranking = rank(search, less, set())
     return LeftOut(less, ranking, next((e for e, v in ranking if v[0].effect == name), None))
 
@@ -113,13 +113,19 @@ def trace(
     progress("replaying the declared model")
     nothing = fitted(search, search.learned(search.nothing()))
     saved = checkpoint.restore(nothing.hypothesis)
-    fit, refused, tried = nothing, set(), []
+    fit, refused, tried, vain = nothing, set(), [], 0
+    # Without which effects was a model fitted (None: it can be again), and which.
+    left_out: dict[str, LeftOut | None] = {}
+    judged = nothing.hypothesis
     if saved is not None:
-        hypothesis, refused, tried = saved
-        progress(f"going on with {', '.join(hypothesis.present) or 'no effect'} found before the interruption")
-        fit = fitted(search, hypothesis)
-    left_out: dict[str, LeftOut] = {}
-    vain = 0
+        progress(f"going on with {', '.join(saved.hypothesis.present) or 'no effect'} found before the interruption")
+        fit, judged = as_it_is(search, saved.hypothesis), saved.judged
+        refused, tried, vain, left_out = (
+            set(saved.refused),
+            list(saved.tried),
+            saved.vain,
+            dict.fromkeys(saved.left_out),
+        )
     while len(fit.hypothesis.present) < LARGEST and vain < PATIENCE:
         ranking = rank(search, fit, refused)
         tried.append({"present": list(fit.hypothesis.present), "ranking": [_line(v, e) for e, v in ranking[:8]]})
@@ -138,19 +144,19 @@ def trace(
                 fit, vain = completed(search, fit), 0
                 # What was too slight beside a large error may matter now.
                 refused = set()
-                left_out = seen
+                left_out, judged = seen, fit.hypothesis
                 break
             refused.add(name)
         else:
             vain += 1
-        checkpoint.save(fit.hypothesis, refused, tried)
+        checkpoint.save(Progress(fit.hypothesis, frozenset(refused), tuple(tried), vain, tuple(left_out), judged))
     if len(fit.hypothesis.present) > 1:
         single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
         fit, left_out = (completed(search, single), {}) if single is not None else (fit, left_out)
-    found = [
-        summary(search, fit, name, left_out.get(name) or leave_out(search, fit, name))
-        for name in fit.hypothesis.present
-    ]
+    found = []
+    for name in fit.hypothesis.present:
+        less = left_out.get(name) or leave_out(search, judged if name in left_out else fit.hypothesis, name)
+        found.append(summary(search, fit, name, less))
     found.sort(key=lambda f: -f.buys)
     return Trace(fit.hypothesis, sensors, found, tried, search, nothing.errors, fit.errors, fit)
 
@@ -194,7 +200,7 @@ def taken_in(
     if not worth_it(name, fit, richer, nothing, clear):
         return fit, None
     # Taken out again, for the newcomer's turn has also fitted the others anew, and that is not its merit.
-    less = leave_out(search, richer, name)
+    less = leave_out(search, richer.hypothesis, name)
     if not needed(search, less, richer, nothing):
         return less.fit, None
     kept, seen = re_examined(search, nothing, less.fit, richer, progress)
@@ -223,7 +229,7 @@ def re_examined(
     seen: dict[str, LeftOut] = {}
     for name in fit.hypothesis.present[:-1]:
         progress(f"looking at {name} again")
-        less = leave_out(search, fit, name)
+        less = leave_out(search, fit.hypothesis, name)
         if not needed(search, less, fit, nothing):
             if fit is richer and np.log(poorer.errors / less.fit.errors).sum() < 0:
                 return poorer, {}
