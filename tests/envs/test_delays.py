@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cfb_mjx.control.pilot import find_pilot, has_lumped_delay
-from cfb_mjx.envs import TargetTask, reset, step, with_room
+from cfb_mjx.envs import Starts, TargetTask, reset, step, with_room
 from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.envs.gym import TargetVectorEnv
 from cfb_mjx.errors import CfbError
@@ -38,43 +38,41 @@ def weightless(model: Quadrotor) -> Quadrotor:
     return eqx.tree_at(lambda m: m.parameters.gravity, model, jnp.asarray(0.0))
 
 
-@pytest.mark.parametrize("lumped", [True, False])
-def test_drawn_delays_are_flown_however_long_they_are(lumped):
-    """Drawn about 14 ms, up to 21 ms, and about 40 ms, up to 70 ms."""
+@pytest.mark.parametrize(("lumped", "pose"), [(True, 0.014), (False, 0.04)])
+def test_drawn_delays_are_flown_however_long_they_are(lumped, pose):
+    """Drawn about 14 ms, up to 21 ms, and about 40 ms, up to 60 ms."""
     ranges = (("pose_delay", Range((0.5,), True, False)), ("gyro_delay", Range((0.8,), True, False)))
     task = replace(TASK, randomisation=Randomisation("delays", ranges), lumped_delay=lumped)
+    drone = weightless(late(pose, 0.004))
 
     @jax.jit
     @jax.vmap
     def seen(key):
         episode = reset(task, drone, key, COASTING)
-        for _ in range(10):
-            episode, _ = step(task, episode, jnp.zeros(4))
+        episode, _ = jax.lax.scan(lambda e, _: (step(task, e, jnp.zeros(4))[0], None), episode, length=10)
         p = episode.model.parameters
         return episode.state.position[0] - episode.estimate.position[0], p.pose_delay, p.gyro_delay
 
-    for pose in (0.014, 0.04):
-        drone = weightless(late(pose, 0.004))
-        age, drawn, gyro = seen.__wrapped__(jax.random.split(jax.random.PRNGKey(0), 200))
-        np.testing.assert_allclose(age, drawn, atol=1e-9)
-        assert drawn.max() > 1.45 * pose
-        assert (gyro.min() < 0.0012) & (gyro.max() > 0.0068)
-        assert abs(np.corrcoef(drawn, gyro)[0, 1]) < 0.3
+    age, drawn, gyro = seen(jax.random.split(jax.random.PRNGKey(0), 200))
+    np.testing.assert_allclose(age, drawn, atol=1e-9)
+    assert drawn.max() > 1.45 * pose
+    assert gyro.min() < 0.0012
+    assert gyro.max() > 0.0068
+    assert abs(np.corrcoef(drawn, gyro)[0, 1]) < 0.3
 
 
 def test_an_environment_flies_the_delay_of_its_model():
-    env = TargetVectorEnv(4, TASK, late(0.030))
+    env = TargetVectorEnv(16, replace(TASK, starts=Starts(near=0.0)), late(0.030))
     _, info = env.reset(seed=0)
     true = [info["position"]]
     for _ in range(8):
-        seen, *_, info = env.step(np.zeros((4, 4)))
+        seen, *_, info = env.step(np.zeros((16, 4)))
         true.append(info["position"])
     # 30 ms are three steps of control and three quarters.
     between = 0.25 * true[-4] + 0.75 * true[-5]
     moved = np.abs(true[-1] - true[-5]).max(axis=1)
     shown = seen[:, :3]
-    far = np.linalg.norm(between, axis=1) > TASK.layout.position_limit_m
-    assert not far.any()
+    assert np.linalg.norm(between, axis=1).max() < TASK.layout.position_limit_m
     assert np.abs(shown - between).max() < 0.002
     assert moved.max() > 0.05
 
@@ -82,7 +80,7 @@ def test_an_environment_flies_the_delay_of_its_model():
 def test_the_gyro_is_as_late_as_the_pose_or_by_a_delay_of_its_own():
     start = eqx.tree_at(lambda s: s.body_rate, DRONE.hover_state(), jnp.array([3.0, -2.0, 1.0]))
     commands = jnp.asarray(np.random.default_rng(0).uniform(0.3, 0.8, (8, 4)))
-    for lumped, gyro, ago in ((True, 0.0, 3), (True, 0.016, 3), (False, 0.0, 0), (False, 0.016, 2)):
+    for lumped, gyro, ago in ((True, 0.016, 3), (False, 0.0, 0), (False, 0.016, 2)):
         task, drone = replace(TASK, lumped_delay=lumped), late(0.024, gyro)
         path = [reset(task, drone, jax.random.PRNGKey(0), start)]
         one = eqx.filter_jit(lambda e, u, t=task: step(t, e, u)[0])

@@ -72,7 +72,7 @@ def three():
     return TargetVectorEnv(3, replace(SHORT, randomisation=load_randomisation("paper")))
 
 
-def test_a_step_before_a_reset_is_refused(one):
+def test_a_step_before_a_reset_is_refused():
     with pytest.raises(CfbError, match="call reset"):
         TargetVectorEnv(1, SHORT).step(np.zeros((1, 4)))
     with pytest.raises(ResetNeeded, match="call reset"):
@@ -127,14 +127,14 @@ def test_what_the_controller_does_not_see_is_in_the_info(three):
     *_, info = three.step(np.full((3, 4), 0.1))
     # The truth of what ended, and of what has begun.
     np.testing.assert_array_equal(info["final_info"]["parameters"]["mass"], mass)
-    np.testing.assert_allclose(info["final_info"]["position"], 2 * places[-1] - places[-2], atol=2e-3)
+    np.testing.assert_allclose(info["final_info"]["position"], 2 * places[-1] - places[-2], atol=4e-3)
     assert not np.any(info["parameters"]["mass"] == mass)
     assert "failure" not in info["final_info"]
 
 
-def test_a_drone_that_fails_says_why(one):
+def test_a_drone_that_fails_says_why():
     drone = Quadrotor.from_file("cfb-guards")
-    fast = replace(SHORT, starts=Starts(near=0.0, speed_mps=300.0))
+    fast = replace(SHORT, starts=Starts(near=0.0, speed_mps=1e5))
     failing = TargetEnv(fast, drone)
     failing.reset(seed=3)
     _, reward, failed, _, info = failing.step(np.zeros(4))

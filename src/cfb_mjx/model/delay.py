@@ -14,7 +14,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model.state import State
 
 _SLACK = 1e-3
-"""Of a sample: delays and steps are rounded to float32."""
+"""Of a sample: delays and steps are rounded to float32, and 0.008 / 0.004 must not become 3 samples for that."""
 
 
 class DelayLine(eqx.Module):
@@ -32,8 +32,7 @@ class DelayLine(eqx.Module):
             dt: time between pushes, s.
             longest_delay: the longest delay that will be asked for, s (static; it sets the size).
         """
-        # The small slack keeps 0.008 / 0.004 from becoming 3 samples through rounding.
-        count = math.ceil(longest_delay / dt - 1e-9) + 1
+        count = math.ceil(longest_delay / dt - _SLACK) + 1
         return cls(jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[None], count, axis=0), sample), dt)
 
     def push(self, sample: PyTree) -> DelayLine:
