@@ -128,19 +128,16 @@ def _require_possible(model: Quadrotor, described: ModelFile, where: str) -> Non
     for name, specification in SPECIFICATIONS.items():
         specification.check(getattr(changed, name), f"{where}: with its effects, parameters.{name}", together=False)
     if bodies and not physical_inertia(changed.inertia):
-        said = (
-            f"{where}: with its effects, parameters.inertia = {changed.inertia.tolist()} is that of no rigid body: one"
-        )
-        said += " moment is larger than the sum of the other two"
+        moments = ", ".join(f"{x:.3g}" for x in changed.inertia.tolist())
+        said = f"{where}: with its effects, parameters.inertia = [{moments}] kg m^2 is that of no rigid body"
+        said += " (one moment is larger than the sum of the other two)"
         if not any("uncertainty" in item for item in described.effects if item.get("name") == Inertia.name):
             raise CfbError(f"{said}.")
-        warnings.warn(f"{said} (a fit may err so far).", CfbWarning, stacklevel=3)
+        warnings.warn(f"{said}; a fit may err so far.", CfbWarning, stacklevel=3)
     speed = changed.motor_gain + changed.motor_speed_offset
     lift, weight = float(jnp.sum(rotors.thrust(changed, speed))), float(changed.mass * changed.gravity)
     if lift < weight:
-        said = (
-            f"{where}: the drone cannot hover: it weighs {weight:.3g} N, its rotors lift {lift:.3g} N at full command"
-        )
+        said = f"{where}: the drone cannot hover: it weighs {weight:.3g} N, its rotors lift {lift:.3g} N at most"
         warnings.warn(f"{said}; check mass and thrust.", CfbWarning, stacklevel=3)
 
 

@@ -46,7 +46,7 @@ class ModelFile:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     kind: str = "plant"
     path: str = field(default="", compare=False)
-    """The file it was read from, for messages."""
+    """The file or preset it was read from, for messages."""
 
     def require_plant(self, purpose: str, how: str) -> None:
         """Refuse a predictor where the drone itself is needed.
@@ -130,7 +130,7 @@ def load_model_file(name_or_path: str | Path) -> ModelFile:
         effects=tuple(effects),
         provenance=provenance,
         kind=kind,
-        path=str(path),
+        path=str(name_or_path),
     )
 
 
