@@ -48,6 +48,7 @@ def written(*parts: str) -> dict:
     return load_yaml(shipped("configs", *parts))
 
 
+DRAG = [{"name": "rotor_drag", "parameters": {"coefficient": 0.01}, "source": "a test"}]
 PLANTS = written("plants", "off-nominal.yaml")
 READERS = {
     "training": (TrainingConfig().to_mapping(), load_config),
@@ -55,7 +56,7 @@ READERS = {
     "sweep": (SWEEP, lambda path: tasks_of(load_sweep(path, COMMANDS))),
     "manoeuvre": (written("manoeuvres", "double-flip.yaml"), load_manoeuvre),
     "randomisation": (written("randomisation", "paper.yaml"), load_randomisation),
-    "model": (written("parameters", "cfb-idsia.yaml"), Quadrotor.from_file),
+    "model": (written("parameters", "cfb.yaml") | {"effects": DRAG}, Quadrotor.from_file),
     "plants": (PLANTS | {"plants": PLANTS["plants"][:3]}, lambda path: load_plants(load_model_file("cfb"), path)),
     "variables": (written("logs", "crazyflie.yaml"), load_mapping),
     "topics": (TOPICS, lambda path: _custom_topics(path, "cf1")),

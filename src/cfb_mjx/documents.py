@@ -60,7 +60,7 @@ def load_yaml(path: str | Path) -> dict:
     try:
         text = Path(path).read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise CfbError(f"{path}: no such file.") from None
+        raise CfbError(f"{path}: there is no such file; check the path.") from None
     except (OSError, UnicodeDecodeError) as error:
         raise CfbError(f"{path}: cannot be read as text ({error}).") from None
     document = parse_yaml(text, str(path))
@@ -77,7 +77,7 @@ def parse_yaml(text: str, where: str) -> Any:
     """
     try:
         document = yaml.load(text, Loader=_StrictLoader)
-        _require_plain(document, (), set())
+        _require_plain(document, (), (), set())
     # PyYAML lets through whatever its parts raise: !!bool x a KeyError, a thirteenth month a ValueError, and so on.
     except Exception as error:
         said = "nested too deeply" if isinstance(error, RecursionError) else "a value that does not fit its tag"
@@ -108,14 +108,18 @@ def is_named(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(k, str) for k in value) and isinstance(value.get("name"), str)
 
 
-def _require_plain(value: Any, within: tuple[int, ...], known: set[int]) -> None:
+def _require_plain(value: Any, at: tuple[str, ...], within: tuple[int, ...], known: set[int]) -> None:
+    where = f"{'.'.join(at)} is " if at else ""
     if isinstance(value, int) and abs(value) > LARGEST_INT:
-        raise yaml.YAMLError("a whole number of more than 64 bits; write it with a decimal point")
+        raise yaml.YAMLError(f"{where}a whole number of more than 64 bits; write it with a decimal point")
     if isinstance(value, dict | list | tuple | set) and id(value) not in known:
         if id(value) in within:
-            raise yaml.YAMLError("something that contains itself")
-        for part in (*value, *value.values()) if isinstance(value, dict) else value:
-            _require_plain(part, (*within, id(value)), known)
+            raise yaml.YAMLError(f"{where}something that contains itself")
+        if isinstance(value, dict):
+            for key in value:
+                _require_plain(key, at, within, known)
+        for key, part in value.items() if isinstance(value, dict) else enumerate(value):
+            _require_plain(part, (*at, str(key)), (*within, id(value)), known)
         # What anchors repeat is looked at once.
         known.add(id(value))
 
