@@ -113,8 +113,8 @@ def fit_map(
         per_motor: a factor for each motor on the common curve.
         sigma: reference rotor speed, rad/s.
         name: for messages.
-        tared: the scale is known to read zero at rest. Otherwise an offset is fitted where the points show one by `TARE`
-            standard deviations; where they do not, what it might be is in the covariance.
+        tared: the scale is known to read zero at rest. Otherwise an offset is fitted where the points show one by
+            `TARE` standard deviations; where they do not, what it might be is in the covariance.
 
     Raises:
         CfbError: too few points or too few different speeds for a cubic.
