@@ -18,7 +18,7 @@ def points(rng, noise, count=60, coefficients=PAPER_THRUST):
 
 def test_coefficients_and_covariance_are_the_closed_form():
     speed, value = points(np.random.default_rng(0), 0.002)
-    found = fit_map(speed, value)
+    found = fit_map(speed, value, tared=True)
     # y / s is a plain quadratic with weights s: NumPy's own fit of it.
     s = speed / 2900
     expected, covariance = np.polyfit(s, value / s, 2, w=s, cov=True)
@@ -36,7 +36,7 @@ def test_given_noise_weighs_the_points():
     value = value + std * rng.normal(size=len(speed))
     s = speed / 2900
     expected, covariance = np.polyfit(s, value / s, 2, w=s / std, cov="unscaled")
-    found = fit_map(speed, value, std=std)
+    found = fit_map(speed, value, std=std, tared=True)
     np.testing.assert_allclose(found.coefficients, expected, rtol=1e-8)
     np.testing.assert_allclose(found.covariance, covariance, rtol=1e-7)
 
@@ -60,7 +60,7 @@ def test_intervals_of_both_estimators_cover():
     for seed in range(150):
         speed, value = points(np.random.default_rng(seed), 0.002, count=40)
         for robust in scores:
-            found = fit_map(speed, value, robust=robust)
+            found = fit_map(speed, value, robust=robust, tared=True)
             scores[robust].append((found.coefficients - PAPER_THRUST) / found.std)
     for values in scores.values():
         assert np.all(np.abs(np.std(values, axis=0) - 1) < 0.25)
@@ -121,6 +121,15 @@ def test_a_scale_that_was_not_tared_is_seen_and_kept_out_of_the_curve():
     assert np.abs(found.residual).max() < 0.01
     tared = fit_map(speed, value)
     assert (tared.offset, tared.offset_std) == (0.0, 0.0)
+
+
+def test_an_offset_too_small_to_be_told_is_in_the_error_bars():
+    scores = []
+    for seed in range(40):
+        speed, value = points(np.random.default_rng(seed), 0.002)
+        found = fit_map(speed, value + 0.003)
+        scores.append((found.coefficients - PAPER_THRUST) / found.std)
+    assert np.mean(np.abs(scores) < 1.96) > 0.88
 
 
 def test_an_offset_is_common_to_motors_that_differ():

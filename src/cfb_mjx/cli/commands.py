@@ -177,6 +177,7 @@ def fit_rotors(
     robust: bool = False,
     json: File = None,
     figure: File = None,
+    tared: bool = False,
 ) -> None:
     """Fit motors and rotor maps on their own, from flights with rotor speed and from bench tables.
 
@@ -195,13 +196,14 @@ def fit_rotors(
         robust: weigh outliers among the bench points of force and torque down.
         json: write the results here.
         figure: draw fits and residuals here (.png, .svg, .pdf).
+        tared: the scale read zero at rest, so that no offset of its readings is tried and none is in the error bars.
     """
     if not files:
         raise CfbError("fit-rotors needs at least one file; see 'cfb fit-rotors --help'.")
     from cfb_mjx.cli.rotor_fitting import run_fit_rotors
 
     run_fit_rotors(
-        list(files), output, model, flat(set), offset, asymmetric, dead_time, per_motor, robust, json, figure
+        list(files), output, model, flat(set), offset, asymmetric, dead_time, per_motor, robust, json, figure, tared
     )
 
 

@@ -41,6 +41,7 @@ def run_fit_rotors(
     robust: bool = False,
     json: Path | None = None,
     figure: Path | None = None,
+    tared: bool = False,
 ) -> None:
     """Fit what the files hold, print a table, write the model.
 
@@ -65,7 +66,7 @@ def run_fit_rotors(
         motors = fit_motors(
             records, base.parameters(), **extras, per_motor=per_motor, progress=Progress("fitting motors")
         )
-    maps = _fit_maps(tables, base, per_motor, robust)
+    maps = _fit_maps(tables, base, per_motor, robust, tared)
     corrected, written = _corrected(base, motors, maps, output, paths)
     if not written:
         reasons = "; ".join(motors.common.unidentifiable.values()) if motors else ""
@@ -109,7 +110,7 @@ def _bench(path: Path) -> MotorRecord | MapTable | None:
     return from_columns(table, path) if recognises(table) else None
 
 
-def _fit_maps(tables: list[MapTable], base: ModelFile, per_motor: bool, robust: bool) -> dict[str, MapFit]:
+def _fit_maps(tables: list[MapTable], base: ModelFile, per_motor: bool, robust: bool, tared: bool) -> dict[str, MapFit]:
     from cfb_mjx.sysid.rotors.rotor_maps import fit_map
 
     found = {}
@@ -129,6 +130,7 @@ def _fit_maps(tables: list[MapTable], base: ModelFile, per_motor: bool, robust: 
             per_motor=per_motor,
             sigma=float(base.entries["reference_rotor_speed"].value),
             name=f"{label} ({name})",
+            tared=tared,
         )
     return found
 

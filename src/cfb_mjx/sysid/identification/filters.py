@@ -36,6 +36,8 @@ class Unlogged(NamedTuple):
     """Body rate per error, over an interval at whose start it was there."""
     force: Float[Array, ""]
     """Specific force along z per error, m/s^2 per rad/s."""
+    start: Float[Array, ""]
+    """Variance of the error at the first row, where no command before tells the rotor speeds."""
 
 
 def rate_innovations(
@@ -70,7 +72,7 @@ def rate_innovations(
         return (w, a, o, pww, pwa, pwo, paa, pao, poo), (e, s)
 
     zero = jnp.zeros(3)
-    start = (piece.body_rate[0], zero, zero, r, zero, zero, d, zero, zero)
+    start = (piece.body_rate[0], zero, zero, r, zero, zero, d, zero, zero + unlogged.start)
     rows = (piece.interval[1:], torque, piece.body_rate[1:], *unlogged[:4])
     _, (error, variance) = jax.lax.scan(row, start, rows)
     return error, variance
@@ -106,7 +108,7 @@ def force_innovations(
     before = jnp.concatenate([force[:1], force[:-1]])
     inputs = (piece.interval[1:], before, force, piece.specific_force[1:, 2], unlogged.variance, unlogged.decay)
     zero = jnp.zeros(())
-    _, (error, variance) = jax.lax.scan(row, (force[0], zero, zero, d, zero, zero), inputs)
+    _, (error, variance) = jax.lax.scan(row, (force[0], zero, zero, d, zero, unlogged.start), inputs)
     return error[:, None], variance[:, None]
 
 

@@ -38,6 +38,9 @@ from cfb_mjx.sysid.identification.robust import surprise
 
 CHANNELS = ("rate_x", "rate_y", "rate_z", "specific_force_z", "rotor_1", "rotor_2", "rotor_3", "rotor_4")
 
+START = 0.1
+"""Std of a rotor's speed at the first row of a segment about its steady speed then, as a share of the motor gain."""
+
 
 class Drive(eqx.Module):
     """What the rotors do to the body, row by row."""
@@ -132,6 +135,7 @@ def _loads(parameters, dt, start, end, body_rate):
 
 
 def _unlogged(parameters: Parameters, noise: Noise, piece: Segments, use_measured: bool) -> Unlogged:
+    """Rotor errors that the filters must allow for: of the first row, and of commands that were not logged."""
     interval, lag = piece.interval[1:], jnp.mean(parameters.motor_time_constant)
     decay = jnp.exp(-interval / lag)
     counts = 1.0 - piece.measured * use_measured
@@ -150,6 +154,7 @@ def _unlogged(parameters: Parameters, noise: Noise, piece: Segments, use_measure
         jump=kick + 0.5 * pull * interval[:, None],
         later=pull * lag * (1 - decay)[:, None],
         force=lift / parameters.mass,
+        start=counts * 4 * (START * jnp.mean(parameters.motor_gain)) ** 2,
     )
 
 

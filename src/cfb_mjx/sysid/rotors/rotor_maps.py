@@ -100,6 +100,7 @@ def fit_map(
     per_motor: bool = False,
     sigma: float = SIGMA,
     name: str = "map",
+    tared: bool = False,
 ) -> MapFit:
     """Fit thrust [N] or torque [N m] against rotor speed [rad/s].
 
@@ -112,6 +113,8 @@ def fit_map(
         per_motor: a factor for each motor on the common curve.
         sigma: reference rotor speed, rad/s.
         name: for messages.
+        tared: the scale is known to read zero at rest. Otherwise an offset is fitted where the points show one by
+            `TARE` standard deviations; where they do not, what it might be is in the covariance.
 
     Raises:
         CfbError: too few points or too few different speeds for a cubic.
@@ -125,7 +128,8 @@ def fit_map(
     unit = np.ones(len(speed)) if given is None else given
     weight, noise = np.ones(len(speed)), unit
     member = np.array([motor == m for m in motors], float).T if motors else np.zeros((len(speed), 0))
-    shared = _levels(speed) >= _TARE_LEVELS and len(speed) > FEWEST_POINTS + len(motors)
+    shared = not tared and _levels(speed) >= _TARE_LEVELS and len(speed) > FEWEST_POINTS + len(motors)
+    untold = None
     while True:
         weight, noise = np.ones(len(speed)), unit
         design = np.concatenate([powers(speed, sigma), np.ones((len(speed), int(shared)))], axis=1)
@@ -144,7 +148,11 @@ def fit_map(
         covariance = _covariance(design, member, theta, scale, residual, noise, robust)
         if not shared or abs(theta[3]) > TARE * np.sqrt(covariance[3, 3]):
             break
-        shared = False
+        # An offset too small to be told still moves the curve: by as much as the one found, or one of its deviations.
+        shared, untold = False, (theta[:3], max(1.0, float(np.sqrt(covariance[3, 3]) / max(abs(theta[3]), 1e-300))))
+    if untold is not None:
+        moved = untold[1] * (untold[0] - theta[:3])
+        covariance[:3, :3] += np.outer(moved, moved)
     spread = covariance[design.shape[1] :, design.shape[1] :]
     return MapFit(
         coefficients=theta[:3],
