@@ -36,6 +36,8 @@ class GroundEffect(Effect):
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"strength": (0.0, 0.3), "height": (0.02, 0.3)}
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
+    # Of the thrust that the flow through the rotors leaves.
+    rank: ClassVar[int] = 1
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"height": 0.05}, {"height": 0.12}, {"height": 0.25})
 
     strength: Float[Array, "*batch"] = eqx.field(converter=number)

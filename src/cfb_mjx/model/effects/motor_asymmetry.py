@@ -35,6 +35,8 @@ class MotorAsymmetry(Effect):
         "width": (5.0, 200.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("spin_up", "spin_down")
+    # By the target the windings leave.
+    rank: ClassVar[int] = 2
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"width": 15.0}, {"width": 60.0})
 
     spin_up: Float[Array, "*batch"] = eqx.field(converter=number)

@@ -30,6 +30,8 @@ class MotorSecondOrder(Effect):
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {"lag": (0.0, 0.03)}
     strengths: ClassVar[tuple[str, ...]] = ("lag",)
+    # Of the speed that battery and warmth leave.
+    rank: ClassVar[int] = 1
 
     lag: Float[Array, "*batch"] = eqx.field(converter=number)
     """Of the additional first-order lag; zero or positive."""
