@@ -17,10 +17,23 @@ from scipy.integrate import solve_ivp
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import CATALOGUE, Effect, ParasiticDrag, Quadrotor, State, begin, rollout, specific_force, step
-from cfb_mjx.model.effects import Reading, RegressionDilution, ResidualFormula, effect_from_mapping, effect_to_mapping
+from cfb_mjx.model.effects import (
+    PayloadSwing,
+    Reading,
+    RegressionDilution,
+    ResidualFormula,
+    RotorDrag,
+    effect_from_mapping,
+    effect_to_mapping,
+    overrides,
+)
 from cfb_mjx.model.effects.formula import TERMS
+from cfb_mjx.model.quadrotor import advance, prepare, remembering
+from cfb_mjx.model.state import unstack
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters import load_model_file
 
+AIR_ONLY, DRAG = ("gust", "jet"), 0.03
 STEP = 1e-5
 """Of the difference quotients, as a share of the prior's width."""
 INSIDE = (0.7, 0.4, 0.6, 0.8)
@@ -40,12 +53,20 @@ def _at(name: str, place: tuple[float, ...]) -> Effect:
     for key, (low, high) in kind.prior.items():
         shape = getattr(kind.neutral(), key).shape
         values[key] = low + (high - low) * np.resize(place, shape)
+    if name == "jet":
+        # Towards where the drones fly, or they would not feel it.
+        values["origin"] = [-0.5, -0.2, 0.9] + 0.05 * values["origin"]
+        values["direction"] = [1.0, 0.3, 0.1] + 0.1 * values["direction"]
     return kind(**values)
 
 
 def _direction(name: str) -> Effect:
     """Over every prior's width, components unlike each other."""
-    return jax.tree.map(lambda b, a: b - a, _at(name, (1.0, 0.4, 0.8, 0.6)), _at(name, (0.0,)))
+    there, here = _at(name, (1.0, 0.4, 0.8, 0.6)), _at(name, (0.0,))
+    if name == "gust":
+        # No quantity: waves by the dozen turn as it grows.
+        there = replace(there, seed=here.seed)
+    return jax.tree.map(lambda b, a: b - a, there, here)
 
 
 def _moved(effect: Effect, by: Effect, share: float) -> Effect:
@@ -117,8 +138,13 @@ def manoeuvre():
 
 
 def _alone(effect: Effect) -> tuple[Effect, ...]:
-    """Every effect of the catalogue, all but this one neutral: whatever the effect, the same program flies it."""
-    return tuple(effect if type(other) is type(effect) else other for other in _neutrals())
+    """Every effect of the catalogue, all but this one neutral: whatever the effect, the same program flies it.
+
+    Beside what does nothing but move the air there is a drag to feel it.
+    """
+    drag = RotorDrag(DRAG) if effect.name in AIR_ONLY else RotorDrag.neutral()
+    given = {type(drag): drag, type(effect): effect}
+    return tuple(given.get(type(other), other) for other in _neutrals())
 
 
 @functools.cache
@@ -132,8 +158,9 @@ def studied(guards, manoeuvre):
     there and back; then every probe with no strength."""
     effects, directions, rows = [], [], {}
     for name, kind in CATALOGUE.items():
-        direction, neutral = _direction(name), kind.neutral()
-        inside = _at(name, INSIDE)
+        direction, inside = _direction(name), _at(name, INSIDE)
+        # No drone is in a jet by chance.
+        neutral = replace(inside, speed=jnp.zeros(())) if name == "jet" else kind.neutral()
         mine = [neutral, _moved(neutral, direction, STEP), inside]
         mine += [_moved(inside, direction, STEP), _moved(inside, direction, -STEP)]
         mine += [dataclasses.replace(neutral, **probe) for probe in kind.probes]
@@ -149,20 +176,19 @@ def studied(guards, manoeuvre):
 
 @pytest.fixture(scope="module")
 def without(guards, manoeuvre, fly_fleet):
-    """The same flight without effects, by integrator."""
-    return {
-        integrator: helpers.pack(fly_fleet(_one(Quadrotor(guards, integrator=integrator)), *manoeuvre))[0]
-        for integrator in ("leapfrog", "rk4")
-    }
+    """The same flight without effects, by integrator, and with a drag alone."""
+    models = {integrator: Quadrotor(guards, integrator=integrator) for integrator in ("leapfrog", "rk4")}
+    models["drag"] = Quadrotor(guards, (RotorDrag(DRAG),))
+    return {name: helpers.pack(fly_fleet(_one(model), *manoeuvre))[0] for name, model in models.items()}
 
 
 @ONE_WORKER
 @pytest.mark.parametrize("name", sorted(CATALOGUE))
 def test_neutral_effects_change_nothing(name, studied, without):
-    flown = helpers.pack(studied[name][0])
+    flown, plain = helpers.pack(studied[name][0]), without["drag" if name in AIR_ONLY else "leapfrog"]
     for row in (0, *range(5, len(flown))):
-        np.testing.assert_allclose(flown[row], without["leapfrog"], rtol=1e-12, atol=1e-12)
-    assert np.abs(flown[2] - without["leapfrog"]).max() > 1e-6, "the test would not see it"
+        np.testing.assert_allclose(flown[row], plain, rtol=1e-12, atol=1e-12)
+    assert np.abs(flown[2] - plain).max() > 1e-6, "the test would not see it"
 
 
 @ONE_WORKER
@@ -194,6 +220,92 @@ def test_a_batched_rollout_is_every_effect_stepped(name, studied, guards, manoeu
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9), alone, batched)
 
 
+def _flown(parameters, effects) -> np.ndarray:
+    """Three long steps without compiling: each effect beside others makes another program."""
+    y, commands = helpers.aggressive_manoeuvre(0.1)
+    model = Quadrotor(parameters, effects, dt=0.01)
+    prepared = prepare(model)
+    at = unstack(begin(model, helpers.state_of(y)), prepared.parameters.center_of_gravity)
+    for command in commands[::8][:3]:
+        at = advance(prepared, at, Vec.unstack(jnp.asarray(command)))
+    return np.asarray(jax.tree.leaves(remembering(at, ())))
+
+
+@pytest.fixture(scope="module")
+def strong() -> dict[str, Effect]:
+    """Every effect there is, strong."""
+    formula = np.random.default_rng(0).uniform(-1e-4, 1e-4, (6, len(TERMS)))
+    dilution = RegressionDilution(0.5, 5e-4, 4.0, 3.0, 1.0)
+    everything = {name: _at(name, INSIDE) for name in CATALOGUE}
+    return everything | {"residual_formula": ResidualFormula(formula, 1e-3), "regression_dilution": dilution}
+
+
+@ONE_WORKER
+@pytest.mark.parametrize("seed", range(3))
+def test_the_order_of_all_effects_means_nothing(seed, strong, guards):
+    """A list and its reverse: every two effects change places."""
+    names = np.random.default_rng(seed).permutation(sorted(strong))
+    there, back = (_flown(guards, tuple(strong[name] for name in order)) for order in (names, names[::-1]))
+    np.testing.assert_allclose(back, there, rtol=1e-13, atol=1e-13)
+
+
+@ONE_WORKER
+@pytest.mark.parametrize("hook", ["change", "command", "motors", "rotors", "body"])
+def test_the_order_of_any_two_effects_means_nothing(hook, strong, guards):
+    """Of all that act on the same thing; a drag goes along, for what moves the air."""
+    drag = ParasiticDrag(0.02, 0.01)
+    mine = [name for name, effect in strong.items() if overrides(effect, hook)]
+    # Those that only add to the wrench were all tried together; here come those that use what others leave.
+    late = [name for name in mine if hook != "body" or type(strong[name]).rank > 0 or name in ("thrust_tilt", "wind")]
+    for one in late:
+        for other in mine:
+            if one != other:
+                pair = strong[one], strong[other], drag
+                np.testing.assert_allclose(
+                    _flown(guards, pair[::-1]), _flown(guards, pair), rtol=1e-13, atol=1e-13, err_msg=f"{one}, {other}"
+                )
+
+
+def test_two_forces_that_follow_from_all_others_are_refused(guards):
+    with pytest.raises(CfbError, match="payload_swing and payload_swing each follow from all other forces"):
+        Quadrotor(guards, (PayloadSwing(0.002, 0.1), PayloadSwing(0.002, 0.2)))
+
+
+@pytest.mark.parametrize("name", ["gust", "jet"])
+def test_air_that_nothing_feels_is_refused(name, guards):
+    with pytest.raises(CfbError, match=f"{name}: the air moves, but no effect of the model feels it; add rotor_drag"):
+        Quadrotor(guards, (_at(name, INSIDE), PayloadSwing.neutral()))
+
+
+def test_a_wind_of_an_earlier_file_is_the_force_it_was():
+    """Fitted beside a drag that did not feel it."""
+    old, new = ({"velocity": 1.0, "conductance": conductance} for conductance in (0.02, 0.0))
+    felt = [float(effect_from_mapping({"name": "wind", "parameters": values}, "").felt) for values in (old, new)]
+    assert felt == [0.0, 1.0]
+
+
+def test_a_wind_in_a_file_that_does_nothing_is_refused():
+    """Without a conductance, and without a drag for it to act on."""
+    wind = {"name": "wind", "parameters": {"velocity": [1.0, 0.0, 0.0], "conductance": 0.0}}
+    drag = {"name": "rotor_drag", "parameters": {"coefficient": 0.02}}
+    assert Quadrotor.from_file(replace(load_model_file("cfb-guards"), effects=(wind, drag))).effects
+    with pytest.raises(CfbError, match=r"cfb-guards: wind: the air moves, but no effect .* or a conductance"):
+        Quadrotor.from_file(replace(load_model_file("cfb-guards"), effects=(wind,)))
+
+
+def test_the_rotors_momentum_of_an_earlier_file_is_kept(guards):
+    """`gyroscopic` used to have a rotor's inertia of its own, beside the model's."""
+    old = {"name": "gyroscopic", "parameters": {"rotor_inertia": 2e-7}}
+    assert float(effect_from_mapping(old, "old.yaml", guards).scale) == pytest.approx(2e-7 / 5e-8)
+    for parameters in (None, replace(guards, rotor_inertia=0.0)):
+        with pytest.raises(CfbError, match=r"old\.yaml: .*rotor_inertia is a share .* write scale in its place"):
+            effect_from_mapping(old, "old.yaml", parameters)
+    with pytest.raises(CfbError, match="write scale in its place"):
+        effect_from_mapping({"name": "gyroscopic", "parameters": {"rotor_inertia": "small"}}, "old.yaml", guards)
+    file = replace(load_model_file("cfb-guards"), effects=(old,))
+    assert float(Quadrotor.from_file(file).effects[0].scale) == pytest.approx(4.0)
+
+
 def test_all_effects_together_keep_float32(guards, manoeuvre):
     with jax.enable_x64(False):
         cast = functools.partial(jax.tree.map, lambda x: jnp.asarray(np.asarray(x, np.float32)))
@@ -210,10 +322,11 @@ def test_effects_may_carry_batch_axes(guards):
         effects = [_at(name, (share, 0.4, 0.6, 0.8)) for share in (0.7, 0.3)]
         batch = jax.tree.map(lambda *x: jnp.stack(x), *effects)
         for parameters in (guards, fleet):
-            changed = Quadrotor(parameters, (batch,)).changed_parameters()
+            # What moves the air is refused where nothing feels it.
+            changed = Quadrotor(parameters, (batch, RotorDrag.neutral())).changed_parameters()
             for i, effect in enumerate(effects):
                 drone = guards if parameters is guards else jax.tree.map(lambda x, i=i: x[i], fleet)
-                wanted = Quadrotor(drone, (effect,)).changed_parameters()
+                wanted = Quadrotor(drone, (effect, RotorDrag.neutral())).changed_parameters()
                 for got, one, base in zip(*map(jax.tree.leaves, (changed, wanted, drone)), strict=True):
                     got = got if got.ndim == base.ndim else got[i]
                     np.testing.assert_allclose(got, one, rtol=1e-12)

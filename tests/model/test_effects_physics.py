@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 
 from cfb_mjx.model import Quadrotor, State, begin, rollout, rotors
 from cfb_mjx.model.effects import (
+    CATALOGUE,
     BatterySag,
     BladeFlapping,
     CogOffset,
@@ -22,9 +23,11 @@ from cfb_mjx.model.effects import (
     Condition,
     EscRateLimit,
     GroundEffect,
+    Gust,
     Gyroscopic,
     Inertia,
     InflowThrust,
+    Jet,
     MotorAsymmetry,
     MotorGainMismatch,
     Motors,
@@ -42,7 +45,10 @@ from cfb_mjx.model.effects import (
     TorqueScale,
     Wind,
 )
+from cfb_mjx.model.quadrotor import conditions, loaded, prepare
+from cfb_mjx.model.state import unstack
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters import load_model_file
 
 # They share what one worker compiled.
 ONE_WORKER = pytest.mark.xdist_group("effects_physics")
@@ -57,22 +63,44 @@ def _batch(models):
 AIR = {
     "inflow_thrust": InflowThrust(0.02),
     "ground_effect": GroundEffect(0.15, 0.15),
-    "gyroscopic": Gyroscopic(2e-7),
-    "thrust_tilt": ThrustTilt([0.04, -0.03]),
+    "gyroscopic": Gyroscopic(4.0),
+    "thrust_tilt": ThrustTilt([0.04, -0.03], 0.05),
     "rotor_drag": RotorDrag(0.04),
     "parasitic_drag": ParasiticDrag(0.0, 0.01),
     "blade_flapping": BladeFlapping(8e-4, 0.3, 0.2),
     "wind": Wind([2.0, -1.0, 0.5], 0.03),
     "position_moment": PositionMoment([4e-4, -3e-4]),
+    "gust": Gust([2.0, 1.0, 0.5], time_scale=0.05, seed=3.0),
+    "jet": Jet(5.0, origin=[0.2, -0.5, 0.15], direction=[0.6, 0.1, 0.2], width=0.2),
 }
+MOVED = ("rotor_drag", "parasitic_drag", "inflow_thrust", "blade_flapping")
+"""Effects without which moving air does nothing."""
 
 
-def _wrench(constants, y, on):
+def _air(y, time, on):
+    """Velocity of the air at the rotors' centre, world. The gust is that of the library, held through a step."""
+    air = np.zeros(3)
+    if "wind" in on:
+        air += [2.0, -1.0, 0.5]
+    if "gust" in on:
+        air += np.asarray(AIR["gust"].at(time).stack())
+    if "jet" in on:
+        axis = np.array([0.6, 0.1, 0.2]) / np.linalg.norm([0.6, 0.1, 0.2])
+        away = y[:3] - [0.2, -0.5, 0.15]
+        ahead = away @ axis
+        beside = np.linalg.norm(np.cross(axis, away))
+        half = 0.2 + 0.1 * max(ahead, 0.0)
+        air += axis * 5.0 * 0.2 / half * 2 ** -((beside / half) ** 2) / (1 + np.exp(-4 * ahead / 0.2))
+    return air
+
+
+def _wrench(constants, y, on, time, conductance=0.03):
     """Force and torque about the rotors' centre that the effects ``on`` add to the rotors', body axes."""
     matrix, rate, speed = helpers.rotation_matrix(y[6:10]), y[10:13], y[13:17]
-    v = matrix.T @ y[3:6]
+    air = matrix.T @ _air(y, time, on)
+    v = matrix.T @ y[3:6] - air
     plain, _ = helpers.rotor_forces(constants, speed)
-    force, torque, lift = np.zeros(3), np.zeros(3), 0.0
+    force, torque = np.zeros(3), np.zeros(3)
     for i in range(4):
         arm = constants.rotor_spacing / 2 * np.array([helpers.ROTOR_X[i], helpers.ROTOR_Y[i], 0.0])
         at_hub = v + np.cross(rate, arm)
@@ -82,23 +110,23 @@ def _wrench(constants, y, on):
         if "ground_effect" in on:
             height = y[2] + (matrix @ arm)[2]
             thrust *= 1 + 0.15 * (0.15**2 + 0.1**2) / (0.15**2 + height**2)
-        lift += thrust
         here = np.array([0.0, 0.0, thrust - plain[i]])
+        if "thrust_tilt" in on:
+            round_ = np.cross([0.0, 0.0, 1.0], arm) / np.linalg.norm(arm)
+            here += thrust * (np.array([0.04, -0.03, 0.0]) + 0.05 * round_)
         if "rotor_drag" in on:
             here[:2] -= 0.04 / 4 * speed[i] / 1594 * at_hub[:2]
         force += here
         torque += np.cross(arm, here)
         if "gyroscopic" in on:
-            # A rotor that pushes the body about +z turns about -z.
+            # A rotor that pushes the body about +z turns about -z. Four times the inertia of a rotor.
             torque -= np.cross(rate, [0.0, 0.0, -helpers.YAW[i] * 2e-7 * speed[i]])
-    if "thrust_tilt" in on:
-        force += lift * np.array([0.04, -0.03, 0.0])
     if "parasitic_drag" in on:
         force -= 0.01 * np.abs(v) * v
     if "blade_flapping" in on:
         torque += 8e-4 * speed.mean() / 1594 * np.exp(0.3 * v[2]) * np.array([-0.8 * v[1], 1.2 * v[0], 0.0])
     if "wind" in on:
-        force += matrix.T @ (0.03 * np.array([2.0, -1.0, 0.5]))
+        force += conductance * matrix.T @ [2.0, -1.0, 0.5]
     if "position_moment" in on:
         # As blade flapping of an airspeed that grows with the distance from the middle.
         place = y[:3] + matrix @ constants.center_of_gravity
@@ -112,11 +140,11 @@ def _truth(constants, y, commands, on):
     about_center = np.diag(constants.inertia) - m * cx @ cx
     inverse = np.linalg.inv(np.block([[m * np.eye(3), -m * cx], [m * cx, about_center]]))
     rows = []
-    for command in commands:
+    for k, command in enumerate(commands):
         basic = helpers.ode(constants, command)
 
-        def rates(t, y, basic=basic):
-            added = inverse @ np.concatenate(_wrench(constants, y, on))
+        def rates(t, y, basic=basic, time=0.004 * k):
+            added = inverse @ np.concatenate(_wrench(constants, y, on, time))
             rate = basic(t, y)
             rate[3:6] += helpers.rotation_matrix(y[6:10]) @ added[:3]
             rate[10:13] += added[3:]
@@ -139,6 +167,9 @@ def in_air(off_center, low_flight, fly_fleet):
     """Flown with no effect, every effect alone, and all of them, by name; the centre of gravity is off centre."""
     y, commands = low_flight
     cases = {"none": (), **{name: (name,) for name in AIR}, "all": tuple(AIR)}
+    # In moving air alone nothing would happen.
+    cases |= {name: (name, *MOVED) for name in ("gust", "jet")}
+    cases["still"] = MOVED
     models = []
     for on in cases.values():
         effects = tuple(effect if name in on else type(effect).neutral() for name, effect in AIR.items())
@@ -154,7 +185,7 @@ def test_wrench_follows_the_ode(name, in_air, off_center, low_flight):
     truth = _truth(helpers.constants_of(off_center), *low_flight, on)
     for part, tolerance in (("position", 1e-6), ("velocity", 1e-4), ("body_rate", 1e-3)):
         assert np.abs(helpers.part(flown - truth, part)).max() < tolerance, part
-    seen = np.abs(flown - in_air["none"][1])
+    seen = np.abs(flown - in_air["still" if name in ("gust", "jet") else "none"][1])
     assert helpers.part(seen, "position").max() > 1e-5 or helpers.part(seen, "body_rate").max() > 1e-2
 
 
@@ -171,13 +202,99 @@ def test_inflow_damps_roll_at_its_closed_form(guards, fly_fleet):
     np.testing.assert_allclose(flown.body_rate[0, :, 1:], 0, atol=1e-12)
 
 
+def _felt(parameters, effects, state):
+    """Force and torque about the rotors' centre, body axes."""
+    model = Quadrotor(parameters, effects)
+    prepared = prepare(model)
+    at = unstack(begin(model, state), prepared.parameters.center_of_gravity)
+    loads = rotors.loads_at(prepared.rotors, at.rotor_speed, 0.0 * at.rotor_speed)
+    wrench = loaded(model, prepared.parameters, loads, conditions(prepared, at, at.rotor_speed))
+    return np.concatenate([wrench.force.stack(), wrench.torque.stack()])
+
+
+@pytest.mark.parametrize("name", [name for name, kind in CATALOGUE.items() if kind.feels_air])
+def test_moving_air_does_what_moving_through_still_air_does(name, off_center):
+    """Galilean invariance: at rest in air that moves, and moving the other way through still air."""
+    effect, air = (
+        {"parasitic_drag": ParasiticDrag([0.01, 0.02, 0.03], 0.01, 0.5)}.get(name, AIR[name]),
+        [2.0, -1.0, 0.5],
+    )
+    y, _ = helpers.aggressive_manoeuvre(0.01, seed=4)
+    still = helpers.state_of(y)
+    there = dataclasses.replace(still, velocity=still.velocity - jnp.array(air))
+    moving, resting = _felt(off_center, (effect,), there), _felt(off_center, (effect, Wind(air, 0.0)), still)
+    np.testing.assert_allclose(resting, moving, rtol=1e-12, atol=1e-15)
+    assert np.abs(_felt(off_center, (effect,), still) - moving).max() > 1e-6
+
+
+def test_a_conductance_is_the_drag_of_what_no_other_effect_describes(off_center):
+    """Alone it is the constant force it always was; at zero beside a drag the drag carries the wind."""
+    y, _ = helpers.aggressive_manoeuvre(0.01, seed=4)
+    state, air = helpers.state_of(y), np.array([2.0, -1.0, 0.5])
+    matrix = helpers.rotation_matrix(y[6:10])
+
+    def force(*effects):
+        return matrix @ (_felt(off_center, effects, state) - _felt(off_center, (), state))[:3]
+
+    np.testing.assert_allclose(force(Wind(air, 0.02)), 0.02 * air, rtol=1e-9)
+    drag = ParasiticDrag(0.02, 0.0)
+    np.testing.assert_allclose(force(Wind(air, 0.0), drag) - force(drag), 0.02 * air, rtol=1e-9)
+    assert force(Wind(air, 0.0)) == pytest.approx(0.0, abs=1e-15)
+    # As a search has it: a force, whatever drag there is.
+    np.testing.assert_allclose(force(Wind(air, 0.02, felt=0.0), drag) - force(drag), 0.02 * air, rtol=1e-9)
+
+
+def test_a_gust_has_the_spectrum_it_states():
+    """Over many seeds: zero mean, the intensity, the exponential autocorrelation, and axes that know nothing of
+    each other."""
+    lags = np.arange(0.0, 4.0, 0.1)
+
+    def path(seed):
+        return jax.vmap(lambda t: Gust([2.0, 1.0, 0.5], 0.5, seed).at(t).stack())(0.5 * jnp.arange(0.0, 12.0, 0.1))
+
+    gust = np.asarray(jax.jit(jax.vmap(path))(jnp.arange(1000.0))) / [2.0, 1.0, 0.5]
+    np.testing.assert_allclose(gust.mean((0, 1)), 0.0, atol=0.03)
+    np.testing.assert_allclose(gust.std((0, 1)), 1.0, atol=0.02)
+    known = [np.mean(gust[:, :80] * gust[:, k : 80 + k], axis=(0, 1)) for k in range(len(lags))]
+    np.testing.assert_allclose(known, np.exp(-lags)[:, None] * np.ones(3), atol=0.06)
+    assert np.abs(np.corrcoef(gust[:, ::10].reshape(-1, 3).T) - np.eye(3)).max() < 0.05
+    # And one seed is as unlike the next as any.
+    assert abs(np.mean(gust[1:, 0] * gust[:-1, 0])) < 0.1
+
+
+def test_a_jet_keeps_its_momentum_and_halves_at_its_width():
+    parameters = prepare(Quadrotor(load_model_file("cfb-guards").parameters())).parameters
+    jet = Jet(5.0, origin=[1.0, 0.0, 0.0], direction=[0.0, 2.0, 0.0], width=0.2, spreading=0.1)
+    zero = Vec(*jnp.zeros(3))
+
+    def air(x, z, y):
+        place = Vec(*map(jnp.asarray, (x, y, z)))
+        level = Vec(1.0, 0.0, 0.0, 0.0)
+        return jet.air(Condition(place, zero, zero, zero, level, zero, Vec(*jnp.zeros(4)), parameters))
+
+    def along(r, y):
+        return float(air(1.0 + r, 0.0, y)[1])
+
+    for far in (0.5, 2.0, 4.0):
+        half = 0.2 + 0.1 * far
+        assert along(half, far) == pytest.approx(0.5 * along(0.0, far), rel=1e-6)
+        r = np.linspace(0.0, 5 * half, 200)
+        flux = np.trapezoid([along(x, far) ** 2 * x for x in r], r)
+        # Of a Gaussian: the speed at the fan squared, times its width squared, over 4 ln 2.
+        assert flux == pytest.approx(25.0 * 0.04 / (4 * np.log(2)), rel=1e-3)
+    # Far away it has slowed down as 1 / distance; behind the fan nothing moves.
+    assert along(0.0, 8.0) / along(0.0, 3.0) == pytest.approx(0.5, rel=1e-6)
+    assert abs(along(0.0, -0.5)) < 1e-3
+    assert [float(air(1.0, 0.0, 1.0)[i]) for i in (0, 2)] == [0.0, 0.0]
+
+
 def test_gyroscopic_torque_does_no_work(guards, fly_fleet):
     """A body in free rotation with rotors of unequal speed: its energy and the total angular momentum stay."""
     nothing = jnp.zeros(3)
     free = eqx.tree_at(
         lambda p: (p.gravity, p.thrust_polynomial, p.torque_polynomial), guards, (jnp.zeros(()), nothing, nothing)
     )
-    model = Quadrotor(free, (Gyroscopic(2e-7),), integrator="rk4", dt=0.002)
+    model = Quadrotor(free, (Gyroscopic(4.0),), integrator="rk4", dt=0.002)
     speed = np.array([1000.0, 2000.0, 500.0, 2500.0])
     y = np.zeros(17)
     y[6], y[10:13], y[13:] = 1.0, [8.0, -5.0, 3.0], speed
@@ -406,7 +523,6 @@ def test_battery_voltage_is_filtered_and_scales_the_target(guards):
     def factor():
         return np.asarray(_steered(effect, guards, target, target, memory)[0].target.stack()) / target
 
-    np.testing.assert_allclose(factor(), 1.02, rtol=1e-12)
     memory = effect.sense(memory, _reading(np.nan, 0.0))
     np.testing.assert_allclose(factor(), 1.02, rtol=1e-12)
     # The first reading counts in full, later ones through the lag whatever their spacing.
@@ -416,6 +532,66 @@ def test_battery_voltage_is_filtered_and_scales_the_target(guards):
         memory = effect.sense(memory, _reading(voltage, time))
     voltage = 3.8 + 0.3 * np.exp(-0.4 / 0.3)
     np.testing.assert_allclose(factor(), 1.02 + 0.8 * (voltage - 3.7) / 3.7, rtol=1e-9)
+    # What a log said stays in predictions that start from it.
+    zero = Vec(*jnp.zeros(3))
+    at = Condition(zero, zero, zero, zero, Vec(1.0, 0.0, 0.0, 0.0), zero, Vec(*jnp.full(4, 2500.0)), guards, memory)
+    for _ in range(50):
+        at = dataclasses.replace(at, memory=effect.advance(at, zero, 0.01))
+    np.testing.assert_array_equal(at.memory[0][0], memory[0][0])
+
+
+def test_a_cell_runs_down_as_the_equations_say(guards, fly_fleet):
+    """In simulation: charge, voltage under load and rotor speeds by an adaptive integrator of SciPy, to the last
+    charge and beyond."""
+    capacity, resistance, power, lag = 6.0, 0.12, 8.0, 0.05
+    effect = BatterySag(0.02, 0.8, lag, charge=0.9, capacity=capacity, resistance=resistance, power=power)
+    model = Quadrotor(guards, (effect,))
+    y = np.zeros(17)
+    y[6], y[13:] = 1.0, 1450.0
+    command = np.array([0.5, 0.6, 0.55, 0.45])
+    flown = fly_fleet(_batch([model]), helpers.state_of(y), jnp.broadcast_to(command, (1000, 4)))
+
+    def terminal(charge, speed):
+        open_ = np.polyval([0.3201, -0.1178, 0.2156, 3.685], charge) - 1.031 * np.exp(-35 * charge)
+        taken = power * np.mean((speed / 1594) ** 3)
+        voltage = np.roots([1.0, -open_, resistance * taken]).real.max()
+        return voltage, taken / voltage
+
+    def slope(_, x):
+        charge, felt, speed = x[0], x[1], x[2:]
+        voltage, current = terminal(max(charge, 0.0), speed)
+        steady = 2900 * command * (1.02 + 0.8 * (felt - 3.7) / 3.7)
+        return [-current / capacity * (charge > 0), (voltage - felt) / lag, *((steady - speed) / 0.05)]
+
+    first = [0.9, terminal(0.9, np.full(4, 1450.0))[0], *np.full(4, 1450.0)]
+    times = 0.004 * np.arange(1, 1001)
+    known = solve_ivp(slope, (0, 4), first, t_eval=times, rtol=1e-8, atol=1e-8, max_step=0.01).y
+    felt, _, charge, _ = (memory[0, :, 0] for memory in flown.memory[0])
+    np.testing.assert_allclose(charge, np.maximum(known[0], 0.0), atol=2e-3)
+    going = known[0] > 0.01
+    np.testing.assert_allclose(felt[going], known[1][going], atol=5e-3)
+    np.testing.assert_allclose(flown.rotor_speed[0, going], known[2:].T[going], atol=5.0)
+    assert 3.9 > known[1, 5] > known[1, 300] > 3.4
+    assert known[0, -1] <= 0.0
+    # An empty cell: it neither charges nor turns into a number that means nothing.
+    assert float(charge[-1]) == 0.0
+    assert 1.3 < float(felt[-1]) < 2.66
+
+
+def test_a_half_full_cell_carries_hover_at_the_nominal_voltage(guards):
+    """So that a fitted level and slope mean in simulation what they meant beside the log."""
+    voltage, current = BatterySag.neutral().loaded(jnp.asarray(0.5), Vec(*jnp.full(4, 1594.0)))
+    assert float(voltage) == pytest.approx(3.7, abs=0.02)
+    # Ten minutes from 350 mAh, more or less.
+    assert 8 < 1260 / float(current) / 60 < 14
+
+
+def test_a_cell_gives_no_more_than_it_can():
+    voltage, current = BatterySag(0.0, 1.0, resistance=0.5, power=20.0).loaded(
+        jnp.asarray(0.5), Vec(*jnp.full(4, 2900.0))
+    )
+    assert float(voltage) == pytest.approx(0.5 * 3.803, abs=1e-3)
+    assert np.isfinite(float(current))
 
 
 def test_warm_motors_turn_slower(guards, fly_fleet):
@@ -495,7 +671,7 @@ def test_load_followed_beside_a_log_is_found_by_what_the_model_misses(guards, ma
 
     def condition(memory):
         level = Vec(1.0, 0.0, 0.0, 0.0)
-        return Condition(zero, zero, zero, level, zero, Vec(*jnp.zeros(4)), guards, memory)
+        return Condition(zero, zero, zero, zero, level, zero, Vec(*jnp.zeros(4)), guards, memory)
 
     def pulled(memory):
         along, turning = memory
@@ -524,7 +700,59 @@ def test_load_hangs_below_what_the_drone_feels_after_a_gap(guards):
     effect = PayloadSwing(mass=0.004, length=0.16)
     zero = Vec(*jnp.zeros(3))
     memory = Vec(*jnp.array([0.6, 0.0, -0.8])), Vec(*jnp.array([0.0, 3.0, 0.0]))
-    at = Condition(zero, zero, zero, Vec(1.0, 0.0, 0.0, 0.0), zero, Vec(*jnp.zeros(4)), guards, memory)
+    at = Condition(zero, zero, zero, zero, Vec(1.0, 0.0, 0.0, 0.0), zero, Vec(*jnp.zeros(4)), guards, memory)
     along, turning = effect.follow(at, Vec(3.0, 0.0, 0.0), zero, 0.4)
     np.testing.assert_allclose(along.stack(), np.array([-3.0, 0.0, -9.81]) / np.hypot(3.0, 9.81), atol=1e-6)
     np.testing.assert_allclose(turning.stack(), 0.0, atol=1e-12)
+
+
+@ONE_WORKER
+def test_wind_drag_tilt_and_a_load_follow_newton(guards, fly_fleet):
+    """Composed: drone and load as two bodies with a string between them, for every force the same moving air."""
+    m, own, length, ratio = 0.006, 0.044, 0.2, 0.05
+    effects = (
+        PayloadSwing(m, length, ratio),
+        Wind([2.0, -1.0, 0.5], 0.0),
+        ThrustTilt([0.04, -0.03], 0.05),
+        InflowThrust(0.02),
+        ParasiticDrag(0.0, 0.01),
+        RotorDrag(0.04),
+    )
+    constants, dt, steps = helpers.constants_of(guards), 0.001, 250
+    model = Quadrotor(guards, effects, integrator="rk4", dt=dt)
+    y, commands = helpers.aggressive_manoeuvre(0.01, seed=7)
+    y[13:17] = 1594.0
+    command = 0.55 + 0.1 * (commands[0] - commands[0].mean())
+    flown = helpers.pack(fly_fleet(_batch([model]), helpers.state_of(y), jnp.broadcast_to(command, (steps, 4))))[0]
+    basic = helpers.ode(constants, command)
+    on = ("wind", "thrust_tilt", "inflow_thrust", "parasitic_drag", "rotor_drag")
+    gravity = np.array([0.0, 0.0, -9.81])
+
+    def rates(t, z):
+        y, along, turning = z[:17], z[17:20], z[20:]
+        rate = basic(t, y)
+        force, torque = _wrench(constants, y, on, 0.0, conductance=0.0)
+        matrix = helpers.rotation_matrix(y[6:10])
+        free = rate[3:6] + matrix @ force / own
+        # m a_load = m g - T n, own a = own free + T n, and n . (a_load - a) = -length |n'|^2. Air damps the load.
+        pull = (length * turning @ turning - along @ (free - gravity)) / (1 / m + 1 / own)
+        rate[3:6] = free + max(pull, 0.0) * along / own
+        rate[10:13] += torque / constants.inertia
+        felt = rate[3:6] - gravity
+        swing = -(felt - along * (along @ felt)) / length - (turning @ turning) * along
+        swing -= 2 * ratio * np.sqrt(9.81 / length) * turning
+        return np.concatenate([rate, turning, swing])
+
+    start = np.concatenate([y, [0.0, 0.0, -1.0], np.zeros(3)])
+    times = dt * np.arange(1, steps + 1)
+    known = solve_ivp(rates, (0.0, times[-1]), start, t_eval=times, method="DOP853", rtol=1e-9, atol=1e-10).y.T
+    without = fly_fleet(
+        _batch([Quadrotor(guards, effects[1:], integrator="rk4", dt=dt)]),
+        helpers.state_of(y),
+        jnp.broadcast_to(command, (steps, 4)),
+    )
+    # The load moves by semi-implicit steps: its share in the flight is right to one percent.
+    load = np.abs(known[:, :3] - np.asarray(without.position[0])).max()
+    assert load > 0.01
+    for part, tolerance in (("position", 0.01 * load), ("velocity", 0.02), ("body_rate", 5e-3)):
+        assert np.abs(helpers.part(flown - known[:, :17], part)).max() < tolerance, part

@@ -14,7 +14,7 @@ from cfb_mjx.labelled_plants import EFFECTS, Case, fly_campaigns
 from cfb_mjx.labelled_plants.effects import put
 from cfb_mjx.logs import read_log
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.model.effects import Inertia, RotorDrag
+from cfb_mjx.model.effects import Inertia, RotorDrag, Wind
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.refinement import Number, free_numbers, plausible_numbers, refine
@@ -51,6 +51,20 @@ def test_drag_comes_back_and_flights_not_fitted_are_predicted_better(campaign, r
     key = "velocity_rmse_mps@0.5s"
     before = evaluate(Quadrotor(GUARDS()), campaign.held_out).metrics("commands_in")[key]
     assert evaluate(refined.model, campaign.held_out).metrics("commands_in")[key] < 0.5 * before
+
+
+def test_what_no_flight_tells_is_not_fitted():
+    """A wind's conductance, a battery's charge: they stay as given, and a wind beside a drag does not count twice."""
+    names = [n.name for n in plausible_numbers(GUARDS(), ("wind", "battery_sag"))]
+    assert names == [
+        *(f"wind.velocity[{i}]" for i in range(3)),
+        *(f"battery_sag.{f}" for f in ("level", "slope", "lag")),
+    ]
+    for asked, conductance in ((("wind",), 0.02), (("wind", "rotor_drag"), 0.0)):
+        model = _prepared(Quadrotor(GUARDS()), plausible_numbers(GUARDS(), asked))
+        assert float(model.effects[0].conductance) == pytest.approx(conductance)
+    given = Quadrotor(GUARDS(), (Wind(0.0, 0.03), RotorDrag(0.01)))
+    assert float(_prepared(given, plausible_numbers(GUARDS(), ("wind",))).effects[0].conductance) == pytest.approx(0.03)
 
 
 def test_air_drawn_to_the_middle_of_a_room_is_told_by_the_moments(monkeypatch):

@@ -19,7 +19,7 @@ from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
-from cfb_mjx.sysid.tracing.columns import term_columns
+from cfb_mjx.sysid.tracing.columns import moved, neutral_effects, shapes, strengths, term_columns
 from cfb_mjx.sysid.tracing.evidence import evidence
 from cfb_mjx.sysid.tracing.formula import with_library
 from cfb_mjx.sysid.tracing.given import fit_given
@@ -282,13 +282,23 @@ def test_a_limit_is_not_taken_for_half_of_it_and_another(campaigns, base, guess)
     assert float(limit.rotor) < 0.05
 
 
+def test_a_wind_that_is_found_is_a_force_and_does_not_count_twice():
+    """The drag found beside it does not act on it: its conductance stands for all there is."""
+    (variant,) = strengths("wind")
+    wind = neutral_effects(("wind",))[0]
+    for column in variant:
+        wind = moved(wind, column, 0.5, present=False)
+    assert (float(wind.felt), float(wind.conductance)) == (0.0, pytest.approx(0.02))
+    assert shapes(wind) == []
+    np.testing.assert_allclose(wind.velocity, 0.5)
+
+
 def test_what_no_search_looks_for_takes_part_where_it_is_named_or_declared(campaigns, base):
     def names(*given):
         return Search.start(campaigns["clean"].fit[:1], base.parameters(), 0.008, sensors, *given).names
 
     sensors = check_sensors(campaigns["clean"].fit, 0.008)
-    assert "position_moment" not in names()
-    assert len(names()) == len(CATALOGUE) - 1
+    assert set(CATALOGUE) - set(names()) == {"position_moment", "gust", "jet"}
     assert "position_moment" in names((), ["position_moment"])
     assert "position_moment" in names((CATALOGUE["position_moment"].neutral(),))
 

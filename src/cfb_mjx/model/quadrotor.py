@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.model import rotors
 from cfb_mjx.model.bodies import Body, RigidBody
-from cfb_mjx.model.effects import SENSOR_FAULTS, Condition, Effect, Motors, Wrench, effect_from_mapping, overrides
+from cfb_mjx.model.effects import (
+    SENSOR_FAULTS,
+    Condition,
+    Effect,
+    Motors,
+    Wind,
+    Wrench,
+    effect_from_mapping,
+    overrides,
+)
+from cfb_mjx.model.effects.base import CONSTRAINT, in_order
 from cfb_mjx.model.effects.inertia import Inertia
 from cfb_mjx.model.integrate import END, INTEGRATORS, MIDDLE, START
 from cfb_mjx.model.state import Components, State, stack, unstack
@@ -31,7 +43,7 @@ class Quadrotor(eqx.Module):
 
     Attributes:
         parameters: constants.
-        effects: physical effects beyond the paper's model, applied in order.
+        effects: physical effects beyond the paper's model; their order means nothing (`Effect.rank`).
         body: `RigidBody()` (closed form, no ground, fastest) or `MjxBody()` (MuJoCo XLA, floor contact).
         dt: time between commands, s.
         substeps: integration steps per command.
@@ -58,6 +70,11 @@ class Quadrotor(eqx.Module):
             raise CfbError(f"dt must be a positive number of seconds, found {self.dt!r}.")
         if not (isinstance(self.substeps, int) and self.substeps >= 1):
             raise CfbError(f"substeps must be a whole number from 1, found {self.substeps!r}.")
+        bound = [type(effect).name for effect in self.effects if type(effect).rank == CONSTRAINT]
+        if len(bound) > 1:
+            raise CfbError(f"{' and '.join(bound)} each follow from all other forces; a model can have one of them.")
+        # A wind has a conductance of its own.
+        _require_felt(self.effects, [e.name for e in self.effects if overrides(e, "air") and not overrides(e, "body")])
 
     @classmethod
     def from_file(cls, model: ModelFile | str | Path = "cfb-guards", **choices) -> Quadrotor:
@@ -74,7 +91,8 @@ class Quadrotor(eqx.Module):
         where = model.path or model.name
         # What a model file says of the sensors does not change how the drone flies.
         physical = (item for item in model.effects if item.get("name") not in SENSOR_FAULTS)
-        effects = tuple(effect_from_mapping(item, where) for item in physical)
+        effects = tuple(effect_from_mapping(item, where, model.parameters()) for item in physical)
+        _require_felt(effects, [e.name for e in effects if isinstance(e, Wind) and not np.any(e.conductance)], where)
         found = cls(parameters=model.parameters(), effects=effects, **choices)
         _require_possible(found, model, where)
         return found
@@ -91,8 +109,8 @@ class Quadrotor(eqx.Module):
                 if isinstance(value := getattr(effect, field), int | float):
                     raise CfbError(f"{effect.name}.{field} = {value!r} is no array; put jnp.asarray(...) there.")
         parameters = self.parameters
-        for effect in self.effects:
-            parameters = effect.change(parameters)
+        for i in in_order(self.effects):
+            parameters = self.effects[i].change(parameters)
         return parameters
 
     def steps_per_command(self, control_dt_s: float) -> int:
@@ -139,6 +157,15 @@ def _require_possible(model: Quadrotor, described: ModelFile, where: str) -> Non
     if lift < weight:
         said = f"{where}: the drone cannot hover: it weighs {weight:.3g} N, its rotors lift {lift:.3g} N at most"
         warnings.warn(f"{said}; check mass and thrust.", CfbWarning, stacklevel=3)
+
+
+def _require_felt(effects: tuple[Effect, ...], blowing: list[str], where: str = "") -> None:
+    """Refuse effects whose only deed is to move the air, in a model where nothing depends on it."""
+    if blowing and not any(type(effect).feels_air for effect in effects):
+        raise CfbError(
+            f"{where and where + ': '}{', '.join(blowing)}: the air moves, but no effect of the model feels it; "
+            "add rotor_drag or parasitic_drag" + (", or a conductance." if "wind" in blowing else ".")
+        )
 
 
 def begin(model: Quadrotor, state: State) -> State:
@@ -209,11 +236,12 @@ def commanded_path(prepared: Prepared, rotor_speed: Vec, memory: tuple, command:
     """How the rotors run from ``rotor_speed`` while the command is held for ``prepared.dt``, and the new memory."""
     model, parameters, memory = prepared.model, prepared.parameters, list(memory)
     command = command.map(lambda u: jnp.clip(u, 0.0, 1.0))
-    for i, effect in enumerate(model.effects):
-        command, memory[i] = effect.command(command, memory[i], prepared.dt, parameters)
+    order = in_order(model.effects)
+    for i in order:
+        command, memory[i] = model.effects[i].command(command, memory[i], prepared.dt, parameters)
     motors = Motors(rotors.steady_speed(prepared.rotors, command), parameters.motor_time_constant)
-    for i, effect in enumerate(model.effects):
-        motors, memory[i] = effect.motors(motors, rotor_speed, memory[i], prepared.dt, parameters)
+    for i in order:
+        motors, memory[i] = model.effects[i].motors(motors, rotor_speed, memory[i], prepared.dt, parameters)
     constants = prepared.rotors
     if any(overrides(effect, "motors") for effect in model.effects):
         constants = rotors.with_time_constant(constants, motors.time_constant, prepared.dt)
@@ -285,14 +313,23 @@ def at_rotor_center(parameters: Parameters, wrench: Wrench, body_rate: Vec) -> t
 
 def conditions(prepared: Prepared, at: Components, speed: Vec) -> tuple[Condition, ...]:
     """The flight condition as each effect sees it."""
-    if not prepared.model.effects:
+    effects = prepared.model.effects
+    if not effects:
         return ()
+    still = in_still_air(prepared, at, speed)
+    seen = [replace(still, memory=memory) for memory in at.memory]
+    blowing = [effects[i].air(seen[i]) for i in in_order(effects) if overrides(effects[i], "air")]
+    if not blowing:
+        return tuple(seen)
+    wind = rotate_inverse(at.quaternion, sum(blowing[1:], blowing[0]))
+    return tuple(replace(each, airspeed_body=still.velocity_body - wind) for each in seen)
+
+
+def in_still_air(prepared: Prepared, at: Components, speed: Vec) -> Condition:
+    """The flight condition without effects."""
     parameters = prepared.parameters
-    velocity_body = rotate_inverse(at.quaternion, at.velocity) - at.body_rate.cross(parameters.center_of_gravity)
-    return tuple(
-        Condition(at.position, at.velocity, velocity_body, at.quaternion, at.body_rate, speed, parameters, memory)
-        for memory in at.memory
-    )
+    velocity = rotate_inverse(at.quaternion, at.velocity) - at.body_rate.cross(parameters.center_of_gravity)
+    return Condition(at.position, at.velocity, velocity, velocity, at.quaternion, at.body_rate, speed, parameters)
 
 
 def advanced(prepared: Prepared, at: tuple[Condition, ...], acceleration: Vec) -> tuple:
@@ -309,12 +346,12 @@ def followed(prepared: Prepared, at: tuple[Condition, ...], acceleration: Vec, m
 
 def loaded(model: Quadrotor, parameters: Parameters, loads: rotors.RotorLoads, conditions: tuple) -> Wrench:
     """Wrench of the rotors and of every effect about the rotors' centre, body axes."""
-    pairs = list(zip(model.effects, conditions, strict=True))
-    for effect, condition in pairs:
-        loads = effect.rotors(loads, condition)
+    order = in_order(model.effects)
+    for i in order:
+        loads = model.effects[i].rotors(loads, conditions[i])
     wrench = wrench_of(parameters, loads)
-    for effect, condition in pairs:
-        wrench = effect.body(wrench, condition)
+    for i in order:
+        wrench = model.effects[i].body(wrench, replace(conditions[i], loads=loads))
     return wrench
 
 

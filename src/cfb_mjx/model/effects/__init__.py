@@ -16,9 +16,11 @@ from cfb_mjx.model.effects.command_delay import CommandDelay
 from cfb_mjx.model.effects.esc_rate_limit import EscRateLimit
 from cfb_mjx.model.effects.formula import ResidualFormula
 from cfb_mjx.model.effects.ground_effect import GroundEffect
+from cfb_mjx.model.effects.gust import Gust
 from cfb_mjx.model.effects.gyroscopic import Gyroscopic
 from cfb_mjx.model.effects.inertia import Inertia
 from cfb_mjx.model.effects.inflow_thrust import InflowThrust
+from cfb_mjx.model.effects.jet import Jet
 from cfb_mjx.model.effects.motor_asymmetry import MotorAsymmetry
 from cfb_mjx.model.effects.motor_gain_mismatch import MotorGainMismatch
 from cfb_mjx.model.effects.motor_second_order import MotorSecondOrder
@@ -47,9 +49,11 @@ __all__ = [
     "Effect",
     "EscRateLimit",
     "GroundEffect",
+    "Gust",
     "Gyroscopic",
     "Inertia",
     "InflowThrust",
+    "Jet",
     "Memory",
     "MotorAsymmetry",
     "MotorGainMismatch",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -11,6 +12,9 @@ from cfb_mjx.model.rotors import RotorLoads
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
+
+CONSTRAINT, EXPECTATION = 10, 11
+"""Ranks of a force that follows from all others (a string's tension), and of what is no physics but an expectation."""
 
 Memory = tuple[Vec, ...]
 """What one effect remembers from step to step: hidden states such as a delay line or a swinging load."""
@@ -25,6 +29,8 @@ class Condition(eqx.Module):
     """Of the centre of gravity, world."""
     velocity_body: Vec
     """Of the rotors' centre, body axes."""
+    airspeed_body: Vec
+    """Of the rotors' centre through the air, body axes: `velocity_body` less the air's own velocity there."""
     quaternion: Vec
     body_rate: Vec
     rotor_speed: Vec
@@ -32,6 +38,8 @@ class Condition(eqx.Module):
     """With what effects change in them; `Vec` in place of arrays."""
     memory: Memory = ()
     """Of the effect that is asked."""
+    loads: RotorLoads | None = None
+    """Of the rotors, all effects on them included; only `Effect.body` is told."""
 
 
 class Wrench(eqx.Module):
@@ -84,6 +92,15 @@ class Effect(eqx.Module):
     strengths: ClassVar[tuple[str, ...]]
     probes: ClassVar[tuple[dict[str, float], ...]] = ({},)
     searched: ClassVar[bool] = True
+    assumed: ClassVar[tuple[str, ...]] = ()
+    """Fields that no flight tells: whoever fits leaves them as they are given."""
+    rank: ClassVar[int] = 0
+    """Which of two effects acts first where the second sees what the first leaves; by their names where it is equal.
+
+    The order of a model's list means nothing. Below `CONSTRAINT`, effects on the body only add to the wrench.
+    """
+    feels_air: ClassVar[bool] = False
+    """Whether it depends on `Condition.airspeed_body`."""
 
     def __check_init__(self):
         for field, limits in self.limits.items():
@@ -93,6 +110,15 @@ class Effect(eqx.Module):
     def neutral(cls) -> Effect:
         """The effect at the values where it vanishes."""
         raise TypeError(f"{cls.__name__} must say at which values it vanishes")
+
+    @classmethod
+    def migrated(cls, values: Mapping[str, Any], parameters: Parameters | None) -> Mapping[str, Any]:
+        """What a model file of an earlier version says, in today's fields; ``parameters`` are the file's own.
+
+        Raises:
+            CfbError: it cannot be said; what to write instead.
+        """
+        return values
 
     def change(self, parameters: Parameters) -> Parameters:
         """Change the drone itself, once per rollout."""
@@ -120,6 +146,13 @@ class Effect(eqx.Module):
         """Change how the motors answer, from ``rotor_speed`` on."""
         return motors, memory
 
+    def air(self, condition: Condition) -> Vec:
+        """Velocity of the air at the drone, world, that this effect brings about; the air of all effects adds up.
+
+        In ``condition`` the air is taken to be still.
+        """
+        return Vec(0.0, 0.0, 0.0)
+
     def rotors(self, loads: RotorLoads, condition: Condition) -> RotorLoads:
         """Change thrust and torque rotor by rotor."""
         return loads
@@ -138,6 +171,11 @@ class Effect(eqx.Module):
         ``missed`` is how much of it the model does not say: it tells how far off the memory is.
         """
         return self.advance(condition, acceleration, dt)
+
+
+def in_order(effects: Sequence[Effect]) -> list[int]:
+    """Positions of effects in the order in which they act, whatever the order they are listed in."""
+    return sorted(range(len(effects)), key=lambda i: (type(effects[i]).rank, type(effects[i]).name))
 
 
 def overrides(effect: Effect, hook: str) -> bool:

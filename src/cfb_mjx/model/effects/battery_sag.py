@@ -2,10 +2,21 @@
 
     steady rotor speed *= 1 + level + slope (V - 3.7 V) / 3.7 V
 
-Slope 1 is a motor whose speed is proportional to the voltage, 0 one whose controller makes up for it. V is what was
-read, through a first-order filter of time constant ``lag``: with a short one the rotors feel every dip under load, with
-a long one they answer to how empty the battery is. Remembered are V, 3.7 V until a log says otherwise, and when it was
-last read: the first reading is taken as it is, unknown ones are passed over. Between readings V stays.
+Slope 1 is a motor whose speed is proportional to the voltage, 0 one whose controller makes up for it. V is the
+battery's voltage through a first-order filter of time constant ``lag``: with a short one the rotors feel every dip
+under load, with a long one they answer to how empty the battery is.
+
+In simulation the voltage is that of a cell with a state of charge s, an open-circuit voltage E and a resistance R:
+
+    E(s) = 3.685 + 0.2156 s - 0.1178 s^2 + 0.3201 s^3 - 1.031 exp(-35 s)
+    E - R i = P / i,   P = power mean_j((Omega_j / 1594 rad/s)^3),   capacity s' = -i
+
+with the current i and the power P the rotors take, which grows with the cube of their speed. A cell gives E^2 / (4 R)
+at most; asked for more it stays at E / 2. An empty one (s = 0) has 2.65 V and stays empty.
+
+Beside a log V is what was read there: the first reading is taken as it is, unknown ones are passed over, and between
+readings V stays, in predictions that start from the log too. Where a log reads no voltage V is 3.7 V: nobody knows how
+full that battery was. Remembered are V, when it was last read, s, and whether no log has been asked yet.
 """
 
 from __future__ import annotations
@@ -16,14 +27,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.effects.base import Effect, Memory, Motors, Reading
-from cfb_mjx.model.effects.fields import number
+from cfb_mjx.model.effects.base import Condition, Effect, Memory, Motors, Reading
+from cfb_mjx.model.effects.fields import HOVER_SPEED, number
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 NOMINAL_VOLTAGE = 3.7
-"""Of one lithium-polymer cell, V."""
+"""Of one lithium-polymer cell, V: half full, under the load of hover."""
 _LONG_AGO = 1000.0  # s
 
 
@@ -33,18 +44,41 @@ class BatterySag(Effect):
     name: ClassVar[str] = "battery_sag"
     meaning: ClassVar[str] = "rotor speed follows the battery's voltage"
     experiment: ClassVar[str] = "hover from a full battery to an empty one with the voltage logged"
-    units: ClassVar[dict[str, str]] = {"level": "1", "slope": "1", "lag": "s"}
+    units: ClassVar[dict[str, str]] = {
+        "level": "1",
+        "slope": "1",
+        "lag": "s",
+        "charge": "1",
+        "capacity": "A s",
+        "resistance": "ohm",
+        "power": "W",
+    }
     source: ClassVar[str] = (
         "Q. Quan, Introduction to Multicopter Design and Control, 2017, ch. 4 (motor and ESC model: speed against "
-        "voltage)"
+        "voltage); M. Chen, G. Rincon-Mora, Accurate electrical battery model, IEEE Trans. Energy Conversion 21(2), "
+        "2006, eq. 2 (open-circuit voltage)"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"level": (-0.1, 0.1), "slope": (0.0, 1.2), "lag": (0.002, 5.0)}
+    prior: ClassVar[dict[str, tuple[float, float]]] = {
+        "level": (-0.1, 0.1),
+        "slope": (0.0, 1.2),
+        "lag": (0.002, 5.0),
+        "charge": (0.05, 1.0),
+        "capacity": (900.0, 1800.0),
+        "resistance": (0.02, 0.2),
+        "power": (3.0, 15.0),
+    }
     limits: ClassVar[dict[str, Limits]] = {
         "level": Limits(-0.95, 2.0, -0.3, 0.3),
         "slope": Limits(-1.0, 4.0, 0.0, 1.5),
         "lag": Limits(0.0001, 1000.0, 0.001, 60.0),
+        "charge": Limits(0.0, 1.0, 0.0, 1.0),
+        "capacity": Limits(36.0, 36000.0, 900.0, 1800.0),
+        "resistance": Limits(0.0, 10.0, 0.005, 0.5),
+        "power": Limits(0.0, 1000.0, 1.0, 30.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("level", "slope")
+    # Beside a log the voltage is what was read.
+    assumed: ClassVar[tuple[str, ...]] = ("charge", "capacity", "resistance", "power")
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"lag": 0.02}, {"lag": 0.5})
 
     level: Float[Array, "*batch"] = eqx.field(converter=number)
@@ -52,7 +86,16 @@ class BatterySag(Effect):
     slope: Float[Array, "*batch"] = eqx.field(converter=number)
     """Relative change of speed per relative change of voltage."""
     lag: Float[Array, "*batch"] = eqx.field(converter=number, default=0.02)
-    """Of what the rotors feel behind what was read, s."""
+    """Of what the rotors feel behind the battery's voltage, s."""
+    charge: Float[Array, "*batch"] = eqx.field(converter=number, default=0.5)
+    """State of charge where a simulation begins: 1 full, 0 empty."""
+    capacity: Float[Array, "*batch"] = eqx.field(converter=number, default=1260.0)
+    """Charge of a full cell: 350 mAh, the drone's own battery."""
+    resistance: Float[Array, "*batch"] = eqx.field(converter=number, default=0.05)
+    """Of cell, plug and wires: a drone of the IDSIA nano-drone benchmark shows 0.1 V of dip at the power of hover."""
+    power: Float[Array, "*batch"] = eqx.field(converter=number, default=7.0)
+    """Of the four rotors at 1594 rad/s: 0.43 N at a torque of 5.7 mm times the thrust (firmware, platform CF21BL) are
+    3.9 W at the shafts, of motors and controllers with an efficiency of 55 %."""
 
     @classmethod
     def neutral(cls) -> BatterySag:
@@ -60,20 +103,43 @@ class BatterySag(Effect):
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
         one = rotor_speed[0]
-        return Vec(jnp.full_like(one, NOMINAL_VOLTAGE)), Vec(jnp.full_like(one, -_LONG_AGO))
+        full = jnp.asarray(self.charge, one.dtype) + 0.0 * one
+        voltage, _ = self.loaded(full, rotor_speed)
+        return Vec(voltage), Vec(jnp.full_like(one, -_LONG_AGO)), Vec(full), Vec(jnp.ones_like(one))
+
+    def loaded(self, charge: Any, rotor_speed: Vec) -> tuple[Any, Any]:
+        """Voltage [V] and current [A] of a cell that drives the rotors at these speeds."""
+        open_ = 3.685 + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201)) - 1.031 * jnp.exp(-35 * charge)
+        power = 0.25 * self.power * (rotor_speed * (1 / HOVER_SPEED)).map(lambda x: x * x * x).sum()
+        left = open_ * open_ - 4 * self.resistance * power
+        able = left > 0
+        voltage = 0.5 * (open_ + jnp.where(able, jnp.sqrt(jnp.where(able, left, 1.0)), 0.0))
+        return voltage, power / voltage
 
     def sense(self, memory: Memory, reading: Reading) -> Memory:
-        (voltage,), (time,) = memory
+        (voltage,), (time,), charge, (alone,) = memory
+        voltage = jnp.where(alone > 0, NOMINAL_VOLTAGE, voltage).astype(voltage.dtype)
         now = jnp.asarray(reading.time, time.dtype)
         known = jnp.isfinite(reading.voltage)
         # Not multiplied by the unknown: NaN would come through any weight, and through the derivative.
         measured = jnp.where(known, reading.voltage, voltage).astype(voltage.dtype)
         kept = jnp.exp(-jnp.maximum(now - time, 0.0) / self.lag)
-        return Vec(measured + (voltage - measured) * kept), Vec(jnp.where(known, now, time))
+        felt = measured + (voltage - measured) * kept
+        return Vec(felt), Vec(jnp.where(known, now, time)), charge, Vec(0.0 * alone)
+
+    def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
+        (voltage,), time, (charge,), (alone,) = condition.memory
+        now, current = self.loaded(charge, condition.rotor_speed)
+        felt = voltage + (now - voltage) * (1 - jnp.exp(-dt / self.lag))
+        left = charge - current * dt / self.capacity
+        simulated = alone > 0
+        voltage = jnp.where(simulated, felt, voltage)
+        charge = jnp.where(simulated, jnp.where(left > 0, left, 0.0), charge)
+        return Vec(voltage), time, Vec(charge), Vec(alone)
 
     def motors(
         self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
     ) -> tuple[Motors, Memory]:
-        (voltage,), _ = memory
+        voltage = memory[0][0]
         factor = 1 + self.level + self.slope * ((voltage - NOMINAL_VOLTAGE) / NOMINAL_VOLTAGE)
         return Motors(motors.target * factor, motors.time_constant), memory

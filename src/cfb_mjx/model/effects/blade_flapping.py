@@ -5,10 +5,10 @@ The disc tilts or, on stiff blades, the hub is twisted:
     tau_x = -(1 - anisotropy) c v_y,  tau_y = (1 + anisotropy) c v_x
     c = coefficient (Omega / 1594 rad/s) exp(climb v_z)
 
-in body axes with the mean rotor speed. The sign is free, because stiffness and the height of the discs over the rotors'
-centre pull in opposite directions. ``climb`` lets the moment depend on the flow through the discs, without ever turning
-it round. With ``anisotropy`` flow along the body twists it more than flow from the side, for what sits between the
-rotors (battery, decks) is longer than wide.
+with v the velocity through the air, in body axes, and the mean rotor speed. The sign is free, because stiffness and the
+height of the discs over the rotors' centre pull in opposite directions. ``climb`` lets the moment depend on the flow
+through the discs, without ever turning it round. With ``anisotropy`` flow along the body twists it more than flow from
+the side, for what sits between the rotors (battery, decks) is longer than wide.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ class BladeFlapping(Effect):
         "anisotropy": Limits(-1.0, 1.0, -1.0, 1.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
+    feels_air: ClassVar[bool] = True
     # Both are looked for at zero, and fitted once the moment is there.
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"climb": 0.0, "anisotropy": 0.0},)
 
@@ -65,7 +66,7 @@ class BladeFlapping(Effect):
         return cls(coefficient=0.0, climb=0.0)
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
-        vx, vy, vz = condition.velocity_body
+        vx, vy, vz = condition.airspeed_body
         c = self.coefficient * mean_hover_ratio(condition) * jnp.exp(self.climb * vz)
         return Wrench(
             wrench.force, wrench.torque + Vec(-(1 - self.anisotropy) * c * vy, (1 + self.anisotropy) * c * vx, 0.0)

@@ -25,9 +25,11 @@ from cfb_mjx.model.effects.command_delay import CommandDelay
 from cfb_mjx.model.effects.esc_rate_limit import EscRateLimit
 from cfb_mjx.model.effects.formula import ResidualFormula
 from cfb_mjx.model.effects.ground_effect import GroundEffect
+from cfb_mjx.model.effects.gust import Gust
 from cfb_mjx.model.effects.gyroscopic import Gyroscopic
 from cfb_mjx.model.effects.inertia import Inertia
 from cfb_mjx.model.effects.inflow_thrust import InflowThrust
+from cfb_mjx.model.effects.jet import Jet
 from cfb_mjx.model.effects.motor_asymmetry import MotorAsymmetry
 from cfb_mjx.model.effects.motor_gain_mismatch import MotorGainMismatch
 from cfb_mjx.model.effects.motor_second_order import MotorSecondOrder
@@ -43,6 +45,7 @@ from cfb_mjx.model.effects.thrust_scale import ThrustScale
 from cfb_mjx.model.effects.thrust_tilt import ThrustTilt
 from cfb_mjx.model.effects.torque_scale import TorqueScale
 from cfb_mjx.model.effects.wind import Wind
+from cfb_mjx.parameters.parameters import Parameters
 
 _PHYSICS: dict[str, type[Effect]] = {
     effect.name: effect
@@ -68,6 +71,8 @@ _PHYSICS: dict[str, type[Effect]] = {
         ParasiticDrag,
         BladeFlapping,
         Wind,
+        Gust,
+        Jet,
         PositionMoment,
         PayloadSwing,
     )
@@ -143,8 +148,13 @@ SENSOR_FAULTS: dict[str, SensorFault] = {
 """What a model file may name beside physics: it changes what is recorded, not how the drone flies."""
 
 
-def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
+def effect_from_mapping(item: Mapping[str, Any], where: str, parameters: Parameters | None = None) -> Effect:
     """Build an effect from ``{name, parameters}`` as written in a model YAML; what is left out is neutral.
+
+    Args:
+        item: the mapping.
+        where: the file, for errors.
+        parameters: of the same file, where there are any: fields of earlier versions may need them.
 
     Raises:
         CfbError: unknown effect, unknown parameter or a value that is no number or cannot be, named; ``where`` is the
@@ -165,6 +175,10 @@ def effect_from_mapping(item: Mapping[str, Any], where: str) -> Effect:
     for key in item:
         if key not in ("name", "parameters", "source", "uncertainty", "p_value"):
             raise CfbError(f"{where}: unknown key 'effects.{name}.{key}'.")
+    try:
+        values = kind.migrated(values, parameters)
+    except CfbError as error:
+        raise CfbError(f"{where}: {error}") from None
     neutral = kind.neutral()
     arguments = {field: getattr(neutral, field) for field in fields}
     for key, raw in values.items():

@@ -42,6 +42,8 @@ class EscRateLimit(Effect):
         "rotor": Limits(0.0, 1.0, 0.0, 1.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("slowness",)
+    # Of commands that have arrived, and of a rotor with all its lags.
+    rank: ClassVar[int] = 3
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"rotor": 0.0}, {"rotor": 1.0})
 
     slowness: Float[Array, "*batch"] = eqx.field(converter=number)

@@ -38,9 +38,12 @@ def hub_positions(parameters: Parameters) -> tuple[Vec, Vec]:
 
 
 def hub_velocities(condition: Condition) -> tuple[Vec, Vec, Vec]:
-    """Velocity of the four rotor hubs, v + omega x r_i, by body axis, m/s."""
+    """Velocity of the four rotor hubs through the air, v + omega x r_i, by body axis, m/s.
+
+    The air is taken to move alike at all four.
+    """
     x, y = hub_positions(condition.parameters)
-    (vx, vy, vz), (wx, wy, wz) = condition.velocity_body, condition.body_rate
+    (vx, vy, vz), (wx, wy, wz) = condition.airspeed_body, condition.body_rate
     return vx + wz * -y, vy + wz * x, vz + wx * y + wy * -x
 
 

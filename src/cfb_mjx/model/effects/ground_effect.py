@@ -43,6 +43,8 @@ class GroundEffect(Effect):
         "height": Limits(0.001, 10.0, 0.01, 1.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
+    # Of the thrust that the flow through the rotors leaves.
+    rank: ClassVar[int] = 1
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"height": 0.05}, {"height": 0.12}, {"height": 0.25})
 
     strength: Float[Array, "*batch"] = eqx.field(converter=number)

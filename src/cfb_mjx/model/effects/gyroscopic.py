@@ -1,23 +1,28 @@
 """Gyroscopic torque of the turning rotors:
 
-    tau = -omega x h,   h = rotor_inertia * sum_i(-yaw_i Omega_i) e_z
+    tau = -omega x h,   h = scale J_m sum_i(-yaw_i Omega_i) e_z
 
-where yaw_i is the sign of rotor i's reaction on the body (a rotor that pushes the body one way turns the other way).
-The torque is at right angles to the body rate: it does no work.
+with J_m the model's own moment of inertia of a rotor (``rotor_inertia``), so that a scale of 1 is what physics says and
+0 is the paper's model, and where yaw_i is the sign of rotor i's reaction on the body (a rotor that pushes the body one
+way turns the other way). The torque is at right angles to the body rate: it does no work.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
+from numbers import Real
+from typing import Any, ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from cfb_mjx.errors import CfbError
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.rotors import YAW_SIGNS
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Parameters
 
 
 class Gyroscopic(Effect):
@@ -26,21 +31,34 @@ class Gyroscopic(Effect):
     name: ClassVar[str] = "gyroscopic"
     meaning: ClassVar[str] = "the spinning rotors resist being turned"
     experiment: ClassVar[str] = "fast roll and pitch while climbing hard: rates at high rotor speed"
-    units: ClassVar[dict[str, str]] = {"rotor_inertia": "kg m^2"}
+    units: ClassVar[dict[str, str]] = {"scale": "1"}
     source: ClassVar[str] = (
         "S. Bouabdallah, Design and control of quadrotors with application to autonomous flying, EPFL thesis 3727, 2007"
     )
-    prior: ClassVar[dict[str, tuple[float, float]]] = {"rotor_inertia": (0.0, 2e-07)}
-    limits: ClassVar[dict[str, Limits]] = {"rotor_inertia": Limits(0.0, 0.0001, 0.0, 1e-06)}
-    strengths: ClassVar[tuple[str, ...]] = ("rotor_inertia",)
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"scale": (0.0, 4.0)}
+    limits: ClassVar[dict[str, Limits]] = {"scale": Limits(0.0, 1000.0, 0.0, 20.0)}
+    strengths: ClassVar[tuple[str, ...]] = ("scale",)
 
-    rotor_inertia: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of one rotor with its bell about its axis."""
+    scale: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Of the rotors' angular momentum, by what the model's J_m makes it."""
 
     @classmethod
     def neutral(cls) -> Gyroscopic:
-        return cls(rotor_inertia=0.0)
+        return cls(scale=0.0)
+
+    @classmethod
+    def migrated(cls, values: Mapping[str, Any], parameters: Parameters | None) -> Mapping[str, Any]:
+        if "rotor_inertia" not in values:
+            return values
+        values = dict(values)
+        absolute, own = values.pop("rotor_inertia"), None if parameters is None else float(parameters.rotor_inertia)
+        if not own or not isinstance(absolute, Real):
+            raise CfbError(
+                "effects.gyroscopic.parameters.rotor_inertia is a share of the model's own rotor_inertia now; "
+                "write scale in its place, 1 for all of it, and give the model a rotor_inertia above zero."
+            )
+        return values | {"scale": absolute / own}
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
-        momentum = -self.rotor_inertia * condition.rotor_speed.dot(YAW_SIGNS)
+        momentum = -self.scale * condition.parameters.rotor_inertia * condition.rotor_speed.dot(YAW_SIGNS)
         return Wrench(wrench.force, wrench.torque - condition.body_rate.cross(Vec(0.0, 0.0, momentum)))

@@ -2,8 +2,9 @@
 
     f_i -= coefficient (Omega_i / 1594 rad/s) (v + omega x r_i)_z
 
-in body axes, rotor by rotor: it damps heave, and through the hubs' own motion roll and pitch. A positive coefficient
-means that a climbing rotor loses thrust. The change is not clamped: near zero rotor speed it vanishes by itself.
+with v the velocity through the air, in body axes, rotor by rotor: it damps heave, and through the hubs' own motion roll
+and pitch. A positive coefficient means that a climbing rotor loses thrust. The change is not clamped: near zero rotor
+speed it vanishes by itself.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ class InflowThrust(Effect):
     prior: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (-0.01, 0.03)}
     limits: ClassVar[dict[str, Limits]] = {"coefficient": Limits(-1.0, 1.0, -0.05, 0.2)}
     strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
+    feels_air: ClassVar[bool] = True
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
     """Per rotor at hover speed."""

@@ -43,6 +43,8 @@ class MotorAsymmetry(Effect):
         "width": Limits(0.1, 100000.0, 1.0, 1000.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("spin_up", "spin_down")
+    # By the target the windings leave.
+    rank: ClassVar[int] = 2
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"width": 15.0}, {"width": 60.0})
 
     spin_up: Float[Array, "*batch"] = eqx.field(converter=number)

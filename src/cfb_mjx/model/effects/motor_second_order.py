@@ -36,6 +36,8 @@ class MotorSecondOrder(Effect):
     prior: ClassVar[dict[str, tuple[float, float]]] = {"lag": (0.0, 0.03)}
     limits: ClassVar[dict[str, Limits]] = {"lag": Limits(0.0, 1.0, 0.0, 0.1)}
     strengths: ClassVar[tuple[str, ...]] = ("lag",)
+    # Of the speed that battery and warmth leave.
+    rank: ClassVar[int] = 1
 
     lag: Float[Array, "*batch"] = eqx.field(converter=number)
     """Of the additional first-order lag; zero or positive."""

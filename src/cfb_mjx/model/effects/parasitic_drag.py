@@ -1,4 +1,4 @@
-"""Parasitic drag of the airframe: a force against the velocity through still air."""
+"""Parasitic drag of the airframe: a force against the velocity through the air."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from cfb_mjx.parameters.limits import Limits
 class ParasiticDrag(Effect):
     """F_i = -(linear_i + quadratic_i sqrt(v_i^2 + cross (|v|^2 - v_i^2))) v_i along each body axis i.
 
-    v is the velocity in body axes. With ``cross`` 0 the axes do not know of each other; with 1 the force grows with the
-    speed |v|, as that of a bluff body.
+    v is the velocity through the air in body axes. With ``cross`` 0 the axes do not know of each other; with 1 the
+    force grows with the speed |v|, as that of a bluff body.
     """
 
     name: ClassVar[str] = "parasitic_drag"
@@ -43,6 +43,7 @@ class ParasiticDrag(Effect):
     }
     # The linear part is what `rotor_drag` does at hover; tracing looks for it there.
     strengths: ClassVar[tuple[str, ...]] = ("quadratic",)
+    feels_air: ClassVar[bool] = True
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"cross": 0.0}, {"cross": 1.0})
 
     linear: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
@@ -55,7 +56,7 @@ class ParasiticDrag(Effect):
         return cls(linear=0.0, quadratic=0.0)
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
-        velocity = condition.velocity_body
+        velocity = condition.airspeed_body
         square = velocity.dot(velocity)
         # A square root has no slope at rest; what is added is far below what any drag can show.
         speed = velocity.map(lambda v: jnp.sqrt(v * v + self.cross * (square - v * v) + 1e-12))

@@ -4,7 +4,7 @@
     F_world = T n,  T = max(length |n'|^2 - n . F / M, 0) m M / (m + M)
 
 n is the unit vector from the drone to the load, a the drone's acceleration, M its mass and F the force (world) of all
-that comes before this effect: the tension T follows from the string keeping its length. A string does not push; where
+else but gravity: the tension T follows from the string keeping its length. A string does not push; where
 it would go slack the load is still carried along on its sphere. Remembered are n and n'; at the start the load hangs
 still. Swings are hardly damped, and once a string was slack nothing tells where they began: beside a log, the force
 the model misses turns n towards where the string pulls (a Luenberger observer).
@@ -18,7 +18,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.effects.base import Condition, Effect, Memory, Wrench
+from cfb_mjx.model.effects.base import CONSTRAINT, Condition, Effect, Memory, Wrench
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec, rotate, rotate_inverse
 from cfb_mjx.parameters.limits import Limits
@@ -54,6 +54,8 @@ class PayloadSwing(Effect):
         "damping_ratio": Limits(0.0, 10.0, 0.0, 1.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("mass",)
+    # The tension follows from all other forces.
+    rank: ClassVar[int] = CONSTRAINT
     probes: ClassVar[tuple[dict[str, float], ...]] = (
         {"length": 0.1, "damping_ratio": 0.05},
         {"length": 0.15, "damping_ratio": 0.05},

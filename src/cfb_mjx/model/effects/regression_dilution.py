@@ -4,7 +4,7 @@
     tau_i     <- (1 - unanswered) tau_i - unanswered reversion I_i omega_i,    i = x, y
     time_constant m' = omega_x^2 + omega_y^2 - m
 
-of all torques of the effects before it and the rotors. In gentle flight the torques of rotors and air nearly cancel, a
+of all torques of the rotors and all other effects. In gentle flight the torques of rotors and air nearly cancel, a
 controller cancels what the model misses as well, and the small sum a model computes is mostly error: of a small one
 only a share is to be expected (attenuation by errors in variables), of a large one, or in a flight that has been
 turning hard of late, all of it. In place of the rest is what follows on average, whatever brings it about: the body
@@ -22,7 +22,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.effects.base import Condition, Effect, Memory, Wrench
+from cfb_mjx.model.effects.base import EXPECTATION, Condition, Effect, Memory, Wrench
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
@@ -56,6 +56,8 @@ class RegressionDilution(Effect):
         "time_constant": Limits(0.001, 10000.0, 0.05, 60.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("dilution",)
+    # Of all torques there are.
+    rank: ClassVar[int] = EXPECTATION
     searched: ClassVar[bool] = False
 
     dilution: Float[Array, "*batch"] = eqx.field(converter=number)

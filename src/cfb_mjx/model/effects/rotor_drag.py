@@ -1,6 +1,6 @@
 """Rotor drag: a turning rotor resists being moved along its disc (induced drag and H-force).
 
-On each rotor i, with v_i = v + omega x r_i the velocity of its hub in body axes:
+On each rotor i, with v_i = v + omega x r_i the velocity of its hub through the air, in body axes:
 
     F_i,xy = -(coefficient / 4) (Omega_i / 1594 rad/s) v_i,xy
 
@@ -34,6 +34,7 @@ class RotorDrag(Effect):
     prior: ClassVar[dict[str, tuple[float, float]]] = {"coefficient": (0.0, 0.05)}
     limits: ClassVar[dict[str, Limits]] = {"coefficient": Limits(0.0, 10.0, 0.0, 0.2)}
     strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
+    feels_air: ClassVar[bool] = True
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
     """Of the four rotors together at hover speed."""

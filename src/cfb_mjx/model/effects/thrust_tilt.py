@@ -1,10 +1,11 @@
 """Thrust that does not point along body z: rotors mounted askew, or body axes that the estimator sees askew.
 
-    F += f (tilt_x, tilt_y, 0),  tau_z += f twist l / sqrt(2)
+    F_i = f_i (tilt + twist t_i),  tau += r_i x F_i
 
-with f the total thrust and small angles. The common part of the rotors' tilts moves the force sideways; the part that
-leans every rotor the same way round the drone (``twist``) turns it. f is the body-z force of the rotors and of whatever
-precedes this effect in the model's list.
+on each rotor i, with f_i its thrust, r_i its place, t_i the tangent counter-clockwise round the drone; small angles.
+The common part of the rotors' tilts (``tilt``) moves the force sideways; the part that leans every rotor the same way
+round the drone (``twist``) turns it. Where the rotors pull unequally, the first turns it as well and the second moves
+it. That the rotors' reaction torques lean too is left out.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.cog_offset import CogOffset
-from cfb_mjx.model.effects.fields import number, vector
+from cfb_mjx.model.effects.fields import hub_positions, number, vector
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 
 
 class ThrustTilt(Effect):
-    """F += f (tilt_x, tilt_y, 0), tau_z += f twist l / sqrt(2)."""
+    """F_i = f_i (tilt + twist t_i) on each rotor, tau += r_i x F_i."""
 
     name: ClassVar[str] = "thrust_tilt"
     meaning: ClassVar[str] = "the thrust does not point along the body's z axis"
@@ -49,8 +50,10 @@ class ThrustTilt(Effect):
         return cls(tilt=0.0, twist=0.0)
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
-        x, y = Vec.unstack(self.tilt)
-        thrust = wrench.force[2]
-        arm = condition.parameters.rotor_spacing * 0.5**0.5
-        turn = Vec(0.0, 0.0, thrust * self.twist * arm)
-        return Wrench(wrench.force + Vec(thrust * x, thrust * y, 0.0), wrench.torque + turn)
+        x, y = hub_positions(condition.parameters)
+        along_x, along_y = Vec.unstack(self.tilt)
+        thrust = condition.loads.thrust
+        round_ = self.twist / (condition.parameters.rotor_spacing * 0.5**0.5)
+        force_x, force_y = thrust * (along_x + -round_ * y), thrust * (along_y + round_ * x)
+        turn = (x * force_y - y * force_x).sum()
+        return Wrench(wrench.force + Vec(force_x.sum(), force_y.sum(), 0.0), wrench.torque + Vec(0.0, 0.0, turn))

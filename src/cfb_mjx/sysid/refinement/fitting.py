@@ -11,7 +11,7 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.model.effects import KNOWN
+from cfb_mjx.model.effects import KNOWN, ParasiticDrag, RotorDrag, Wind
 from cfb_mjx.sysid.refinement.numbers import Number, with_values
 from cfb_mjx.sysid.refinement.predictions import AT_BOUND, TRIM, Predictions, Trim
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
@@ -112,5 +112,8 @@ def _prepared(model: Quadrotor, numbers: tuple[Number, ...]) -> Quadrotor:
     names = dict.fromkeys(n.effect for n in numbers)
     here = {type(e).name for e in model.effects}
     added = tuple(KNOWN[name].neutral() for name in names if name not in here)
+    if {RotorDrag.name, ParasiticDrag.name} & {*names, *here}:
+        # Their drag carries a wind; a conductance beside it would count it twice.
+        added = tuple(Wind(0.0, 0.0) if isinstance(effect, Wind) else effect for effect in added)
     effects = (*model.effects, *added, Trim(jnp.zeros(3)))
     return Quadrotor(model.parameters, effects, body=model.body, integrator="rk4", rotor_loads="instant")

@@ -51,6 +51,8 @@ class Number:
 def plausible_numbers(parameters: Parameters, effects: Sequence[str]) -> tuple[Number, ...]:
     """Every number of some effects within its prior range; inertia and rate damping within `INERTIA`, `RATE_DAMPING`.
 
+    Fields that no flight tells (`Effect.assumed`) stay as the model has them.
+
     Raises:
         CfbError: an effect the catalogue does not have, or one that is no physics.
     """
@@ -80,6 +82,8 @@ def _numbers(effects: Sequence[str], bounds: dict) -> tuple[Number, ...]:
             raise CfbError(f"{name}: no such effect; the catalogue has {', '.join(sorted(KNOWN))}.")
         neutral = KNOWN[name].neutral()
         for field, prior in KNOWN[name].prior.items():
+            if field in KNOWN[name].assumed:
+                continue
             low, high = bounds.get((name, field), prior)
             value = np.asarray(getattr(neutral, field))
             found += [Number(name, field, i, low, high) for i in (range(value.size) if value.ndim else [None])]

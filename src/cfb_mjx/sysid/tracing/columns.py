@@ -61,10 +61,13 @@ def strengths(name: str) -> list[list[Column]]:
 
 
 def shapes(effect: Effect) -> list[Column]:
-    """Columns of what describes the shape of an effect that is there: fitted once its strength is known."""
+    """Columns of what describes the shape of an effect that is there: fitted once its strength is known.
+
+    What no flight tells (`Effect.assumed`) is left as it is.
+    """
     kind = type(effect)
     moving = {key for probe in kind.probes for key in probe}
-    return columns_of(kind.name, tuple(f for f in kind.prior if f in moving), {})
+    return columns_of(kind.name, tuple(f for f in kind.prior if f in moving and f not in kind.assumed), {})
 
 
 def bounds(name: str, item: str) -> tuple[float, float]:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import jax.numpy as jnp
+
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import CATALOGUE, Effect
+from cfb_mjx.model.effects import CATALOGUE, Effect, Wind
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.search import Search
@@ -62,7 +64,11 @@ def fit_given(
     sensors = replace(sensors, faults=faults.as_logged if as_logged else faults)
     search = Search.start(list(logs), parameters, delay, sensors, declared, names)
     progress("replaying the declared model")
-    hypothesis = search.settled(replace(search.learned(search.nothing()), present=tuple(names)))
+    nothing = search.learned(search.nothing())
+    # Where nobody declared a wind, one is a force, as in a search.
+    new = Wind.name not in {type(effect).name for effect in declared}
+    effects = tuple(replace(e, felt=jnp.zeros(())) if new and isinstance(e, Wind) else e for e in nothing.effects)
+    hypothesis = search.settled(replace(nothing, effects=effects, present=tuple(names)))
     for number in range(1, ROUNDS):
         progress(f"fitting {', '.join(names)}, round {number + 1}")
         hypothesis = search.settled(hypothesis)

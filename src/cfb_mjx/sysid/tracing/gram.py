@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects import Condition, Wrench
 from cfb_mjx.model.effects.formula import body_signals, place_signals
-from cfb_mjx.model.quadrotor import Quadrotor, at_rotor_center, conditions, prepare, remembering
+from cfb_mjx.model.quadrotor import Quadrotor, at_rotor_center, in_still_air, prepare
 from cfb_mjx.model.state import State, unstack
 from cfb_mjx.model.vector import Vec, rotate_inverse
 from cfb_mjx.parameters import Parameters
@@ -86,8 +86,7 @@ def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, 
     prepared = prepare(model)
     middle = (flight.position, flight.velocity, flight.quaternion, flight.body_rate, driven)
     at = unstack(State(*map(between, middle)), prepared.parameters.center_of_gravity)
-    (seen,) = conditions(prepared, remembering(at, ((),)), at.rotor_speed)
-    return prepared.parameters, seen
+    return prepared.parameters, in_still_air(prepared, at, at.rotor_speed)
 
 
 @eqx.filter_jit
