@@ -138,7 +138,7 @@ def longest_delay_s(task: Task, nominal: Quadrotor, magnitude: Float[Array, ""] 
         value, spread = getattr(nominal.parameters, name), ranges.get(name)
         if isinstance(value, jax.core.Tracer) or (spread is not None and isinstance(magnitude, jax.core.Tracer)):
             return None
-        value = float(np.max(value))
+        value = float(np.asarray(value).max())
         if spread is not None:
             if spread.relative and value == 0:
                 raise CfbError(

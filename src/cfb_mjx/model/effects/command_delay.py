@@ -58,7 +58,7 @@ class CommandDelay(Effect):
     def begin(self, rotor_speed: Vec, parameters: Parameters, dt: float) -> Memory:
         longest = self.prior["delay"][1]
         if not isinstance(self.delay, jax.core.Tracer):
-            longest = max(longest, float(np.max(self.delay)))
+            longest = max(longest, float(np.asarray(self.delay).max()))
         return self._steady(rotor_speed, parameters, max(ROWS, math.ceil(longest / dt - 1e-6) + 1))
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
