@@ -16,7 +16,7 @@ from cfb_mjx.logs import write_mcap
 from cfb_mjx.model import CATALOGUE, Quadrotor
 from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.plugins import plugged
-from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
+from cfb_mjx.sysid.tracing.checkpoint import identity
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.train.config import load_config
 from cfb_mjx.train.run import Training
@@ -101,7 +101,7 @@ def test_a_model_with_it_predicts_flies_and_trains(folder, closed, tmp_path, cap
 def test_without_the_plugin_a_model_with_it_is_refused_by_a_sentence_that_says_how(folder, capsys):
     assert main(["fly", "pid", "--model", str(folder / "mine.yaml")]) == 2
     said = capsys.readouterr().err
-    assert "mine: unknown effect 'air_drag'" in said
+    assert "mine.yaml: unknown effect 'air_drag'" in said
     assert "one of your own needs --plugin FILE.py" in said
 
 
@@ -109,14 +109,14 @@ def test_a_search_and_a_training_do_not_go_on_with_another_text_of_the_effect(fo
     """Half of it would be computed with one physics and half with another."""
     plugin, base = tmp_path / "my_effects.py", load_model_file("cfb-guards")
     plugin.write_text(AIR_DRAG)
-    keys, identities = [Checkpoint.open(tmp_path / "search.json", [], base).key], []
+    keys, identities = [identity([], base)], []
     for text in (AIR_DRAG, AIR_DRAG, AIR_DRAG.replace("* -self", "* -2.0 * self")):
         plugin.write_text(text)
         with plugged(plugin):
-            keys.append(Checkpoint.open(tmp_path / "search.json", [], base).key)
+            keys.append(identity([], base))
             training = Training.prepare(load_config("target", (f"model={folder / 'mine.yaml'}",)), {})
             identities.append(training.identity()["effects"])
-    assert keys[1] == keys[2]
-    assert len(set(keys)) == 3
+    assert keys[1] == keys[2] != keys[3]
+    assert keys[0] not in keys[1:]
     assert identities[0] == identities[1] != identities[2]
     assert "effects" not in Training.prepare(load_config("target"), {}).identity()
