@@ -25,7 +25,7 @@ from cfb_mjx.sysid.identification.robust import tempered
 from cfb_mjx.sysid.identification.shooting import shoot
 from cfb_mjx.sysid.identification.solver import RIDGE, least_squares
 from cfb_mjx.sysid.identification.uncertainty import assess, most_contradicted
-from cfb_mjx.sysid.identification.unknowns import GROUPS, UNITS, Unknowns, at_the_border, choose
+from cfb_mjx.sysid.identification.unknowns import GROUPS, OFFSETS, UNITS, Unknowns, at_the_border, choose
 
 ROUNDS = 8
 """Noise levels and parameters are found in turns, at most so often."""
@@ -36,6 +36,9 @@ BLOCK = 128
 MASS_STD = 0.05
 """Of the mass as stated, relative, where nothing else is said: decks, batteries and guards come and go, and no flight
 tells the mass from the thrust."""
+BLUR = 0.0025
+"""What commands between rows 10 ms apart, put on a parabola, leave wrong in the constants, relative: found on flights
+of known drones (`docs/coverage.md`); it grows with the square of the interval."""
 HELD = 1e5
 """Ridge of what is held: a prior of 1e-5 units."""
 PRIORS = {"thrust_scale": 0.3, "torque_scale": 0.5, "command_hold": 1.0}
@@ -120,7 +123,12 @@ def fit(
     judged = tuple(name for name in unknowns.names if name in (*fitted, *stated))
     columns = [unknowns.names.index(name) for name in judged]
     priors = {"command_hold": PRIORS["command_hold"]} | stated
-    uncertainty = assess(blocks[0], blocks[1][..., columns], judged, priors)
+    blur = np.array([_blur(name, float(v)) for name, v in zip(unknowns.names, unknowns.values(vector), strict=True)])
+    # Only where some commands were not logged, and nothing else says how fast the rotors turned.
+    interval = float(np.median(np.asarray(segments.interval)[np.asarray(segments.interval) > 0]))
+    missing = 1 - min(max(float(unknowns.hold(vector)) / interval, 0.0), 1.0) ** 2
+    blur *= (interval / 0.01) ** 2 * missing * (use_measured is False or not np.all(np.asarray(data.segments.measured)))
+    uncertainty = assess(blocks[0], blocks[1][..., columns], judged, priors, blur[columns])
     impossible = {} if not set(GROUPS["inertia"]) & set(fitted) else at_the_border(unknowns.apply(vector))
     return summarise(
         unknowns,
@@ -135,6 +143,13 @@ def fit(
         whiteness=dict(zip(CHANNELS, map(float, _lag_one(residual)), strict=True)),
         feedback=detect(segments, residual),
     )
+
+
+def _blur(name: str, value: float) -> float:
+    """`BLUR` in the optimiser's units: of the value, a tenth of it for what slow torques tell, nothing for the log."""
+    if name in ("mass", "command_hold"):
+        return 0.0
+    return 0.1 * BLUR * abs(value) / OFFSETS[name] if name in OFFSETS else BLUR
 
 
 def _playing(asked: tuple[str, ...]) -> tuple[str, ...]:

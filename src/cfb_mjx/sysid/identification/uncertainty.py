@@ -52,6 +52,7 @@ def assess(
     jacobian: np.ndarray,
     names: tuple[str, ...],
     priors: dict[str, float] | None = None,
+    blur: np.ndarray | float = 0.0,
     bootstraps: int = 400,
 ) -> Uncertainty:
     """Uncertainty at the optimum.
@@ -61,6 +62,7 @@ def assess(
         jacobian: (blocks, ..., k) its derivatives by relative changes of the named quantities.
         names: of the k parameters.
         priors: standard deviations of what is known without the data, about the optimum.
+        blur: (k,) standard deviations that no amount of data makes smaller.
         bootstraps: resamples of the blocks.
 
     The covariance is that of the normal equations, by SVD, widened to the block bootstrap's where that is larger: the
@@ -77,6 +79,7 @@ def assess(
     keep = rows[~loose].T
     covariance = keep @ np.diag(singular[~loose] ** -2.0) @ keep.T
     covariance = np.maximum(1.0, _inflation(jacobian, residual, known**2, keep, covariance, bootstraps)) * covariance
+    covariance = covariance + np.diag(np.broadcast_to(blur, k) ** 2)
     deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     free = [row for row, is_loose in zip(rows, loose, strict=True) if is_loose]
     moved = [name for i, name in enumerate(names) if any(abs(v[i]) > SHARE for v in free)]
