@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from cfb_mjx.cli import refining
-from cfb_mjx.errors import CfbError
+from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.logs import read_log
-from cfb_mjx.model.effects import RotorDrag
+from cfb_mjx.model.effects import Inertia, RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.sysid.sensor_faults import HEALTHY
 from cfb_mjx.sysid.tracing.given import Given
@@ -48,6 +48,20 @@ def test_a_number_that_ends_at_its_bound_says_so(monkeypatch):
 
     assert found(0.0)
     assert not found(0.01)
+
+
+def test_effects_that_are_not_fitted_anew_keep_what_is_known_of_them(monkeypatch):
+    """A fitted inertia may be one that no body has, as long as the file says how sure it is."""
+    known = {"relative": [0.1, 0.1, 0.1]}
+    inertia = {"name": "inertia", "parameters": {"relative": [0.2, -0.1, 0.4]}, "uncertainty": known}
+    effects = (Inertia(relative=[0.2, -0.1, 0.4]), RotorDrag(coefficient=0.01))
+    given = Given(effects, {"rotor_drag": {"coefficient": 1e-3}}, HEALTHY)
+    monkeypatch.setattr("cfb_mjx.sysid.tracing.given.fit_given", lambda *_: given)
+    base = replace(load_model_file("cfb-guards"), effects=(inertia,))
+    with pytest.warns(CfbWarning, match="no rigid body"):
+        refined, report = refining.by_innovations(base, [read_log(LOG)], ["rotor_drag"])
+    assert refined.effects[0]["uncertainty"] == known
+    assert list(report["numbers"]) == ["rotor_drag.coefficient"]
 
 
 def test_plants_say_nothing_and_unknown_kinds_are_refused(tmp_path):

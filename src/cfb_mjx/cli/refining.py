@@ -93,10 +93,10 @@ def by_innovations(
     delay = usual_delay(logs, parameters)
     declared = Quadrotor.from_file(base).effects
     found = fit_given(logs, parameters, names, declared, delay, progress, as_logged)
-    rows, mappings = {}, _mappings(found.effects, found.uncertainty)
+    rows, mappings = {}, _mappings(found.effects, _kept(base, names) | found.uncertainty)
     for mapping in mappings:
         std = mapping.get("uncertainty")
-        for field, value in mapping["parameters"].items() if std else ():
+        for field, value in mapping["parameters"].items() if std and mapping["name"] in names else ():
             low, high = bounds(mapping["name"], field)
             for name, (v, s) in _pairs(f"{mapping['name']}.{field}", value, std.get(field)).items():
                 rows[name] = {"value": v, "std": s, "at_bound": not low < v < high}
@@ -129,7 +129,7 @@ def by_predictions(
         own = uncertainty.setdefault(number.effect, {})
         own[number.field] = known if number.index is None else [*own.get(number.field, []), known]
     kind = "predictor" if predictor else base.kind
-    effects = (*_mappings(found.model.effects, uncertainty), *faults.to_mappings())
+    effects = (*_mappings(found.model.effects, _kept(base, names) | uncertainty), *faults.to_mappings())
     report = {
         "numbers": rows,
         "loss": {"before": found.cost[0], "after": found.cost[1]},
@@ -154,6 +154,11 @@ def _mappings(effects: tuple[Effect, ...], uncertainty: dict[str, dict]) -> list
 
     found = [effect_to_mapping(effect) for effect in effects]
     return [m | ({"uncertainty": uncertainty[m["name"]]} if uncertainty.get(m["name"]) else {}) for m in found]
+
+
+def _kept(base: ModelFile, names: list[str]) -> dict[str, dict]:
+    """What the model says of the uncertainty of effects that are not fitted anew."""
+    return {e["name"]: e["uncertainty"] for e in base.effects if "uncertainty" in e and e["name"] not in names}
 
 
 def _description(base: ModelFile, names: list[str]) -> str:
