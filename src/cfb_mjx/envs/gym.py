@@ -122,7 +122,7 @@ class TargetVectorEnv(VectorEnv):
 
         self._begin, self._fly = jax.jit(begun), jax.jit(fly)
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, *, seed: Any = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
         """Begin all episodes; the same seed gives the same drones, starts and noise, none gives ones of their own."""
         _require_jax()
         if not (seed is None or isinstance(seed, int | np.integer)):
@@ -133,7 +133,7 @@ class TargetVectorEnv(VectorEnv):
         self._episodes, seen, truth = self._begin(self._next_key())
         return np.asarray(seen, np.float32), _shown(truth, np.ones(self.num_envs, bool))
 
-    def step(self, actions: np.ndarray):
+    def step(self, actions: Any):
         """Observations, rewards, whether failed, whether timed out, and the info.
 
         Raises:
@@ -206,7 +206,7 @@ class TargetEnv(gymnasium.Env):
         self._flying = True
         return seen[0], _of_one(info)
 
-    def step(self, action: np.ndarray):
+    def step(self, action: Any):
         """Observation, reward, whether failed, whether timed out, info.
 
         Raises:
