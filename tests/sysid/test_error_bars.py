@@ -55,7 +55,7 @@ def scores(found, truth=DRONE) -> dict[str, float]:
 @pytest.fixture(scope="module")
 def flight():
     """250 Hz rows of a 500 Hz loop: every other command is not logged."""
-    return fly(drone(), 12.0, seed=21, measure_rotors=False, loop=1)[0]
+    return fly(drone(), 12.0, seed=21, measure_rotors=False, dither=0.0, loop=1)[0]
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def found(flight):
 def test_a_drone_that_is_not_the_preset_is_within_its_error_bars(found):
     assert set(DRONE) <= set(found.estimates)
     assert max(map(abs, scores(found).values())) < 3.5, scores(found)
-    assert all(found.estimates[n].std < 0.03 * value for n, value in DRONE.items())
+    assert all(found.estimates[n].std < 0.05 * value for n, value in DRONE.items())
 
 
 def test_commands_between_the_rows_are_not_taken_for_a_faster_motor(found):
