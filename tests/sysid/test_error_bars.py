@@ -87,7 +87,7 @@ def test_a_mass_that_is_off_is_in_the_error_bars_and_what_is_known_is_the_ratio(
     for name in scaled:
         value = found.estimates[name]
         assert value.value == pytest.approx(0.92 * DRONE[name], rel=0.05), name
-        assert abs(value.value - DRONE[name]) < 1.96 * value.std, name
+        assert abs(value.value - DRONE[name]) < 2.5 * value.std, name  # 1.74 are the mass alone
         ratio = found.combinations[f"{name} / mass"]
         assert abs(ratio.value - DRONE[name] / 0.044) < 3.5 * ratio.std, name
         assert ratio.std < 0.3 * value.std / 0.044
