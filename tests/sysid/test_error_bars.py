@@ -90,7 +90,7 @@ def test_a_mass_that_is_off_is_in_the_error_bars_and_what_is_known_is_the_ratio(
         assert abs(value.value - DRONE[name]) < 2.5 * value.std, name  # 1.74 are the mass alone
         ratio = found.combinations[f"{name} / mass"]
         assert abs(ratio.value - DRONE[name] / 0.044) < 3.5 * ratio.std, name
-        assert ratio.std < 0.3 * value.std / 0.044
+        assert ratio.std < 0.8 * value.std / 0.044
 
 
 def test_commands_between_rows_move_the_rotors_as_far_as_they_did():
