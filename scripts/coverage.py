@@ -47,7 +47,7 @@ CONDITIONS = {
     "250": Condition("250 Hz, 30 s", 30, 250),
     "500": Condition("500 Hz (every command logged), 14 s", 14, 500),
     "100": Condition("100 Hz, 60 s", 60, 100),
-    "irregular": Condition("irregular rows: half of 500 Hz, at random, 28 s", 28, 500, irregular=True),
+    "irregular": Condition("irregular rows: 2, 4 or 6 ms apart at random, 28 s", 28, 500, irregular=True),
     "short": Condition("250 Hz, 3 s", 3, 250),
     "omega": Condition("250 Hz, rotor speeds measured, 30 s", 30, 250, ("--omega",)),
     "omega100": Condition("100 Hz, rotor speeds measured, 60 s", 60, 100, ("--omega",)),
@@ -91,7 +91,8 @@ def one(log, drone: dict, condition: Condition, rng) -> dict:
     from cfb_mjx.sysid.identification.fitting import fit
 
     if condition.irregular:
-        keep = np.flatnonzero(rng.random(len(log.time)) < 0.5)
+        keep = np.cumsum(rng.integers(1, 4, len(log.time)))
+        keep = keep[keep < len(log.time)]
         log = dataclasses.replace(log, **{f: getattr(log, f)[keep] for f in ROWS if getattr(log, f) is not None})
     error = 1.0 if condition.mass_std is None else 1 + condition.mass_std * rng.normal()
     mass = drone["stated_mass"] * error

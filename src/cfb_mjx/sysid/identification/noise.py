@@ -12,6 +12,10 @@ from cfb_mjx.sysid.identification.flight_data import FlightData
 
 _SHORTEST, _LONGEST = 0.03, 3.0  # correlation time of the disturbance, s
 
+UNTIMED = 0.3
+"""Least of `Noise.command`: a step came at any moment between two rows (1 / sqrt(12) of it), however smooth the others
+are. Steps that come in time with the rows would else decide how long commands act."""
+
 
 class Noise(eqx.Module):
     """Standard deviations, one per axis where there are axes, and the two time constants that go with them."""
@@ -82,7 +86,7 @@ class Noise(eqx.Module):
             rotor=x[13] + 1e-2,
             rotor_walk=x[14] + 1e-2,
             rotor_disturbance=x[15] + 1e-2,
-            command=x[16] + 1e-4,
+            command=jnp.maximum(x[16], UNTIMED),
         )
 
     @staticmethod
@@ -100,7 +104,7 @@ class Noise(eqx.Module):
             rotor=max(rotor, 1.0),
             rotor_walk=30.0,
             rotor_disturbance=20.0,
-            command=0.2,
+            command=2 * UNTIMED,
         )
         # An explicit type: weakly typed numbers would compile every program twice.
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), levels)
