@@ -72,7 +72,7 @@ class BatterySag(Effect):
         "slope": Limits(-1.0, 4.0, 0.0, 1.5),
         "lag": Limits(0.0001, 1000.0, 0.001, 60.0),
         "charge": Limits(0.0, 1.0, 0.0, 1.0),
-        "capacity": Limits(36.0, 36000.0, 900.0, 1800.0),
+        "capacity": Limits(1.0, 36000.0, 900.0, 1800.0),
         "resistance": Limits(0.0, 10.0, 0.005, 0.5),
         "power": Limits(0.0, 1000.0, 1.0, 30.0),
     }

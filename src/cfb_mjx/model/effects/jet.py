@@ -50,7 +50,7 @@ class Jet(Effect):
     limits: ClassVar[dict[str, Limits]] = {
         "speed": Limits(0.0, 100.0, 0.0, 20.0),
         "origin": Limits(-1e4, 1e4, -100.0, 100.0),
-        "direction": Limits(-1e3, 1e3, -1.0, 1.0),
+        "direction": Limits(-1e3, 1e3, -1e3, 1e3),
         "width": Limits(1e-3, 100.0, 0.02, 2.0),
         "spreading": Limits(0.0, 2.0, 0.05, 0.3),
     }
