@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Literal
 
@@ -39,6 +40,8 @@ tells the mass from the thrust."""
 BLUR = 0.004
 """What commands between rows 10 ms apart, put on a parabola, leave wrong in the constants, relative: found on flights
 of known drones (`docs/coverage.md`); it grows with the square of the interval."""
+NEARLY = 0.5
+"""Share of the interval between rows from which on it is asked whether commands act until the next row."""
 HELD = 1e5
 """Ridge of what is held: a prior of 1e-5 units."""
 PRIORS = {"thrust_scale": 0.3, "torque_scale": 0.5, "command_hold": 1.0}
@@ -103,12 +106,22 @@ def fit(
     if not (use_measured and bool(np.any(np.asarray(segments.measured)))):
         tried = [name for name in tried if name not in NEED_ROTOR_SPEED]
     contradicted: list[str] = []
+    interval = float(np.median(np.asarray(segments.interval)[np.asarray(segments.interval) > 0]))
     while True:
         free = (*asked, *contradicted, "command_hold")
         ridge = jnp.asarray([1 / PRIORS.get(n, 1 / RIDGE) if n in free else HELD for n in unknowns.names])
         if over is not None:  # placed as the rounds return it, or the second would compile anew
             vector, noise, ridge = over.whole((vector, noise, ridge))
         vector, noise = _settled(unknowns, vector, noise, segments, use_measured, robust, ridge, progress)
+        if not contradicted and "command_hold" not in asked and float(unknowns.hold(vector)) > NEARLY * interval:
+            # A free hold takes every step of a command for uncertain, and so the rotors' own readings for better than
+            # they are: where commands come in time with the rows, all motor constants lean by several deviations.
+            timed = replace(unknowns, timed=jnp.ones(()))
+            other = _settled(timed, vector, noise, segments, use_measured, robust, ridge, progress)
+            fits = (unknowns, vector, noise), (timed, *other)
+            free_hold, in_time = (float(_surprise(*each, segments, use_measured, robust)) for each in fits)
+            if in_time <= free_hold:
+                unknowns, vector, noise = fits[1]
         residual, jacobian = map(np.asarray, fit_slopes(unknowns, vector, noise, segments, use_measured, robust))
         blocks = in_blocks(segments, residual, jacobian @ np.linalg.inv(unknowns.slope(vector)))
         name = most_contradicted(*blocks, unknowns.names, free, [n for n in tried if n not in contradicted])
@@ -117,7 +130,8 @@ def fit(
         contradicted.append(name)
     if progress is not None:
         progress(ROUNDS, ROUNDS)
-    fitted = tuple(name for name in unknowns.names if name in free)
+    is_timed = float(unknowns.timed) > 0
+    fitted = tuple(name for name in unknowns.names if name in free and not (is_timed and name == "command_hold"))
     deviation = MASS_STD if mass_std is None else mass_std / float(nominal.mass)
     stated = {} if "mass" in asked or deviation == 0 else {"mass": deviation}
     judged = tuple(name for name in unknowns.names if name in (*fitted, *stated))
@@ -125,7 +139,6 @@ def fit(
     priors = {"command_hold": PRIORS["command_hold"]} | stated
     blur = np.array([_blur(name, float(v)) for name, v in zip(unknowns.names, unknowns.values(vector), strict=True)])
     # Only where some commands were not logged, and nothing else says how fast the rotors turned.
-    interval = float(np.median(np.asarray(segments.interval)[np.asarray(segments.interval) > 0]))
     missing = 1 - min(max(float(unknowns.hold(vector)) / interval, 0.0), 1.0) ** 2
     blur *= (interval / 0.01) ** 2 * missing * (use_measured is False or not np.all(np.asarray(data.segments.measured)))
     uncertainty = assess(blocks[0], blocks[1][..., columns], judged, priors, blur[columns])
@@ -204,6 +217,15 @@ def _residual(vector, unknowns: Unknowns, noise: Noise, segments: Segments, use_
     parameters = unknowns.apply(vector)
     segments = as_held(parameters, unknowns.hold(vector), segments)
     return tempered(whitened(parameters, noise, segments, use_measured, robust), robust)
+
+
+@eqx.filter_jit
+def _surprise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
+    """Negative logarithm of the likelihood per row."""
+    parameters = unknowns.apply(vector)
+    segments = as_held(parameters, unknowns.hold(vector), segments)
+    driven = drive(parameters, noise, segments, use_measured, robust)
+    return negative_log_likelihood(parameters, noise, segments, driven, use_measured, robust)
 
 
 @eqx.filter_jit

@@ -167,14 +167,15 @@ def as_held(parameters: Parameters, hold: Float[Array, ""] | None, segments: Seg
 
     Args:
         parameters: the drone; only the motors' lag matters, by which later commands count for more.
-        hold: s; None takes every command to act until the next row.
+        hold: s; None, or infinite, takes every command to act until the next row.
         segments: flight data.
     """
     if hold is None:
         return eqx.tree_at(lambda s: s.doubt, segments, jnp.zeros_like(segments.doubt))
     interval = segments.interval[:, 1:, None]
     safe = jnp.where(interval > 0, interval, 1.0)
-    held = jnp.clip(hold / safe, -0.5, 1.5)
+    timed = jnp.isinf(hold)
+    held = jnp.where(timed, 1.0, jnp.clip(jnp.where(timed, 0.0, hold) / safe, -0.5, 1.5))
     share = 0.5 * (1 - held) * (1 + (1 + held) * interval / (6 * parameters.motor_time_constant))
     step = jnp.diff(segments.command, axis=1)
     ratio = jnp.concatenate([jnp.ones_like(safe[:, :1]), safe[:, :-1] / safe[:, 1:]], axis=1)

@@ -63,6 +63,8 @@ class Unknowns(eqx.Module):
 
     names: tuple[str, ...] = eqx.field(static=True)
     nominal: Parameters
+    timed: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.0)
+    """1 where every command acts until the next row, whatever ``command_hold`` says."""
 
     @property
     def start(self) -> Float[Array, "k"]:
@@ -97,9 +99,15 @@ class Unknowns(eqx.Module):
         )
 
     def hold(self, vector: Float[Array, "k"]) -> Float[Array, ""] | None:
-        """How long a logged command acts before the next one that was sent, s; None where that is not fitted."""
+        """How long a logged command acts before the next one that was sent, s; infinite where until the next row.
+
+        None where that is not fitted.
+        """
         if "command_hold" not in self.names:
             return None
+        return jnp.where(self.timed > 0, jnp.inf, self._hold(vector))
+
+    def _hold(self, vector):
         return HOLD + OFFSETS["command_hold"] * vector[self.names.index("command_hold")]
 
     def values(self, vector: Float[Array, "k"]) -> Float[Array, "k"]:
@@ -111,7 +119,7 @@ class Unknowns(eqx.Module):
             "thrust_linear": p.thrust_polynomial[2],
             "cog_x": p.center_of_gravity[0],
             "cog_y": p.center_of_gravity[1],
-            "command_hold": self.hold(vector),
+            "command_hold": self._hold(vector) if "command_hold" in self.names else None,
         }
         return jnp.stack([known[name] for name in self.names])
 
