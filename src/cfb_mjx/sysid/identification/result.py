@@ -47,7 +47,7 @@ class Fit:
     rows: int
     """Measured rows (innovation) or windows (shooting) that were fitted."""
     hold: float | None = None
-    """How long a logged command acted, s (innovation)."""
+    """How long a logged command acted, s (innovation); None: until the next row."""
     contradicted: tuple[str, ...] = ()
     """What was to be held but is fitted, because the flights contradict the value it had."""
     noise: Noise | None = None
