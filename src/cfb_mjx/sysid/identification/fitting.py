@@ -40,7 +40,7 @@ tells the mass from the thrust."""
 BLUR = 0.004
 """What commands between rows 10 ms apart, put on a parabola, leave wrong in the constants, relative: found on flights
 of known drones (`docs/coverage.md`); it grows with the square of the interval."""
-NEARLY = 0.5
+NEARLY = 0.75
 """Share of the interval between rows from which on it is asked whether commands act until the next row."""
 HELD = 1e5
 """Ridge of what is held: a prior of 1e-5 units."""
@@ -221,9 +221,10 @@ def _residual(vector, unknowns: Unknowns, noise: Noise, segments: Segments, use_
 
 @eqx.filter_jit
 def _surprise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
-    """Negative logarithm of the likelihood per row."""
+    """Negative logarithm of the likelihood per row, of commands that are what `as_held` makes of them and no other."""
     parameters = unknowns.apply(vector)
     segments = as_held(parameters, unknowns.hold(vector), segments)
+    segments = eqx.tree_at(lambda s: s.doubt, segments, jnp.zeros_like(segments.doubt))
     driven = drive(parameters, noise, segments, use_measured, robust)
     return negative_log_likelihood(parameters, noise, segments, driven, use_measured, robust)
 
