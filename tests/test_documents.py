@@ -127,6 +127,7 @@ def answers(tmp_path, monkeypatch):
     return of
 
 
+@pytest.mark.filterwarnings("ignore::cfb_mjx.errors.CfbWarning")
 @pytest.mark.parametrize("name", READERS)
 def test_any_value_anywhere_is_taken_or_refused_in_a_sentence(name, answers):
     document, read = READERS[name]
@@ -140,6 +141,7 @@ def test_any_value_anywhere_is_taken_or_refused_in_a_sentence(name, answers):
     check()
 
 
+@pytest.mark.filterwarnings("ignore::cfb_mjx.errors.CfbWarning")
 @pytest.mark.parametrize("name", READERS)
 def test_wrong_kinds_at_every_key_are_taken_or_refused_in_a_sentence(name, answers):
     document, read = READERS[name]

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import output_folder, read_bytes, remove, replacing, together, write_text, write_texts
+from cfb_mjx.files import output_folder, read_bytes, remove, replacing, scratch, together, write_text, write_texts
 
 NAMES = ("model.yaml", "report.html", "report.json")
 
@@ -136,3 +136,14 @@ def test_what_another_process_is_writing_is_not_cleared_away(tmp_path):
         code = "import sys; from cfb_mjx.files import write_text; write_text(sys.argv[1], 'quick')"
         subprocess.run([sys.executable, "-c", code, tmp_path / "quick.txt"], check=True, env=dict(os.environ))
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"slow.txt": "slow", "quick.txt": "quick"}
+
+
+def test_scratch_files_are_there_at_once_while_others_wait(tmp_path):
+    with together():
+        write_text(tmp_path / "kept", "new")
+        with scratch() as folder:
+            write_text(Path(folder) / "drawn", "a figure")
+            assert (Path(folder) / "drawn").read_text() == "a figure"
+        assert not (tmp_path / "kept").exists()
+    assert (tmp_path / "kept").read_text() == "new"
+    assert not Path(folder).exists()

@@ -9,6 +9,7 @@ import os
 import re
 import secrets
 import stat
+import tempfile
 from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from hashlib import sha256
@@ -103,6 +104,17 @@ def together() -> Iterator[None]:
         for written in group.values():
             if written is not None:
                 written.forget()
+
+
+@contextlib.contextmanager
+def scratch(prefix: str = "cfb-") -> Iterator[str]:
+    """A folder of files that are used within the block and thrown away: they are there at once, also in `together`."""
+    token = _group.set(None)
+    try:
+        with tempfile.TemporaryDirectory(prefix=prefix) as folder:
+            yield folder
+    finally:
+        _group.reset(token)
 
 
 def remove(path: str | os.PathLike) -> None:

@@ -139,12 +139,17 @@ def campaign():
 
     plant = Plant(
         mass=np.full(2, 0.044),
-        inertia=around([3.3e-5, 3.6e-5, 5.9e-5], 0.2, 3),
+        inertia=_possible(around([3.3e-5, 3.6e-5, 5.9e-5], 0.2, 3)),
         rotor_inertia=around(5e-8, 0.3),
         lag=around(0.05, 0.2),
         gain=around(2900.0, 0.1),
     )
     return plant, fly(plant, 12.0, seed=11, disturbance=4.0)
+
+
+def _possible(inertia: np.ndarray) -> np.ndarray:
+    """Well inside what a body can have: at its border a fit gives no number."""
+    return np.append(inertia[:, :2], np.minimum(inertia[:, 2:], 0.87 * inertia[:, :2].sum(1, keepdims=True)), axis=1)
 
 
 def test_inertia_and_motors_come_back_from_disturbed_flights_under_feedback(campaign):

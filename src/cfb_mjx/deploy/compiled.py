@@ -6,7 +6,6 @@ import ctypes
 import os
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from cfb_mjx.deploy.export import Exported
 from cfb_mjx.errors import CfbError
+from cfb_mjx.files import scratch
 
 FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra", "-Werror")
 """What the sources must compile with."""
@@ -82,7 +82,7 @@ def compile_policy(exported: Exported, extra: Sequence[str] = ()) -> CompiledPol
         CfbError: there is no compiler, or it objects.
     """
     compiler = os.environ.get("CC") or "cc"
-    with tempfile.TemporaryDirectory(prefix="cfb-policy-") as folder:
+    with scratch("cfb-policy-") as folder:
         library = Path(folder) / "policy.so"
         sources = [str(path) for path in exported.sources]
         run_compiler([compiler, *FLAGS, *extra, "-shared", "-fPIC", "-o", str(library), *sources, "-lm"])

@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-import tempfile
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +20,7 @@ from cfb_mjx.deploy.compiled import FLAGS, run_compiler
 from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.deploy.export import Exported, literal
 from cfb_mjx.errors import CfbError
+from cfb_mjx.files import scratch
 
 CLOCK_HZ = 168e6
 CYCLES_PER_INSTRUCTION = 2.0
@@ -79,7 +79,7 @@ def size(exported: Exported) -> Size:
     Raises:
         CfbError: there is no such compiler, or it objects.
     """
-    with tempfile.TemporaryDirectory(prefix="cfb-cortex-") as folder:
+    with scratch("cfb-cortex-") as folder:
         objects = []
         for source in exported.sources:
             objects.append(str(Path(folder) / f"{source.stem}.o"))
@@ -106,7 +106,7 @@ def emulate(exported: Exported, inputs: np.ndarray) -> Emulated:
             "libnewlib-arm-none-eabi qemu-system-arm."
         )
     here = files("cfb_mjx.deploy").joinpath("emulated")
-    with tempfile.TemporaryDirectory(prefix="cfb-cortex-") as name:
+    with scratch("cfb-cortex-") as name:
         folder = Path(name)
         for file in ("main.c", "stm32f405.ld"):
             (folder / file).write_text(here.joinpath(file).read_text(encoding="utf-8"), encoding="utf-8")

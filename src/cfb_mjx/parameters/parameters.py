@@ -195,7 +195,7 @@ FORMER_NAMES = {"observation_delay": "pose_delay"}
 """Names that files and commands may still use."""
 
 
-def current_names(values: Mapping[str, Any], where: str | Path, prefix: str = "") -> dict[str, Any]:
+def current_names(values: Mapping[Any, Any], where: str | Path, prefix: str = "") -> dict[Any, Any]:
     """The same values under the names of today.
 
     Raises:

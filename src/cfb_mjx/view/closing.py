@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from cfb_mjx.files import write_text
+from cfb_mjx.files import scratch, write_text
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.sysid.tracing.outcome import Outcome
 from cfb_mjx.view.closing_drawing import draw
@@ -38,8 +37,8 @@ def write_report(
     """
     folder = Path(folder)
     looked = look(outcome, logs_held_out)
-    with tempfile.TemporaryDirectory() as scratch:
-        figures = draw(outcome, looked, Path(scratch))
+    with scratch() as drawn:
+        figures = draw(outcome, looked, Path(drawn))
         found = sections(outcome, looked, figures, logs_fit, logs_held_out)
         page = html_page(f"Closing the loop on {outcome.base.name}", verdict(outcome), found, facts)
     write_recording(folder / "residual.rrd", looked.rows, outcome.before, outcome.after)

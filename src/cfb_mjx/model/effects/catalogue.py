@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx import plugins
+from cfb_mjx.documents import told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.effects.base import Effect
 from cfb_mjx.model.effects.battery_sag import BatterySag
@@ -166,7 +167,8 @@ def effect_from_mapping(item: Mapping[str, Any], where: str, parameters: Paramet
     name = item.get("name")
     if not isinstance(name, str) or name not in KNOWN:
         known = ", ".join(sorted([*KNOWN, *SENSOR_FAULTS]))
-        raise CfbError(f"{where}: unknown effect {name!r}; known are {known}; one of your own needs --plugin FILE.py.")
+        said = f"{where}: unknown effect {told(name)}; known are {known}"
+        raise CfbError(f"{said}; one of your own needs --plugin FILE.py.")
     kind = KNOWN[name]
     fields = {field.name for field in dataclasses.fields(kind)}
     values = item.get("parameters") or {}
