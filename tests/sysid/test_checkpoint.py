@@ -31,7 +31,7 @@ def logs(tmp_path):
 def test_all_of_a_search_comes_back_to_the_last_bit(tmp_path, nothing):
     rng = np.random.default_rng(0)
     first = nothing.having(replace(RotorDrag.neutral(), coefficient=np.asarray(0.1 / 3)))
-    slowed = first.having(replace(ParasiticDrag.neutral(), linear=rng.uniform(size=3)))
+    slowed = first.having(replace(ParasiticDrag.neutral(), linear=0.1 * rng.uniform(size=3)))
     found = replace(slowed, lead=0.2 / 3, shift=1 / 7, levels=rng.normal(size=5))
     tried = ({"present": [], "ranking": [{"name": "wind", "gain": 1 / 3, "t": 2 / 3, "p_value": 1e-300}]},)
     progress = Progress(found, frozenset({"payload", "inertia"}), tried, 2, ("rotor_drag",), first)

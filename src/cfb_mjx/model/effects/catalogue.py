@@ -173,7 +173,7 @@ def effect_from_mapping(item: Mapping[str, Any], where: str, parameters: Paramet
     fields = {field.name for field in dataclasses.fields(kind)}
     values = item.get("parameters") or {}
     if not isinstance(values, Mapping):
-        raise CfbError(f"{where}: effects.{name}.parameters must be a mapping, found {values!r}.")
+        raise CfbError(f"{where}: effects.{name}.parameters must be a mapping, found {told(values)}.")
     for key in item:
         if key not in ("name", "parameters", "source", "uncertainty", "p_value"):
             raise CfbError(f"{where}: unknown key 'effects.{name}.{key}'.")
@@ -195,7 +195,7 @@ def effect_from_mapping(item: Mapping[str, Any], where: str, parameters: Paramet
         shape = np.shape(arguments[key])
         if not np.all(np.isfinite(value)) or value.shape not in ((), shape):
             count = int(np.prod(shape))
-            raise CfbError(f"{where}: effects.{name}.parameters.{key} = {raw!r} must be {count} finite number(s).")
+            raise CfbError(f"{where}: effects.{name}.parameters.{key} = {told(raw)} must be {count} finite number(s).")
         if key in kind.limits:
             kind.limits[key].check(value, f"{where}: effects.{name}.parameters.{key}", kind.units[key], warn=True)
         arguments[key] = value
