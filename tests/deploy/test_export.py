@@ -168,8 +168,8 @@ def test_a_flip_goes_through_its_phases_and_holds_again(built):
     order = [p for i, p in enumerate(phases) if i == 0 or phases[i - 1] != p]
     assert order == [climb, turn, catch, hold]
     assert phases.index(turn) == 51
-    # 10.796 rad at 0.2 a step.
-    assert phases.index(catch) == 60 + 54
+    # The first step at 0.2 rad each at which it has turned far enough.
+    assert phases.index(catch) == 60 + math.ceil(deployment.manoeuvre.knobs.turn_rad / 0.2)
     compiled.reset()
     compiled.step((0, 0, 0), (0, 0, 0), level, (0, 0, 0))
     assert compiled.phase == hold

@@ -41,8 +41,8 @@ def tried(monkeypatch):
         def errors(_, one):
             return np.full(8, with_it if len(one.present) > 1 else 1.0)
 
-        def left_out(search, fit, name):
-            return SimpleNamespace(fit=fit_of(fit.hypothesis.without(name)))
+        def left_out(search, hypothesis, name):
+            return SimpleNamespace(fit=fit_of(hypothesis.without(name)))
 
         monkeypatch.setattr(rare, "rank", rank)
         monkeypatch.setattr(rare, "fitted", lambda search, one, whole: fit_of(one))

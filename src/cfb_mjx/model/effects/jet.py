@@ -10,11 +10,11 @@ drone may be in faster and slower air.
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Condition, Effect
@@ -82,4 +82,4 @@ class Jet(Effect):
         # Behind the fan nothing widens; the profile there is that of the fan, and vanishes.
         b = self.width + self.spreading * jnp.where(along > 0, along, 0.0)
         begins = 0.5 * (1 + jnp.tanh(2 * along / self.width))
-        return axis * (self.speed * begins * (self.width / b) * jnp.exp(-np.log(2) * square / b**2))
+        return axis * (self.speed * begins * (self.width / b) * jnp.exp(-math.log(2) * square / b**2))
