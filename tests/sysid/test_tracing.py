@@ -13,16 +13,19 @@ from scipy.stats import norm
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.labelled_plants import Case, fly_campaigns
+from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import CATALOGUE, RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
+from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import moved, neutral_effects, shapes, strengths, term_columns
 from cfb_mjx.sysid.tracing.evidence import evidence
 from cfb_mjx.sysid.tracing.formula import with_library
 from cfb_mjx.sysid.tracing.given import fit_given
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 from cfb_mjx.sysid.tracing.lines import find_lines
 from cfb_mjx.sysid.tracing.outcome import close_loop
 from cfb_mjx.sysid.tracing.residuals import residual_rows
@@ -127,6 +130,22 @@ def test_a_velocity_stretched_along_some_axes_only_is_told_from_one_stretched_al
     for log, bad in zip(campaigns["clean"].fit, flights, strict=True):
         np.testing.assert_allclose(check.gyro_bias[log.name], healthy.gyro_bias[log.name], atol=1e-4)
         np.testing.assert_allclose(told.repaired(bad).velocity, log.velocity, atol=0.005 * np.abs(log.velocity).max())
+
+
+def test_a_gyro_that_is_said_to_be_late_is_no_finding(campaigns, base):
+    logs = campaigns["clean"].fit
+    late = [log.replace(body_rate=interpolate(log.time, log.body_rate, log.time - 0.006)) for log in logs]
+    assert {f.name for f in check_sensors(late, 0.008).findings} == {"sensor_gyro_lowpass"}
+    said = check_sensors(late, 0.008, 0.006)
+    assert not said.findings
+    drone = base.with_values("late", gyro_delay=0.006).parameters()
+    right = prepare_flight(said.corrected(logs[0]), 0.008, 0.0)
+    told, untold = (
+        Search.start(late, parameters, 0.008, said).flights(Hypothesis(()))[0]
+        for parameters in (drone, base.parameters())
+    )
+    wrong = [np.abs(flight.body_rate - right.body_rate)[right.valid > 0].mean() for flight in (told, untold)]
+    assert wrong[0] < 0.2 * wrong[1]
 
 
 def test_repairs_undo_faults(campaigns):

@@ -32,6 +32,7 @@ class LogEvaluation:
 
     log: FlightLog
     delay: float
+    gyro_delay: float
     windows: Windows
     measured: np.ndarray
     """(W,) whether rotor speed was measured throughout the window."""
@@ -167,7 +168,7 @@ def _evaluate_log(
         else metrics.errors(select(recorded, measured) if variant.startswith("rotor") else recorded, predicted)
         for variant, predicted in predictions.items()
     }
-    return LogEvaluation(log, delay, recorded, measured, predictions, errors)
+    return LogEvaluation(log, delay, gyro_delay, recorded, measured, predictions, errors)
 
 
 def _measured_in(

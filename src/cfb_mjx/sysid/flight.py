@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -61,7 +62,22 @@ def usual_delay(logs: Sequence[FlightLog], parameters: Parameters) -> float:
     return float(np.median(list(delays))) if delays else float(parameters.pose_delay)
 
 
-def prepare_flight(log: FlightLog, delay: float, gyro_delay: float = 0.0) -> Flight:
+def with_gyro_in_time(log: FlightLog, gyro_delay: float) -> FlightLog:
+    """The log with every body rate in the row at whose time it was measured.
+
+    Args:
+        log: the flight.
+        gyro_delay: age of the gyro's reading in a row, s. Rows whose reading lies behind a gap are left out.
+    """
+    if gyro_delay == 0:
+        return log
+    ends = np.append(log.time[log.gaps()], log.time[-1])
+    there = log.time + gyro_delay <= ends[np.searchsorted(ends, log.time)]
+    rate = interpolate(log.time, log.body_rate, log.time + gyro_delay)
+    return dataclasses.replace(log, body_rate=rate).rows(there)
+
+
+def prepare_flight(log: FlightLog, delay: float, gyro_delay: float) -> Flight:
     """Rows of a log at their own time.
 
     Args:

@@ -197,7 +197,7 @@ def predict(contestant: Contestant, log: FlightLog, starts: Starts):
 def _memory(model: Quadrotor, log: FlightLog, rows: np.ndarray) -> tuple:
     if not model.effects:
         return ()
-    _, memory = eqx.filter_jit(remembered)(model, prepare_flight(log, 0.0), jnp.zeros(()))
+    _, memory = eqx.filter_jit(remembered)(model, prepare_flight(log, 0.0, 0.0), jnp.zeros(()))
     return jax.tree.map(lambda x: np.asarray(x)[rows], memory)
 
 

@@ -135,7 +135,7 @@ def observe(model: Quadrotor, log: FlightLog, delay: float, observer: Observer, 
         NumPy arrays, one row per row of the log.
     """
     found, _ = _observe(
-        model, *replay_inputs(log, delay, use_measured, float(model.parameters.gyro_delay)), _numbers(observer)
+        model, *replay_inputs(log, delay, float(model.parameters.gyro_delay), use_measured), _numbers(observer)
     )
     return jax.tree.map(lambda x: np.asarray(x)[: len(log)], found)
 
@@ -163,9 +163,7 @@ def fit_observer(model: Quadrotor, logs: Sequence[FlightLog], observer: Observer
     first = _numbers(observer or Observer())
     replays = []
     for log in logs:
-        flight, driven = replay_inputs(
-            log, delay_of(log, model.parameters), gyro_delay=float(model.parameters.gyro_delay)
-        )
+        flight, driven = replay_inputs(log, delay_of(log, model.parameters), float(model.parameters.gyro_delay))
         replays.append((model, flight, driven, replayed(model, flight, driven)))
     leaves, structure = jax.tree.flatten(first)
     sizes = [leaf.size for leaf in leaves]
@@ -198,9 +196,7 @@ def _numbers(observer: Observer) -> Observer:
     return Observer(**fields)
 
 
-def replay_inputs(
-    log: FlightLog, delay: float, use_measured: bool = True, gyro_delay: float = 0.0
-) -> tuple[Flight, Array]:
+def replay_inputs(log: FlightLog, delay: float, gyro_delay: float, use_measured: bool = True) -> tuple[Flight, Array]:
     """The flight and the rotor speeds that drive the body; its ``measured`` says whether they do."""
     flight = prepare_flight(log, delay, gyro_delay)
     driven = causal_rotor_speed(log) if use_measured else None

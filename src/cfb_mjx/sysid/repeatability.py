@@ -10,7 +10,7 @@ from scipy.signal import butter, sosfiltfilt
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.sysid.flight import delay_of
+from cfb_mjx.sysid.flight import delay_of, with_gyro_in_time
 from cfb_mjx.sysid.observer import replay_inputs, replayed
 
 CORNER = 6.0
@@ -49,7 +49,8 @@ def residual_angular_acceleration(model: Quadrotor, log: FlightLog) -> tuple[np.
     Returns:
         (n,) time, s, evenly spaced; (n, 3) residual, rad/s^2; (n, 3) position, m.
     """
-    said = replayed(model, *replay_inputs(log, delay_of(log, model.parameters)))
+    log = with_gyro_in_time(log, float(model.parameters.gyro_delay))
+    said = replayed(model, *replay_inputs(log, delay_of(log, model.parameters), 0.0))
     said = np.asarray(said.angular_acceleration)[: len(log)]
     time = np.arange(log.time[0], log.time[-1], 1 / RATE)
     rate, said, position = (_sampled(time, log.time, x) for x in (log.body_rate, said, log.position))

@@ -51,7 +51,7 @@ class Looked:
 def _beside(outcome: Outcome, logs: list[FlightLog], repaired: bool) -> Search:
     """The search on other flights, with the faults the fit flights showed taken out or left in."""
     search = outcome.trace.search
-    check = check_sensors(logs, search.delay)
+    check = check_sensors(logs, *search.delays)
     return search.beside(logs, replace(check, faults=outcome.trace.sensors.faults if repaired else HEALTHY))
 
 

@@ -137,8 +137,8 @@ def _unexplained(
     log: FlightLog, model: Quadrotor, others: tuple[Effect, ...], true: str, effect: Effect, names: Sequence[str]
 ) -> dict[str, float]:
     """Nats that each other effect cannot explain of a flight with ``effect``."""
-    delay = float(model.parameters.pose_delay)
-    search = Search.start([log], model.parameters, delay, check_sensors([log], delay), others)
+    delay, gyro_delay = float(model.parameters.pose_delay), float(model.parameters.gyro_delay)
+    search = Search.start([log], model.parameters, delay, check_sensors([log], delay, gyro_delay), others)
     nothing = search.learned(search.nothing())
     right = nothing.having(effect)
     right = search.settled(search.learned(right))

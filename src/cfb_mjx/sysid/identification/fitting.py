@@ -17,6 +17,7 @@ from cfb_mjx.devices import Devices
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.parameters import Parameters
+from cfb_mjx.sysid.flight import with_gyro_in_time
 from cfb_mjx.sysid.identification.feedback import detect
 from cfb_mjx.sysid.identification.flight_data import Segments, prepare
 from cfb_mjx.sysid.identification.innovation import CHANNELS, as_held, drive, negative_log_likelihood, whitened
@@ -90,6 +91,7 @@ def fit(
     Raises:
         CfbError: unknown parameters, or logs without enough contiguous data.
     """
+    logs = [with_gyro_in_time(log, float(nominal.gyro_delay)) for log in logs]
     asked = choose(default_parameters(logs) if parameters is None else parameters, nominal).names
     if estimator == "auto":
         estimator = "shooting" if "pose_delay" in asked else "innovation"

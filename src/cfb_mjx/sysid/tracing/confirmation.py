@@ -56,4 +56,4 @@ def _flights(search: Search, poorer: Hypothesis, richer: Hypothesis) -> Iterator
     for log in search.logs:
         logs = [hypothesis.faults.repaired(log) for hypothesis in (poorer, richer)]
         both = np.intersect1d(logs[0].time, logs[1].time)
-        yield tuple(prepare_flight(one.rows(np.isin(one.time, both)), search.delay) for one in logs)
+        yield tuple(prepare_flight(one.rows(np.isin(one.time, both)), *search.delays) for one in logs)

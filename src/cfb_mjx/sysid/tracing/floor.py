@@ -46,7 +46,7 @@ def _squares(evaluated: LogEvaluation, horizons: tuple[float, ...], levels: Leve
     if not len(starts):
         return np.zeros((4, len(horizons)))
     noise = sensor_levels(log)
-    pose, gyro = (_averaging(log.time, starts + late) for late in (evaluated.delay, 0.0))
+    pose, gyro = (_averaging(log.time, starts + late) for late in (evaluated.delay, evaluated.gyro_delay))
     force = float(np.sqrt(np.mean(np.sum(log.specific_force**2, axis=1))))
     out = np.zeros((4, len(horizons)))
     for axis in range(3):
@@ -58,7 +58,7 @@ def _squares(evaluated: LogEvaluation, horizons: tuple[float, ...], levels: Leve
             moved = _carried(np.array(start), horizon, force if axis < 2 else 0.0, levels, axis, turn)
             late = _averaging(log.time, starts + evaluated.delay + horizon)
             seen = late * np.array([noise["position"][axis], noise["velocity"][axis], noise["angle"]]) ** 2
-            rate = _averaging(log.time, starts + horizon) * noise["gyro"][turn] ** 2
+            rate = _averaging(log.time, starts + evaluated.gyro_delay + horizon) * noise["gyro"][turn] ** 2
             out[:, k] += (moved + np.array([*seen, rate])) * [1, 1, np.degrees(1.0) ** 2, 1]
     return out
 

@@ -59,7 +59,7 @@ def fit_given(
         if name not in CATALOGUE:
             raise CfbError(f"{name}: no such effect; the catalogue has {', '.join(sorted(CATALOGUE))}.")
     progress("comparing the sensors with each other")
-    sensors = check_sensors(list(logs), delay)
+    sensors = check_sensors(list(logs), delay, float(parameters.gyro_delay))
     faults = with_band(sensors.faults, logs)
     sensors = replace(sensors, faults=faults.as_logged if as_logged else faults)
     search = Search.start(list(logs), parameters, delay, sensors, declared, names)

@@ -15,6 +15,7 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import tidy
 from cfb_mjx.logs.rotation import to_world as rotate
+from cfb_mjx.sysid.flight import with_gyro_in_time
 
 SHORT, LONG = 0.12, 0.6
 """Spans of the comparisons, s: short ones show lags, long ones biases and scales."""
@@ -46,14 +47,16 @@ class Kinematics:
     weight: np.ndarray
 
 
-def compare_sensors(log: FlightLog, delay: float, gravity: float = 9.81) -> Kinematics:
+def compare_sensors(log: FlightLog, delay: float, gyro_delay: float = 0.0, gravity: float = 9.81) -> Kinematics:
     """Compare the sensors of one log.
 
     Args:
         log: the flight.
         delay: declared age of pose and velocity, s.
+        gyro_delay: declared age of the gyro's reading, s.
         gravity: m/s^2.
     """
+    log = with_gyro_in_time(log, gyro_delay)
     step = log.nominal_interval
     grid = np.arange(log.time[0], log.time[-1], step)
     covered = _covered(log, grid)

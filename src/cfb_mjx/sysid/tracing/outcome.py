@@ -174,7 +174,7 @@ def close_loop(
     delay = usual_delay(fit, parameters)
     found = trace(fit, parameters, delay, progress, declared, checkpoint)
     # Biases of the held-out sensors come from their own kinematics; no model is fitted.
-    check = replace(check_sensors(held_out, delay), faults=found.sensors.faults)
+    check = replace(check_sensors(held_out, delay, float(parameters.gyro_delay)), faults=found.sensors.faults)
     judge = found.search.beside(held_out, check)
     found = with_rare(found, judge, progress)
     search, proposal = explain(found, progress, judge)

@@ -102,7 +102,8 @@ def model_residuals(model: Quadrotor, log: FlightLog, delay: float | None = None
         log: the flight.
         delay: age of pose and velocity in its rows, s; as the log or the model says by default.
     """
-    flight = prepare_flight(log, delay_of(log, model.parameters) if delay is None else delay)
+    delay = delay_of(log, model.parameters) if delay is None else delay
+    flight = prepare_flight(log, delay, float(model.parameters.gyro_delay))
     driven = driven_by(model, flight, 0.0)
     rows = _rows(residual_blocks(model, flight, driven, jnp.zeros(())), driven, flight, log.name)
     return rows, np.asarray(driven)[: len(log)]

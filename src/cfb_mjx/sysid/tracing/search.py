@@ -80,12 +80,17 @@ class Search:
         looked_for = tuple(name for name, kind in CATALOGUE.items() if kind.searched or name in asked_for)
         return cls(parameters, logs, delay, noise, looked_for, declared)
 
+    @property
+    def delays(self) -> tuple[float, float]:
+        """Age of pose and of gyro in a row, s."""
+        return self.delay, float(self.parameters.gyro_delay)
+
     def flights(self, hypothesis: Hypothesis) -> list[Flight]:
         """The flights as a hypothesis reads them."""
         key = round(hypothesis.shift, 5)
         if key not in self._flights:
             faults = SensorFaults(motor_shift=key)
-            self._flights[key] = [prepare_flight(faults.repaired(log), self.delay) for log in self.logs]
+            self._flights[key] = [prepare_flight(faults.repaired(log), *self.delays) for log in self.logs]
         return self._flights[key]
 
     def residual(self, hypothesis: Hypothesis, flight: Flight) -> tuple[Blocks, Array]:

@@ -72,20 +72,21 @@ class SensorCheck:
         )
 
 
-def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
+def check_sensors(logs: list[FlightLog], delay: float, gyro_delay: float = 0.0) -> SensorCheck:
     """Compare the sensors of a campaign's flights with each other.
 
     Args:
         logs: flights of one drone.
         delay: declared age of pose and velocity, s.
+        gyro_delay: declared age of the gyro's reading, s.
     """
-    kinematics = [compare_sensors(log, delay) for log in logs]
+    kinematics = [compare_sensors(log, delay, gyro_delay) for log in logs]
     vertical = _own_vertical_scale(kinematics)
     if vertical is not None:
         # Stretched alike along all axes first, so that all else is compared as in any other flight.
         ratio = vertical[0] / _pooled(kinematics, "horizontal_scale", 3)[0]
         even = SensorFaults(vertical_scale=ratio)
-        kinematics = [compare_sensors(even.unstretched(log), delay) for log in logs]
+        kinematics = [compare_sensors(even.unstretched(log), delay, gyro_delay) for log in logs]
     pooled = {
         "attitude_lag": _pooled(kinematics, "attitude_lag", 0),
         "velocity_lag": _pooled(kinematics, "velocity_lag", 1),
@@ -103,7 +104,7 @@ def check_sensors(logs: list[FlightLog], delay: float) -> SensorCheck:
     faults = SensorFaults(**{ATTRIBUTES[f.name][key]: x for f in findings for key, x in f.parameters.items()})
     if not faults.healthy:
         # Biases again, from repaired flights.
-        kinematics = [compare_sensors(faults.repaired(log), delay) for log in logs]
+        kinematics = [compare_sensors(faults.repaired(log), delay, gyro_delay) for log in logs]
     names = [log.name for log in logs]
     return SensorCheck(
         faults,

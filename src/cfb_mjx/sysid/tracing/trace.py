@@ -108,7 +108,7 @@ def trace(
     """
     checkpoint = checkpoint or Checkpoint()
     progress("comparing the sensors with each other")
-    sensors = check_sensors(logs, delay)
+    sensors = check_sensors(logs, delay, float(parameters.gyro_delay))
     search = Search.start(logs, parameters, delay, sensors, declared)
     progress("replaying the declared model")
     nothing = fitted(search, search.learned(search.nothing()))
