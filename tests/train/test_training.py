@@ -89,6 +89,29 @@ def test_no_key_of_a_training_is_used_twice(tmp_path, monkeypatch):
     assert uses.of_no_key_twice()
 
 
+class Diverging(Idle):
+    """Weights are numbers until the last update."""
+
+    updates: int = eqx.field(static=True, default=2)
+
+    def update(self, state):
+        last = state.network is not None and bool(state.network.network.biases[0][0] == 7)
+        value = jnp.nan if last else 7.0
+        return Idle(
+            None, eqx.tree_at(lambda c: c.network.biases[0], state.network, replace_fn=lambda b: b * 0 + value)
+        ), {}
+
+
+def test_weights_that_are_no_numbers_end_a_training_and_cost_no_earlier_policy(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "build", lambda *_: Diverging())
+    with pytest.raises(
+        CfbError, match=r"by update 2 the policy's weights are no numbers; the policy of update 1 is kept"
+    ):
+        train(small("ppo", "checkpoints=2"), tmp_path, evaluate=False)
+    assert all(np.isfinite(w).all() for w in weights(tmp_path))
+    assert len((tmp_path / CURVE).read_text().splitlines()) == 2
+
+
 @pytest.mark.long
 def test_both_bodies_give_the_same_gradient():
     config = load_config("target", ("analytic.drones=2", "analytic.horizon_s=0.016", "network.hidden=[8]", "body=mjx"))

@@ -154,7 +154,8 @@ def train(
         The learning curve, one row per checkpoint.
 
     Raises:
-        CfbError: an earlier training is in the way, the checkpoint is of another training, or there are fewer devices.
+        CfbError: an earlier training is in the way, the checkpoint is of another training, there are fewer devices, or
+            the weights are no numbers any more (what was written before stays).
     """
     output = Path(output)
     checkpoint = output / CHECKPOINT
@@ -187,10 +188,10 @@ def train(
         row = {"update": done, "commands": done * algorithm.steps_per_update, "seconds": round(seconds, 2)}
         row |= {name: float(value) for name, value in metrics.items()}
         whole = over.here(state)
+        controller = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, algorithm.controller(whole))
+        if not all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(eqx.filter(controller, eqx.is_inexact_array))):
+            raise CfbError(_diverged(output, done, rows))
         if first():
-            controller = jax.tree.map(
-                lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, algorithm.controller(whole)
-            )
             row |= _judged(controller, training, task, nominal) if evaluate else {}
             about = {"updates": done, "seconds": seconds, "rows": [*rows, row]}
             with together():
@@ -201,6 +202,14 @@ def train(
             report(row)
         rows.append(row)
     return rows
+
+
+def _diverged(output: Path, done: int, rows: list[dict]) -> str:
+    kept = f"the policy of update {rows[-1]['update']} is kept" if rows else "no policy was written"
+    return (
+        f"{output}: by update {done} the policy's weights are no numbers; {kept}. Train anew with a lower learning "
+        "rate, and look for a drone that the ranges make too wild with cfb fly."
+    )
 
 
 def build(config: TrainingConfig, task, nominal: Quadrotor, over: Devices | None = None) -> Algorithm:
