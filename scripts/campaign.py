@@ -2,7 +2,8 @@
 
 import argparse
 import json
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,3 +91,25 @@ def facts_line(command: str, results: list[dict], did: str = "trained") -> str:
         f"Written by `{command}`; {did} {when}, {of['processor']}, Python {of['python']}, "
         f"jax {of['jax']}, cfb_mjx {of['cfb_mjx']}."
     )
+
+
+def moved(before: dict, now: dict, pick: Callable[[dict], dict[str, float]], share: float = 0.05) -> list[str]:
+    """Markdown lines of a page's section on what is not what it was.
+
+    Args:
+        before: results of an earlier run, with their ``environment``.
+        now: results of this one.
+        pick: results to the numbers that count, by the name they are listed under.
+        share: of the larger by which two numbers differ to be listed.
+    """
+    old, new = pick(before), pick(now)
+    rows = [
+        f"| {name} | {old[name]:.4g} | {value:.4g} |"
+        for name, value in new.items()
+        if name in old and not math.isclose(value, old[name], rel_tol=share, abs_tol=1e-9)
+    ]
+    alike = sum(name in old for name in new) - len(rows)
+    date = before["environment"]["date"]
+    text = f"Beside {date}: of {alike + len(rows)} numbers {len(rows)} differ by more than {share:.0%}."
+    head = ["", f"| number | {date} | now |", "|---|---:|---:|"]
+    return ["", "## What moved", "", text, *(head + rows if rows else [])]

@@ -2,15 +2,17 @@
 
 python scripts/flips.py             measure them: docs/flips.md, its figures, benchmarks/flips.json (minutes)
 python scripts/flips.py --search    look for their knobs first: configs/manoeuvres (a quarter of an hour)
+python scripts/flips.py --before EARLIER.json   say what moved since those results
 python scripts/flips.py --page-only write the page from the numbers that are there
 """
 
 import argparse
 import json
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
-from campaign import ROOT, facts_line
+from campaign import ROOT, facts_line, moved
 
 from cfb_mjx.cli.runtime import configure_jax, environment, say
 
@@ -69,7 +71,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--search", nargs="*", choices=list(FLIPS), metavar="NAME", help="all, or these")
     parser.add_argument("--page-only", action="store_true")
+    parser.add_argument("--before", type=Path, help="results of an earlier run")
     arguments = parser.parse_args()
+    before = json.loads(arguments.before.read_text()) if arguments.before else None
     configure_jax(x64=False)
     from cfb_mjx.files import write_json, write_text
 
@@ -79,7 +83,9 @@ def main() -> None:
             course.search(name)
         write_json(RESULTS, {"environment": environment(), "flips": {name: course.measure(name) for name in FLIPS}})
         course.draw()
-    write_text(PAGE / "flips.md", page(json.loads(RESULTS.read_text())))
+    found = json.loads(RESULTS.read_text())
+    change = moved(before, found, _headlines) if before else []
+    write_text(PAGE / "flips.md", page(found, change))
     print("docs/flips.md")
 
 
@@ -192,7 +198,7 @@ class Course:
             write_flight_recording(folder / f"{name}.rrd", flown, self.holder.control_dt_s)
 
 
-def page(found: dict) -> str:
+def page(found: dict, change: list[str]) -> str:
     """The Markdown page."""
     degrees = 180 / np.pi
     lines = [
@@ -277,7 +283,18 @@ def page(found: dict) -> str:
     lines.append("|---|" + "---|" * 7)
     for name, r in found["flips"].items():
         lines.append(f"| {name} | " + " | ".join(f"{x:.4g}" for x in r["knobs"].values()) + " |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *change]) + "\n"
+
+
+def _headlines(found: dict) -> dict[str, float]:
+    """The numbers of the page's first table, by name."""
+    numbers = {}
+    for name, r in found["flips"].items():
+        n = r["nominal"]
+        numbers |= {f"{name}: completed": r["completed_random"], f"{name}: height, m": n["vertical_extent_m"]}
+        numbers |= {f"{name}: rate, rad/s": n["peak_rate_radps"], f"{name}: fall, m/s": n["fall_mps"]}
+        numbers[f"{name}: knob climb_m"] = r["knobs"]["climb_m"]
+    return numbers
 
 
 def _time(seconds: float | None) -> str:

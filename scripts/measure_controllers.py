@@ -1,20 +1,32 @@
 """Fly every controller through every test, and write docs/controllers.md with its figures.
 
-    python scripts/measure_controllers.py [--plants 4096]
+    python scripts/measure_controllers.py [--plants 4096] [--before EARLIER.json]
 
-Minutes. The paper's own numbers are of the real drone and stand beside.
+Minutes. The paper's own numbers are of the real drone and stand beside; beside an earlier run's results the page says
+what moved.
 """
 
 import argparse
+import json
 import sys
 from dataclasses import replace
+from pathlib import Path
 
-from campaign import ROOT
+from campaign import ROOT, moved
 
 from cfb_mjx.cli.runtime import configure_jax, environment, say
 from cfb_mjx.reproduce.paper import PAPER_FIRMWARE, PAPER_HOVER
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+HEADLINES = {
+    "hover_mm": "hover, mm",
+    "command_std": "command std",
+    "arrival_s": "arrival, s",
+    "peak_speed_mps": "peak, m/s",
+    "random_failed": "random drones failed",
+    "random_recovered": "random drones recovered",
+    "recovered": "nominal recovered",
+}
 PAPER_OF = {"target": PAPER_HOVER[1.0], **PAPER_FIRMWARE}
 
 
@@ -23,7 +35,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plants", type=int, default=4096)
     parser.add_argument("--controllers", nargs="+", default=["target", "target-adaptive", "pid", "mellinger"])
+    parser.add_argument("--before", type=Path, help="results of an earlier run")
     arguments = parser.parse_args()
+    before = json.loads(arguments.before.read_text()) if arguments.before else None
     configure_jax(x64=False)
     import jax
     import numpy as np
@@ -73,9 +87,22 @@ def main() -> None:
                 "failed": float(np.mean(there.failed)),
             }
     facts = environment()
-    write_json(ROOT / "benchmarks" / "controllers.json", {"environment": facts, "plants": arguments.plants} | results)
-    write_text(ROOT / "docs" / "controllers.md", page(results, facts, arguments.plants, described))
+    whole = {"environment": facts, "plants": arguments.plants} | results
+    write_json(ROOT / "benchmarks" / "controllers.json", whole)
+    change = moved(before, whole, _headlines) if before else []
+    write_text(ROOT / "docs" / "controllers.md", page(results, facts, arguments.plants, described, change))
     print("docs/controllers.md")
+
+
+def _headlines(results: dict) -> dict[str, float]:
+    """The numbers of the page, by name."""
+    found = {}
+    for name in (key for key, value in results.items() if isinstance(value, dict) and "hover_mm" in value):
+        r = results[name]
+        found |= {f"{name}: {what}": r[key] for key, what in HEADLINES.items()}
+        found[f"{name}: median hover of random drones, mm"] = r["random_hover_mm"]["0.5"]
+        found |= {f"{name}: hover, {plant}, mm": there["hover_mm"] for plant, there in r["plants"].items()}
+    return found
 
 
 def _factors(drones, nominal, distance, well) -> dict[str, dict[str, float]]:
@@ -117,7 +144,7 @@ def _hover_squared(parameters):
     return np.asarray(parameters.mass) / (thrust * np.asarray(parameters.motor_gain)[..., 0] ** 2)
 
 
-def page(results: dict, facts: dict, plants: int, described) -> str:
+def page(results: dict, facts: dict, plants: int, described, change: list[str]) -> str:
     """The Markdown page."""
     names = list(results)
     lines = [
@@ -190,7 +217,7 @@ def page(results: dict, facts: dict, plants: int, described) -> str:
             lost = f", {there['failed']:.0%} failed" if there["failed"] else ""
             cells.append(f"{there['hover_mm']:.0f} ({there['command_std']:.3f}){lost}")
         lines.append(f"| {plant} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *change]) + "\n"
 
 
 if __name__ == "__main__":
