@@ -11,7 +11,7 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _ROOMS = ("control", "envs", "logs", "model", "parameters", "sysid", "train", "view")
 __all__ = ["__version__", "control", "envs", "logs", "model", "parameters", "sysid", "train", "view"]
