@@ -104,20 +104,41 @@ def test_commands_between_rows_move_the_rotors_as_far_as_they_did():
     logged = np.full((1, segments.valid.shape[1], 4), command[rows][-1])
     logged[0, :count] = command[rows, None]
     segments = jax.tree.map(jnp.asarray, eqx.tree_at(lambda s: s.command, segments, logged))
-    made = np.asarray(as_held(NOMINAL, jnp.asarray(0.002), segments).command)[0, :, 0]
+    held = as_held(NOMINAL, jnp.asarray(0.002), segments)
+    made, excess = (np.asarray(x)[0, :, 0] for x in (held.command, held.excess))
+    shrunk = 0.05 * (1 - np.exp(-0.01 / 0.05))  # integral of the lag's decay over an interval of rows
 
     def constant(u, start):
         return u + (start - u) * np.exp(-0.01 / 0.05)
 
-    worst = {"held": 0.0, "made": 0.0}
+    worst = {"held": 0.0, "made": 0.0, "mean without excess": 0.0, "mean": 0.0}
     for k in range(2, count - 1):
         piece = slice(5 * k, 5 * k + 5)
-        speed = 0.45
+        speed, way = 0.45, 0.0
         for u in command[piece]:
-            speed = solve_ivp(lambda _, x, u=u: (u - x) / 0.05, (0, 0.002), [speed], rtol=1e-10, atol=1e-12).y[0, -1]
+            # The speed, and its integral.
+            of = solve_ivp(
+                lambda _, x, u=u: ((u - x[0]) / 0.05, x[0]), (0, 0.002), (speed, way), rtol=1e-10, atol=1e-12
+            )
+            speed, way = of.y[:, -1]
         for name, u in (("held", command[5 * k]), ("made", made[k])):
             worst[name] = max(worst[name], abs(constant(u, 0.45) - speed))
+        # A path towards one constant through the speeds at both rows, as measured ones would be joined.
+        goal = 0.45 + (speed - 0.45) / (1 - np.exp(-0.01 / 0.05))
+        mean = goal + (0.45 - goal) * shrunk / 0.01
+        for name, more in (("mean without excess", 0.0), ("mean", excess[k])):
+            worst[name] = max(worst[name], abs(mean + more - way / 0.01))
     assert worst["made"] < 0.03 * worst["held"]
+    assert worst["mean"] < 0.05 * worst["mean without excess"]
+
+
+def test_a_product_less_sure_than_half_its_value_is_not_told():
+    """Thrust scale / gain^0.33 is known to 42 %; as gain / thrust scale^3 to three times that."""
+    told = np.array([-0.31, 0.95]) / np.hypot(0.31, 0.95)
+    jacobian = np.full((4, 25, 1), 0.24) * told
+    found = assess(np.zeros((4, 25)), jacobian, ("motor_gain", "thrust_scale"))
+    assert found.names == ["motor_gain", "thrust_scale"]
+    assert found.products == []
 
 
 def test_a_prior_bounds_what_the_data_leave_free_and_products_carry_their_std():

@@ -153,6 +153,7 @@ def window_information(
         valid=jnp.ones(count),
         command=jnp.concatenate([hover, commands]),
         doubt=jnp.zeros((count, 4)),
+        excess=jnp.zeros((count, 4)),
         rotor_speed=path.rotor_speed,
         measured=jnp.asarray(float(measured_rotors)),
         warm_up=(row < _HOVER_ROWS).astype(float),

@@ -38,7 +38,7 @@ BLOCK = 128
 MASS_STD = 0.05
 """Of the mass as stated, relative, where nothing else is said: decks, batteries and guards come and go, and no flight
 tells the mass from the thrust."""
-BLUR = 0.004
+BLUR = 0.0025
 """What commands between rows 10 ms apart, put on a parabola, leave wrong in the constants, relative: found on flights
 of known drones (`docs/coverage.md`); it grows with the square of the interval."""
 NEARLY = 0.75

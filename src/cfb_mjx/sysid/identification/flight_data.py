@@ -28,6 +28,8 @@ class Segments(eqx.Module):
     doubt: Float[Array, "s n 4"]
     """Of a command's step to the next row, the part that the steps about it do not foretell: what may have been sent
     between the rows is uncertain by a share of it."""
+    excess: Float[Array, "s n 4"]
+    """Mean of what is commanded until the next row, less ``command``: 0 as logged, see `innovation.as_held`."""
     rotor_speed: Float[Array, "s n 4"]
     """Measured, rad/s; what it holds where ``measured`` is 0 means nothing."""
     measured: Float[Array, "s"]
@@ -128,6 +130,7 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> di
         "valid": (~padding).astype(float),
         "command": pad(np.clip(log.command[rows], 0, 1)),
         "doubt": np.concatenate([doubt, np.zeros((1 + width - count, 4))]),
+        "excess": np.zeros((width, 4)),
         "rotor_speed": pad(speed),
         "measured": np.array(float(measured)),
         "warm_up": (np.arange(width) < lead).astype(float),

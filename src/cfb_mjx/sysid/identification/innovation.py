@@ -64,7 +64,8 @@ def drive(
         speed = _modelled_speed(parameters, piece)
         if use_measured:
             speed = jnp.where(share > 0, smoothed_rotor_speed(parameters, noise, piece, robust), speed)
-        rows = (piece.interval[1:], speed[:-1], speed[1:], piece.body_rate[1:])
+        excess = parameters.motor_gain * piece.excess[:-1]
+        rows = (piece.interval[1:], speed[:-1], speed[1:], excess, piece.body_rate[1:])
         torque, force = jax.vmap(lambda *x: _loads(parameters, *x))(*rows)
         return Drive(torque, force)
 
@@ -120,13 +121,19 @@ def _modelled_speed(parameters: Parameters, piece: Segments) -> Float[Array, "n 
     return jnp.concatenate([target[:1], later])
 
 
-def _loads(parameters, dt, start, end, body_rate):
-    """Mean torque about the centre of gravity over an interval (N m), and specific force along z at its end (m/s^2)."""
+def _loads(parameters, dt, start, end, excess, body_rate):
+    """Mean torque about the centre of gravity over an interval (N m), and specific force along z at its end (m/s^2).
+
+    ``excess`` is by how much the mean of the steady speeds commanded is above the one that leads from start to end:
+    the mean of the rotor speed is above the path's by as much, as T (end - start) is the integral of either's distance.
+    """
     constants = rotors.prepare(parameters, dt)
     risen = -jnp.expm1(-dt / parameters.motor_time_constant)
     # Towards the steady speed whose exponential passes through both ends: a straight line would be off by its sag.
     goal = start + (end - start) / jnp.where(risen > 0, risen, 1.0)
-    mean = wrench_of(parameters, rotors.path_to(constants, Vec.unstack(start), Vec.unstack(goal)).mean)
+    mean = wrench_of(
+        parameters, rotors.path_to(constants, Vec.unstack(start + excess), Vec.unstack(goal + excess)).mean
+    )
     torque = mean.torque - Vec.unstack(parameters.center_of_gravity).cross(mean.force)
     # At the rotors' centre: 3 mm off it, turning at 100 rad/s^2 reads 0.3 m/s^2, twice the accelerometer's noise.
     last = wrench_of(parameters, rotors.loads_at(constants, Vec.unstack(end), 0.0 * Vec.unstack(end)))
@@ -176,15 +183,18 @@ def as_held(parameters: Parameters, hold: Float[Array, ""] | None, segments: Seg
     safe = jnp.where(interval > 0, interval, 1.0)
     timed = jnp.isinf(hold)
     held = jnp.where(timed, 1.0, jnp.clip(jnp.where(timed, 0.0, hold) / safe, -0.5, 1.5))
-    share = 0.5 * (1 - held) * (1 + (1 + held) * interval / (6 * parameters.motor_time_constant))
+    later = (1 - held**2) * interval / (12 * parameters.motor_time_constant)
+    share = 0.5 * (1 - held) + later
     step = jnp.diff(segments.command, axis=1)
     ratio = jnp.concatenate([jnp.ones_like(safe[:, :1]), safe[:, :-1] / safe[:, 1:]], axis=1)
     bend = (step - jnp.concatenate([step[:, :1], step[:, :-1]], axis=1) / ratio) / (1 + ratio)
     between = share * step - (1 - held**2) / 6 * bend
     command = segments.command.at[:, :-1].add(jnp.where(interval > 0, between, 0.0))
+    # Later ones count for more in the rotors' speed at the next row, and for no more in their mean on the way there.
+    excess = segments.excess.at[:, :-1].set(jnp.where(interval > 0, -later * step, 0.0))
     unsure = jnp.sqrt(jnp.clip(1 - held**2, 0.0, 1.0)) * segments.doubt[:, :-1]
     doubt = segments.doubt.at[:, :-1].set(jax.lax.stop_gradient(unsure))
-    return eqx.tree_at(lambda s: (s.command, s.doubt), segments, (command, doubt))
+    return eqx.tree_at(lambda s: (s.command, s.excess, s.doubt), segments, (command, excess, doubt))
 
 
 def whitened(

@@ -168,7 +168,9 @@ def _products(
             powers = {other: 1.0, names[i]: 1 / size}
         powers = {name: float(f"{p:.3g}") for name, p in powers.items()}
         weight = np.array([powers.get(name, 0.0) for name in names])
-        found.append((powers, float(np.sqrt(weight @ covariance @ weight))))
+        deviation = float(np.sqrt(weight @ covariance @ weight))
+        if deviation <= LOOSEST:  # as a power of the other it may be less sure than by itself
+            found.append((powers, deviation))
     return found
 
 
