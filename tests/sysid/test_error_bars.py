@@ -17,6 +17,7 @@ from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid.identification.fitting import fit
 from cfb_mjx.sysid.identification.flight_data import prepare
 from cfb_mjx.sysid.identification.innovation import as_held
+from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.uncertainty import assess, most_contradicted
 from cfb_mjx.sysid.identification.unknowns import at_the_border
 
@@ -202,3 +203,11 @@ def test_a_drone_of_a_foreign_simulator_is_within_its_error_bars(rate, tmp_path)
     nominal = PRESET.with_values("weighed", mass=0.042).parameters()
     found = fit([read_log(tmp_path / "log.csv")], nominal, mass_std=0.0)
     assert max(map(abs, scores(found, truth).values())) < 3.5, json.dumps(scores(found, truth))
+
+
+def test_noise_levels_come_back_from_their_vector_at_the_floor_too():
+    for level in (-30.0, -5.0, 1.0):
+        noise = Noise.from_vector(jnp.full(17, level).at[9].set(0.3))
+        again = Noise.from_vector(noise.to_vector())
+        for one, two in zip(jax.tree.leaves(noise), jax.tree.leaves(again), strict=True):
+            np.testing.assert_allclose(two, one, rtol=2e-3)

@@ -15,6 +15,8 @@ _SHORTEST, _LONGEST = 0.03, 3.0  # correlation time of the disturbance, s
 UNTIMED = 0.3
 """Least of `Noise.command`: a step came at any moment between two rows (1 / sqrt(12) of it), however smooth the others
 are. Steps that come in time with the rows would else decide how long commands act."""
+_FLOORS = np.array([1e-4] * 6 + [1e-3] * 3 + [1e-3, 1e-5, 1e-3, 1e-2, 1e-2, 1e-2, UNTIMED])
+"""Least of every level, in the order of `Noise` without the correlation time."""
 
 
 class Noise(eqx.Module):
@@ -48,45 +50,30 @@ class Noise(eqx.Module):
         """Unconstrained numbers, for optimisation."""
         middle = jnp.sqrt(_SHORTEST * _LONGEST)
         time = jnp.log(self.correlation_time / middle) / jnp.log(_LONGEST / middle)
-        return jnp.concatenate(
-            [
-                jnp.log(self.gyro),
-                jnp.log(self.rate_walk),
-                jnp.log(self.disturbance),
-                jnp.arctanh(jnp.clip(time, -0.999, 0.999))[None],
-                jnp.log(
-                    jnp.stack(
-                        [
-                            self.accelerometer,
-                            self.accelerometer_lag,
-                            self.force_disturbance,
-                            self.rotor,
-                            self.rotor_walk,
-                            self.rotor_disturbance,
-                            self.command,
-                        ]
-                    )
-                ),
-            ]
-        )
+        levels = (self.gyro, self.rate_walk, self.disturbance, self.accelerometer, self.accelerometer_lag)
+        levels = (*levels, self.force_disturbance, self.rotor, self.rotor_walk, self.rotor_disturbance, self.command)
+        levels = jnp.concatenate([jnp.atleast_1d(level) for level in levels])
+        # A level at its floor stays there and movable: a thousandth of the floor above it.
+        logs = jnp.log(jnp.maximum(levels - _FLOORS, 1e-3 * _FLOORS))
+        return jnp.concatenate([logs[:9], jnp.arctanh(jnp.clip(time, -0.999, 0.999))[None], logs[9:]])
 
     @staticmethod
     def from_vector(vector: Float[Array, "17"]) -> Noise:
         """Inverse of `to_vector`; a floor keeps a vanishing level from flattening the likelihood."""
-        x = jnp.exp(vector)
+        x = jnp.exp(jnp.concatenate([vector[:9], vector[10:]])) + _FLOORS
         middle = jnp.sqrt(_SHORTEST * _LONGEST)
         return Noise(
-            gyro=x[0:3] + 1e-4,
-            rate_walk=x[3:6] + 1e-4,
-            disturbance=x[6:9] + 1e-3,
+            gyro=x[0:3],
+            rate_walk=x[3:6],
+            disturbance=x[6:9],
             correlation_time=middle * jnp.exp(jnp.tanh(vector[9]) * jnp.log(_LONGEST / middle)),
-            accelerometer=x[10] + 1e-3,
-            accelerometer_lag=x[11] + 1e-5,
-            force_disturbance=x[12] + 1e-3,
-            rotor=x[13] + 1e-2,
-            rotor_walk=x[14] + 1e-2,
-            rotor_disturbance=x[15] + 1e-2,
-            command=jnp.maximum(x[16], UNTIMED),
+            accelerometer=x[9],
+            accelerometer_lag=x[10],
+            force_disturbance=x[11],
+            rotor=x[12],
+            rotor_walk=x[13],
+            rotor_disturbance=x[14],
+            command=x[15],
         )
 
     @staticmethod
