@@ -102,7 +102,8 @@ def moved(before: dict, now: dict, pick: Callable[[dict], dict[str, float]], sha
         pick: results to the numbers that count, by the name they are listed under.
         share: of the larger by which two numbers differ to be listed.
     """
-    old, new = pick(before), pick(now)
+    # What is not finite is null in a file.
+    old, new = ({k: math.inf if x is None else x for k, x in pick(which).items()} for which in (before, now))
     rows = [
         f"| {name} | {old[name]:.4g} | {value:.4g} |"
         for name, value in new.items()

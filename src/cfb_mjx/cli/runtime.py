@@ -9,6 +9,7 @@ from datetime import date
 from importlib import metadata
 from pathlib import Path
 
+from cfb_mjx import __version__
 from cfb_mjx.cli.terminal import shown
 from cfb_mjx.interrupts import held_back
 
@@ -74,12 +75,14 @@ def environment() -> dict[str, str]:
     """Date, machine and versions, to stand beside every measured number."""
     import jax
 
-    versions = {name: metadata.version(name) for name in ("cfb_mjx", "jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")}
+    versions = {name: metadata.version(name) for name in ("jax", "jaxlib", "mujoco", "mujoco-mjx", "numpy")}
     return {
         "date": date.today().isoformat(),
         "processor": f"{_processor()}, {os.cpu_count()} cores",
         "device": f"{jax.devices()[0].device_kind} x {jax.device_count()}",
         "python": platform.python_version(),
+        # Not its metadata's: that of an editable install is as old as the installing.
+        "cfb_mjx": __version__,
         **versions,
     }
 
