@@ -225,7 +225,7 @@ def main() -> None:
     parser.add_argument("--drones", type=int, default=20, help="per condition")
     parser.add_argument("--only", nargs="+", choices=list(CONDITIONS), default=list(CONDITIONS))
     parser.add_argument("--generator", type=Path, default=GENERATOR)
-    parser.add_argument("--seed", type=int, default=7000, help="of the first condition; the others count on from it")
+    parser.add_argument("--seed", type=int, default=9000, help="of the first condition; the others count on from it")
     parser.add_argument("--anew", action="store_true", help="forget what an earlier run fitted")
     options = parser.parse_args()
     if not options.generator.is_file():
