@@ -88,7 +88,7 @@ def _mechanics(y: np.ndarray, constants: helpers.Constants) -> tuple[np.ndarray,
 # Relative bounds after 2 s at 4 ms and about 15 rad/s: some two times what was measured (docs/accuracy.md).
 @pytest.mark.parametrize(
     ("integrator", "momentum_bound", "energy_bound"),
-    [("leapfrog", 1e-12, 1e-3), ("euler", 0.15, 0.35), ("rk4", 1e-7, 3e-9)],
+    [("leapfrog", 1e-7, 1e-8), ("euler", 0.15, 0.35), ("rk4", 1e-7, 3e-9)],
 )
 def test_momentum_and_energy_of_free_tumbling(integrator, momentum_bound, energy_bound, fleet, drones, fly_fleet):
     """Rotors off: no torque. Angular momentum and rotational energy are constants of the motion."""
@@ -182,7 +182,7 @@ def test_a_free_body_keeps_its_energy_at_any_rate_the_default_may_meet(preset):
     directions = np.random.default_rng(0).normal(size=(16, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     # Training ends episodes at 30 rad/s; with Euler, the default before, 60 rad/s ended in NaN.
-    for rate, bound in ((30.0, 0.002), (60.0, 0.005), (100.0, 0.01), (400.0, 0.1)):
+    for rate, bound, turned in ((30.0, 1e-6, 1e-6), (60.0, 5e-5, 2e-5), (100.0, 1e-3, 4e-4), (400.0, 0.4, 0.2)):
         rates = jnp.asarray(rate * directions)
         flown = _tumbling(Quadrotor(parameters), rates)
         spin = np.concatenate([np.asarray(rates)[:, None], np.asarray(flown.body_rate)], axis=1)
@@ -191,11 +191,14 @@ def test_a_free_body_keeps_its_energy_at_any_rate_the_default_may_meet(preset):
         drift = np.abs(energy / energy[:, :1] - 1).max()
         print(f"{preset} at {rate:g} rad/s: rotational energy off by {drift:.2%}")
         assert drift < bound
+        # What it errs by makes no rate grow.
+        assert np.all(energy <= energy[:, :1] * 1.02)
         world = [
             helpers.rotation_matrix(q) @ m
             for q, m in zip(np.asarray(flown.quaternion)[:, -1], momentum[:, -1], strict=True)
         ]
-        np.testing.assert_allclose(world, momentum[:, 0], rtol=0, atol=1e-11 * rate)
+        away = np.linalg.norm(np.array(world) - momentum[:, 0], axis=1) / np.linalg.norm(momentum[:, 0], axis=1)
+        assert away.max() < turned
 
 
 @eqx.filter_jit

@@ -24,10 +24,10 @@ class Body(Protocol):
     def prepare(self, parameters: Parameters, dt) -> object:
         """Quantities computed once per rollout with integration steps of ``dt`` seconds."""
 
-    def accelerations(self, prepared, state: Components, wrench: Wrench) -> tuple[Vec, Vec]:
+    def accelerations(self, prepared, state: Components, wrench: Wrench, gyroscopic: bool = True) -> tuple[Vec, Vec]:
         """Acceleration of the centre of gravity (world, m/s^2) and angular acceleration (body, rad/s^2).
 
-        ``wrench`` is about the centre of gravity, body axes.
+        ``wrench`` is about the centre of gravity, body axes. ``gyroscopic`` False leaves -J^-1 (omega x J omega) out.
         """
 
 
@@ -47,9 +47,13 @@ class RigidBody:
         inertia = Vec.unstack(parameters.inertia)
         return _Prepared(1 / parameters.mass, parameters.gravity, inertia, inertia.map(lambda x: 1 / x))
 
-    def accelerations(self, prepared: _Prepared, state: Components, wrench: Wrench) -> tuple[Vec, Vec]:
-        omega = state.body_rate
-        angular = (wrench.torque - omega.cross(prepared.inertia * omega)) * prepared.inverse_inertia
+    def accelerations(
+        self, prepared: _Prepared, state: Components, wrench: Wrench, gyroscopic: bool = True
+    ) -> tuple[Vec, Vec]:
+        omega, torque = state.body_rate, wrench.torque
+        if gyroscopic:
+            torque = torque - omega.cross(prepared.inertia * omega)
+        angular = torque * prepared.inverse_inertia
         x, y, z = rotate(state.quaternion, wrench.force * prepared.inverse_mass)
         return Vec(x, y, z - prepared.gravity), angular
 

@@ -42,6 +42,7 @@ class _Prepared(eqx.Module):
     mass_diagonal: Float[Array, "6"]
     """Diagonal of the joint-space inertia. For one free body in its centre-of-gravity frame that matrix is diagonal
     and the same in every state, so it is computed once instead of at every step."""
+    inertia: Vec
 
 
 class MjxBody:
@@ -90,15 +91,20 @@ class MjxBody:
             geom_pos=jnp.where(moving[:, None], model.geom_pos - center, model.geom_pos),
             body_invweight0=model.body_invweight0.at[body].set(inverse),
         )
-        return _Prepared(model, data, _mass_diagonal(model, data))
+        return _Prepared(model, data, _mass_diagonal(model, data), Vec.unstack(parameters.inertia))
 
-    def accelerations(self, prepared: _Prepared, state: Components, wrench: Wrench) -> tuple[Vec, Vec]:
-        model = prepared.model
+    def accelerations(
+        self, prepared: _Prepared, state: Components, wrench: Wrench, gyroscopic: bool = True
+    ) -> tuple[Vec, Vec]:
+        model, torque = prepared.model, wrench.torque
+        if not gyroscopic:
+            # MuJoCo takes the gyroscopic torque off: given to it before, it cancels.
+            torque = torque + state.body_rate.cross(prepared.inertia * state.body_rate)
         data = prepared.data.replace(
             qpos=jnp.concatenate([state.position.stack(), state.quaternion.stack()]),
             qvel=jnp.concatenate([state.velocity.stack(), state.body_rate.stack()]),
             # Generalised force of a free joint: world force at its origin, torque in body axes.
-            qfrc_applied=jnp.concatenate([rotate(state.quaternion, wrench.force).stack(), wrench.torque.stack()]),
+            qfrc_applied=jnp.concatenate([rotate(state.quaternion, wrench.force).stack(), torque.stack()]),
         )
         if self.floor:
             acceleration = _with_contact(model, data)

@@ -47,7 +47,7 @@ class Quadrotor(eqx.Module):
         body: `RigidBody()` (closed form, no ground, fastest) or `MjxBody()` (MuJoCo XLA, floor contact).
         dt: time between commands, s.
         substeps: integration steps per command.
-        integrator: ``"leapfrog"`` (second order, keeps a free body's angular momentum), ``"euler"`` (MuJoCo's
+        integrator: ``"leapfrog"`` (second order, free rotation fourth order), ``"euler"`` (MuJoCo's
             semi-implicit Euler, first order, for parity with MuJoCo) or ``"rk4"`` (fourth order, three times the cost).
         rotor_loads: ``"instant"`` evaluates thrust and torque at the integrator's stages; ``"mean"`` applies their
             exact impulses over each integration step (``docs/accuracy.md`` says what that buys).
@@ -273,10 +273,7 @@ def _integrate(prepared: Prepared, state: Components, path: rotors.RotorPath) ->
         if prepared.wrench_once:
             wrench = jax.lax.optimization_barrier(wrench)
         torque = wrench.torque - parameters.center_of_gravity.cross(wrench.force)
-        if not gyroscopic:
-            # Every body takes the gyroscopic torque off, MuJoCo too: given to it before, it cancels.
-            torque = torque + at.body_rate.cross(inertia * at.body_rate)
-        return model.body.accelerations(prepared.body, at, Wrench(wrench.force, torque))
+        return model.body.accelerations(prepared.body, at, Wrench(wrench.force, torque), gyroscopic)
 
     inertia = Vec.unstack(parameters.inertia)
     moved = INTEGRATORS[model.integrator](accelerations, state, prepared.dt, inertia)
