@@ -32,9 +32,9 @@ def leapfrog(accelerations: Accelerations, state: Components, dt, inertia: Vec) 
     """
     half, omega = 0.5 * dt, state.body_rate
     position = state.position + state.velocity * half
-    middle = _factor(omega * (0.5 * half))
+    factor = _factor(omega * (0.5 * half))
     # One step of Newton's for the length: the factor's square is 1 + |half angle|^2, and the angle is small.
-    middle = multiply(state.quaternion, middle) * (1.5 - 0.5 * middle.dot(middle))
+    middle = multiply(state.quaternion, factor) * (1.5 - 0.5 * factor.dot(factor))
     at = Components(position, state.velocity, middle, omega, state.rotor_speed, state.memory)
     linear, angular = accelerations(at, MIDDLE, gyroscopic=False)
     velocity = state.velocity + linear * dt

@@ -42,7 +42,6 @@ class _Prepared(eqx.Module):
     mass_diagonal: Float[Array, "6"]
     """Diagonal of the joint-space inertia. For one free body in its centre-of-gravity frame that matrix is diagonal
     and the same in every state, so it is computed once instead of at every step."""
-    inertia: Vec
 
 
 class MjxBody:
@@ -91,7 +90,7 @@ class MjxBody:
             geom_pos=jnp.where(moving[:, None], model.geom_pos - center, model.geom_pos),
             body_invweight0=model.body_invweight0.at[body].set(inverse),
         )
-        return _Prepared(model, data, _mass_diagonal(model, data), Vec.unstack(parameters.inertia))
+        return _Prepared(model, data, _mass_diagonal(model, data))
 
     def accelerations(
         self, prepared: _Prepared, state: Components, wrench: Wrench, gyroscopic: bool = True
@@ -99,7 +98,8 @@ class MjxBody:
         model, torque = prepared.model, wrench.torque
         if not gyroscopic:
             # MuJoCo takes the gyroscopic torque off: given to it before, it cancels.
-            torque = torque + state.body_rate.cross(prepared.inertia * state.body_rate)
+            inertia = Vec.unstack(prepared.mass_diagonal[3:])
+            torque = torque + state.body_rate.cross(inertia * state.body_rate)
         data = prepared.data.replace(
             qpos=jnp.concatenate([state.position.stack(), state.quaternion.stack()]),
             qvel=jnp.concatenate([state.velocity.stack(), state.body_rate.stack()]),

@@ -180,16 +180,16 @@ def _playing(asked: tuple[str, ...]) -> tuple[str, ...]:
 def _settled(unknowns, vector, noise: Noise, segments: Segments, use_measured, robust, ridge, progress):
     """Vector and noise levels of largest likelihood, found in turns."""
     for done in range(ROUNDS):
-        before, loud = vector, noise
+        before, levels = vector, noise
         noise = fit_noise(unknowns, vector, noise, segments, use_measured, robust)
         vector = _fit_vector(unknowns, vector, noise, segments, use_measured, robust, ridge)
         if progress is not None:
             progress(min(done + 1, ROUNDS - 1), ROUNDS)
         # A vector that the flights hardly tell may creep for ever; what creeps under the same noise is of no matter.
-        louder = max(
-            float(jnp.max(jnp.abs(a / b - 1))) for a, b in zip(*map(jax.tree.leaves, (noise, loud)), strict=True)
+        changed = max(
+            float(jnp.max(jnp.abs(a / b - 1))) for a, b in zip(*map(jax.tree.leaves, (noise, levels)), strict=True)
         )
-        if done and (louder < SETTLED or float(jnp.max(jnp.abs(vector - before))) < SETTLED):
+        if done and (changed < SETTLED or float(jnp.max(jnp.abs(vector - before))) < SETTLED):
             break
     return vector, noise
 
