@@ -131,7 +131,8 @@ def columns(made: dict[str, ModelFile], logs: dict[str, list[FlightLog]]) -> dic
     """The fit flights, predicted with the sensor faults taken out and as they were logged; what the velocity column
     does, stretched alike at all frequencies or in a band of them."""
     fit = logs["fit"]
-    even = check_sensors(fit, usual_delay(fit, made["repaired"].parameters())).faults
+    parameters = made["repaired"].parameters()
+    even = check_sensors(fit, usual_delay(fit, parameters), float(parameters.gyro_delay)).faults
     band = SensorFaults.from_mappings(made["repaired"].effects, "repaired")
 
     def explains(some: list[FlightLog]) -> list[float]:

@@ -50,7 +50,7 @@ def test_the_same_windows_have_the_same_minimum(drone):
     truth, logs = drone
     pieces = mujoco_fit.windows(logs)
     independent = mujoco_fit.fit(pieces)
-    cut = [find_windows(log, HORIZONS, log.observation_delay) for log in logs]
+    cut = [find_windows(log, HORIZONS, log.observation_delay, 0.0) for log in logs]
     joined = Windows(**{f.name: np.concatenate([getattr(w, f.name) for w in cut]) for f in dataclasses.fields(Windows)})
     assert len(joined) == len(pieces)
     noise = np.array([piece.noise for piece in pieces])[:, None]

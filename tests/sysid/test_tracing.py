@@ -59,7 +59,7 @@ def base():
 
 
 def test_healthy_sensors_agree_with_each_other(campaigns):
-    check = check_sensors(campaigns["clean"].fit, 0.008)
+    check = check_sensors(campaigns["clean"].fit, 0.008, 0.0)
     assert check.faults.healthy
     assert not check.findings
     for name, healthy in (("sensor_delay", 0.0), ("sensor_gyro_lowpass", 0.0), ("sensor_velocity_scale", 1.0)):
@@ -79,7 +79,7 @@ def test_healthy_sensors_agree_with_each_other(campaigns):
 )
 def test_sensor_faults_are_named_and_measured(campaigns, case, fault, truth, tolerance):
     campaign = campaigns[case]
-    check = check_sensors(campaign.fit, 0.008)
+    check = check_sensors(campaign.fit, 0.008, 0.0)
     assert [f.name for f in check.findings] == [fault]
     assert check.findings[0].value == pytest.approx(truth(campaign.truth["effects"][fault]), abs=tolerance)
     # With the fault told, the declared model scores better on other flights; no other effect is needed for that.
@@ -115,7 +115,7 @@ def test_a_velocity_stretched_along_some_axes_only_is_told_from_one_stretched_al
     """As an estimator does that takes horizontal velocity from optical flow and vertical velocity from a ranger."""
     stretch = np.array([across, across, up])
     flights = [log.replace(velocity=log.velocity * stretch) for log in campaigns["clean"].fit]
-    check = check_sensors(flights, 0.008)
+    check = check_sensors(flights, 0.008, 0.0)
     assert [f.name for f in check.findings] == ["sensor_velocity_scale"]
     np.testing.assert_allclose(check.faults.stretch.scale, stretch, atol=0.004)
     assert check.findings[0].p_value < 1e-6
@@ -126,7 +126,7 @@ def test_a_velocity_stretched_along_some_axes_only_is_told_from_one_stretched_al
     assert set(check.findings[0].uncertainty) == {"scale", "vertical"}
     told = SensorFaults.from_mappings(check.faults.to_mappings(), "drone.yaml")
     assert told == check.faults
-    healthy = check_sensors(campaigns["clean"].fit, 0.008)
+    healthy = check_sensors(campaigns["clean"].fit, 0.008, 0.0)
     for log, bad in zip(campaigns["clean"].fit, flights, strict=True):
         np.testing.assert_allclose(check.gyro_bias[log.name], healthy.gyro_bias[log.name], atol=1e-4)
         np.testing.assert_allclose(told.repaired(bad).velocity, log.velocity, atol=0.005 * np.abs(log.velocity).max())
@@ -135,7 +135,7 @@ def test_a_velocity_stretched_along_some_axes_only_is_told_from_one_stretched_al
 def test_a_gyro_that_is_said_to_be_late_is_no_finding(campaigns, base):
     logs = campaigns["clean"].fit
     late = [log.replace(body_rate=interpolate(log.time, log.body_rate, log.time - 0.006)) for log in logs]
-    assert {f.name for f in check_sensors(late, 0.008).findings} == {"sensor_gyro_lowpass"}
+    assert {f.name for f in check_sensors(late, 0.008, 0.0).findings} == {"sensor_gyro_lowpass"}
     said = check_sensors(late, 0.008, 0.006)
     assert not said.findings
     drone = base.with_values("late", gyro_delay=0.006).parameters()
@@ -187,7 +187,7 @@ def test_evidence_is_calibrated_on_noise():
 def test_a_line_in_every_flight_is_found_and_noise_has_none(campaigns, base):
     for name in ("periodic", "clean"):
         campaign = campaigns[name]
-        search = Search.start(campaign.fit, base.parameters(), 0.008, check_sensors(campaign.fit, 0.008))
+        search = Search.start(campaign.fit, base.parameters(), 0.008, check_sensors(campaign.fit, 0.008, 0.0))
         lines = find_lines(residual_rows(search, search.nothing()))
         if name == "clean":
             assert not lines
@@ -294,7 +294,7 @@ def test_a_limit_is_not_taken_for_half_of_it_and_another(campaigns, base, guess)
     """Of a limit on commands; from there a search goes on that only saw slopes at zero."""
     campaign = campaigns["limited"]
     flights = campaign.fit[:3]
-    search = Search.start(flights, base.parameters(), 0.008, check_sensors(flights, 0.008))
+    search = Search.start(flights, base.parameters(), 0.008, check_sensors(flights, 0.008, 0.0))
     nothing = search.learned(search.nothing())
     fitted = search.settled(nothing.having(CATALOGUE["esc_rate_limit"](slowness=guess)))
     limit = fitted.effect("esc_rate_limit")
@@ -317,7 +317,7 @@ def test_what_no_search_looks_for_takes_part_where_it_is_named_or_declared(campa
     def names(*given):
         return Search.start(campaigns["clean"].fit[:1], base.parameters(), 0.008, sensors, *given).names
 
-    sensors = check_sensors(campaigns["clean"].fit, 0.008)
+    sensors = check_sensors(campaigns["clean"].fit, 0.008, 0.0)
     assert set(CATALOGUE) - set(names()) == {"position_moment", "gust", "jet"}
     assert "position_moment" in names((), ["position_moment"])
     assert "position_moment" in names((CATALOGUE["position_moment"].neutral(),))
@@ -331,7 +331,7 @@ def test_nothing_is_reported_on_a_clean_drone(campaigns, base):
 
 def test_all_effects_at_neutral_replay_like_the_bare_model(campaigns, base):
     campaign = campaigns["clean"]
-    search = Search.start(campaign.fit[:1], base.parameters(), 0.008, check_sensors(campaign.fit[:1], 0.008))
+    search = Search.start(campaign.fit[:1], base.parameters(), 0.008, check_sensors(campaign.fit[:1], 0.008, 0.0))
     bare = evaluate(Quadrotor(base.parameters()), campaign.fit[:1]).metrics("commands_in")
     full = evaluate(search.nothing().model(base.parameters()), campaign.fit[:1]).metrics("commands_in")
     for key, value in bare.items():

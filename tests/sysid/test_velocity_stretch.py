@@ -110,8 +110,8 @@ def test_faults_taken_as_logged_move_the_position_alone(stretched):
         log = faults.repaired(bad)
         for name in ("time", "velocity", "quaternion", "body_rate", "command"):
             np.testing.assert_array_equal(getattr(log, name), getattr(bad, name))
-        recorded = find_windows(bad, horizons, 0.008)
-        windows = find_windows(log, faults.reached(horizons), 0.008, recorded.start)
+        recorded = find_windows(bad, horizons, 0.008, 0.0)
+        windows = find_windows(log, faults.reached(horizons), 0.008, 0.0, recorded.start)
         told = faults.as_recorded(perfectly(windows), horizons, faults.began(bad, windows, 0.008))
         np.testing.assert_allclose(told.velocity, recorded.true_velocity, atol=1e-12)
         off = log.position - bad.position
@@ -124,9 +124,9 @@ def test_what_is_recorded_of_a_perfect_prediction_is_the_record(stretched, delay
     horizons = (0.05, 0.1, 0.2, 0.5)
     faults = SensorFaults(**{**vars(BAND), "delay": delay})
     for bad in stretched[:3]:
-        recorded = find_windows(bad, horizons, 0.008)
+        recorded = find_windows(bad, horizons, 0.008, 0.0)
         repaired = faults.repaired(bad)
-        windows = find_windows(repaired, faults.reached(horizons), 0.008, recorded.start)
+        windows = find_windows(repaired, faults.reached(horizons), 0.008, 0.0, recorded.start)
         told = faults.as_recorded(perfectly(windows), horizons, faults.began(bad, windows, 0.008))
         wrong = np.abs(recorded.true_velocity - told.velocity)
         # Linear between the times a window is followed at, which noise is not; the stretch itself is far larger.

@@ -32,25 +32,25 @@ def make_log(time, rotor_speed=None, **metadata):
 
 
 def test_starts_are_every_fifth_of_a_second_from_six_tenths():
-    starts = find_starts(make_log(np.arange(0, 2.0001, 0.004)), HORIZONS, 0.008)
+    starts = find_starts(make_log(np.arange(0, 2.0001, 0.004)), HORIZONS, 0.008, 0.0)
     # 1.4 + 0.53 lies inside 2.0, 1.6 + 0.53 does not.
     np.testing.assert_allclose(starts, [0.6, 0.8, 1.0, 1.2, 1.4])
 
 
 def test_a_first_sample_a_little_late_does_not_shift_the_windows():
-    starts = find_starts(make_log(0.0039 + np.arange(0, 2.0, 0.004)), HORIZONS, 0.008)
+    starts = find_starts(make_log(0.0039 + np.arange(0, 2.0, 0.004)), HORIZONS, 0.008, 0.0)
     assert starts[0] == 0.6
 
 
 def test_a_log_that_starts_elsewhere_counts_from_its_first_row():
-    starts = find_starts(make_log(1000.0 + np.arange(0, 2.0001, 0.004)), HORIZONS, 0.008)
+    starts = find_starts(make_log(1000.0 + np.arange(0, 2.0001, 0.004)), HORIZONS, 0.008, 0.0)
     np.testing.assert_allclose(starts[0], 1000.6)
 
 
 def test_too_short_a_log_has_no_window():
     log = make_log(np.arange(0, 1.0, 0.004))
-    assert len(find_starts(log, HORIZONS, 0.008)) == 0
-    assert len(find_windows(log, HORIZONS, 0.008)) == 0
+    assert len(find_starts(log, HORIZONS, 0.008, 0.0)) == 0
+    assert len(find_windows(log, HORIZONS, 0.008, 0.0)) == 0
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_too_short_a_log_has_no_window():
 def test_gaps_end_windows(gap_begin, gap_end, lost):
     time = np.arange(0, 4.0001, 0.004)
     time = time[(time < gap_begin + 1e-9) | (time > gap_end - 1e-9)]
-    starts = find_starts(make_log(time), HORIZONS, 0.008)
+    starts = find_starts(make_log(time), HORIZONS, 0.008, 0.0)
     every = 0.6 + 0.2 * np.arange(15)
     missing = [round(t, 3) for t in every if not np.any(np.abs(starts - t) < 1e-9)]
     if gap_begin == 2.104:
@@ -83,17 +83,17 @@ def with_step(begin, step, interval=0.004, end=4.0):
 @pytest.mark.parametrize("interval", [0.002, 0.004, 0.01])
 def test_a_gap_is_longer_than_three_intervals_and_half_a_millisecond(interval):
     longest = 3 * interval + 0.5e-3
-    whole = find_starts(make_log(np.arange(0, 4.0001, interval)), HORIZONS, 0.008)
+    whole = find_starts(make_log(np.arange(0, 4.0001, interval)), HORIZONS, 0.008, 0.0)
     for step, lost in ((longest - 1e-5, 0), (longest + 1e-5, 4)):
         # 2.15 lies within [t0 - 0.3, t0 + 0.5] of 1.8, 2.0, 2.2 and 2.4.
-        starts = find_starts(make_log(with_step(2.15, step, interval)), HORIZONS, 0.008)
+        starts = find_starts(make_log(with_step(2.15, step, interval)), HORIZONS, 0.008, 0.0)
         assert len(whole) - len(starts) == lost
 
 
 def test_a_window_lasts_530_milliseconds():
     """0.5 s of prediction and 30 ms for readings that come late."""
     for last, expected in ((1.93, 1.4), (1.929, 1.2)):
-        starts = find_starts(make_log(np.append(np.arange(0, last - 1e-9, 0.004), last)), HORIZONS, 0.008)
+        starts = find_starts(make_log(np.append(np.arange(0, last - 1e-9, 0.004), last)), HORIZONS, 0.008, 0.0)
         assert starts[-1] == pytest.approx(expected)
 
 
@@ -109,7 +109,7 @@ def test_a_window_lasts_530_milliseconds():
     ],
 )
 def test_gaps_count_from_300_ms_before_a_start_to_500_ms_after(begin, step, lost):
-    starts = find_starts(make_log(with_step(begin, step)), HORIZONS, 0.008)
+    starts = find_starts(make_log(with_step(begin, step)), HORIZONS, 0.008, 0.0)
     every = 0.6 + 0.2 * np.arange(15)
     assert [round(t, 3) for t in every if not np.any(np.abs(starts - t) < 1e-9)] == lost
 
@@ -123,7 +123,7 @@ def test_pose_is_read_late_by_the_delay_and_gyro_is_not():
     zero = 0 * time
     turning = np.stack([np.cos(time / 2), zero, zero, np.sin(time / 2)], axis=1)
     log = replace(make_log(time), velocity=np.stack([3 * time, zero, zero], axis=1), quaternion=turning)
-    windows = find_windows(log, HORIZONS, delay)
+    windows = find_windows(log, HORIZONS, delay, 0.0)
     for late, velocity, quaternion in (
         (windows.start + delay, windows.velocity, windows.quaternion),
         (windows.start[:, None] + np.array(HORIZONS) + delay, windows.true_velocity, windows.true_quaternion),
@@ -139,7 +139,7 @@ def test_pose_is_read_late_by_the_delay_and_gyro_is_not():
 
 def test_a_gyro_that_is_late_is_read_late():
     log = make_log(np.arange(0, 3.0, 0.004))
-    windows = find_windows(log, HORIZONS, 0.0065, gyro_delay=0.003)
+    windows = find_windows(log, HORIZONS, 0.0065, 0.003)
     ends = windows.start[:, None] + np.array(HORIZONS)
     np.testing.assert_allclose(windows.position[:, 0], windows.start + 0.0065, atol=1e-12)
     np.testing.assert_allclose(windows.body_rate[:, 0], windows.start + 0.003, atol=1e-12)
@@ -150,7 +150,7 @@ def test_a_gyro_that_is_late_is_read_late():
 @pytest.mark.parametrize("delays", [(0.09, 0.0), (0.008, 0.09)])
 def test_no_window_reads_what_comes_after_the_logs_end(delays):
     log = make_log(np.arange(0, 3.0001, 0.004))
-    windows = find_windows(log, HORIZONS, delays[0], gyro_delay=delays[1])
+    windows = find_windows(log, HORIZONS, *delays)
     assert windows.start[-1] + HORIZONS[-1] + 0.09 <= log.time[-1] < windows.start[-1] + HORIZONS[-1] + 0.09 + 0.2
     ends = windows.start[:, None] + np.array(HORIZONS)
     np.testing.assert_allclose(windows.true_position[..., 0], ends + delays[0], atol=1e-12)
@@ -160,7 +160,7 @@ def test_no_window_reads_what_comes_after_the_logs_end(delays):
 def test_steps_reach_every_horizon_and_hold_each_rows_command(rate):
     time = np.arange(0, 3.0, 1 / rate)
     log = make_log(time)
-    windows = find_windows(log, HORIZONS, 0.008)
+    windows = find_windows(log, HORIZONS, 0.008, 0.0)
     elapsed = np.concatenate([np.zeros((len(windows), 1)), np.cumsum(windows.step, axis=1)], axis=1)
     reached = np.take_along_axis(elapsed, windows.at, axis=1)
     np.testing.assert_allclose(reached, np.tile(HORIZONS, (len(windows), 1)), atol=1e-9)
@@ -178,7 +178,7 @@ def test_rotor_speed_is_linear_between_rows_and_missing_where_not_measured():
     speed = np.tile((1000 + 100 * time)[:, None], (1, 4))
     speed[150, 0] = np.nan  # one bad reading is bridged
     speed[250:260, 1] = np.nan  # a run is not
-    windows = find_windows(make_log(time, rotor_speed=speed), HORIZONS, 0.008)
+    windows = find_windows(make_log(time, rotor_speed=speed), HORIZONS, 0.008, 0.0)
     measured = np.isfinite(windows.rotor_speed).all(axis=(1, 2))
     touched = (windows.start <= 2.6) & (windows.start + 0.5 >= 2.49)
     assert np.array_equal(measured, ~touched)

@@ -51,7 +51,7 @@ def outcome(logs):
     """A hand-made outcome: a drag the drone does not have was 'found', with a made-up verdict."""
     base = load_model_file("cfb-guards")
     parameters = base.parameters()
-    sensors = check_sensors(logs[0], 0.008)
+    sensors = check_sensors(logs[0], 0.008, 0.0)
     sensors = replace(sensors, faults=SensorFaults(), findings=[])
     # One effect instead of the whole catalogue compiles in a fraction of the time.
     search = replace(Search.start(logs[0], parameters, 0.008, sensors), names=("rotor_drag",))

@@ -185,7 +185,7 @@ def _fly_randomised(
     nominal = Quadrotor.from_file(model)
     delay = log.observation_delay
     delay = float(nominal.parameters.pose_delay) if delay is None else delay
-    windows = find_windows(log, HORIZONS, delay)
+    windows = find_windows(log, HORIZONS, delay, float(nominal.parameters.gyro_delay))
     speeds = start_of_windows(nominal, log, windows, delay)[0]
     window = len(windows) // 2
     start = windows.start[window]

@@ -229,7 +229,7 @@ def bands(model, log: FlightLog, start: float, count: int = SIMULATIONS, seed: i
 
     nominal = Quadrotor.from_file(model)
     delay = delay_of(log, nominal.parameters)
-    window = find_windows(log, (0.05,), delay, starts=np.array([start]))
+    window = find_windows(log, (0.05,), delay, float(nominal.parameters.gyro_delay), np.array([start]))
     speed = start_of_windows(nominal, log, window, delay)[0]
     first = State(
         *(jnp.asarray(x[0]) for x in (window.position, window.velocity, window.quaternion, window.body_rate, speed))

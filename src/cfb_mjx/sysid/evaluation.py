@@ -144,10 +144,10 @@ def _evaluate_log(
     over: Devices | None,
 ) -> LogEvaluation:
     delay, gyro_delay = delay_of(log, model.parameters), float(model.parameters.gyro_delay)
-    recorded = find_windows(log, horizons, delay, gyro_delay=gyro_delay)
+    recorded = find_windows(log, horizons, delay, gyro_delay)
     reached, as_logged = faults.reached(horizons), log
     log = faults.repaired(log)
-    windows = recorded if faults.healthy else find_windows(log, reached, delay, recorded.start, gyro_delay)
+    windows = recorded if faults.healthy else find_windows(log, reached, delay, gyro_delay, recorded.start)
     began = faults.began(as_logged, windows, delay)
     measured = np.isfinite(windows.rotor_speed).all(axis=(1, 2))
     predictions: dict[str, State | None] = dict.fromkeys(VARIANTS + OBSERVED)

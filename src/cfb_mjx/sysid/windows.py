@@ -57,7 +57,7 @@ class Windows:
         return len(self.start)
 
 
-def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float, gyro_delay: float = 0.0) -> np.ndarray:
+def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float, gyro_delay: float) -> np.ndarray:
     """Window starts the protocol allows: (W,) s of log time, possibly none."""
     # Logs count from zero even when their first sample comes a little later; others are taken from their first row.
     origin = 0.0 if 0 <= log.time[0] < START_SPACING else log.time[0]
@@ -81,8 +81,8 @@ def find_windows(
     log: FlightLog,
     horizons: tuple[float, ...],
     delay: float,
+    gyro_delay: float,
     starts: np.ndarray | None = None,
-    gyro_delay: float = 0.0,
 ) -> Windows:
     """Cut a log into prediction windows.
 
@@ -90,8 +90,8 @@ def find_windows(
         log: the flight.
         horizons: prediction horizons, s, ascending.
         delay: age of pose and velocity in a row, s; commands are taken as current.
-        starts: window starts, s, in place of those of `find_starts`.
         gyro_delay: age of the gyro's reading in a row, s.
+        starts: window starts, s, in place of those of `find_starts`.
     """
     starts = find_starts(log, horizons, delay, gyro_delay) if starts is None else starts
     ticks = np.ceil(log.time / COMMAND_TICK - 1e-6) * COMMAND_TICK

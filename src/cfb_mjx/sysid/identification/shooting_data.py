@@ -53,7 +53,7 @@ def batches(
     """Windows of the logs, those with and those without measured rotor speeds.
 
     Args:
-        logs: flights.
+        logs: flights, the gyro in time (`with_gyro_in_time`).
         delay: age of the pose in every log, s; None takes each log's own.
         fallback: for logs that do not know theirs, s.
         use_measured: feed measured rotor speeds where there are some.
@@ -63,7 +63,7 @@ def batches(
     for log in logs:
         own = log.metadata.get("observation_delay")
         age = delay if delay is not None else (fallback if own is None else float(own))
-        windows = find_windows(log, HORIZONS, age)
+        windows = find_windows(log, HORIZONS, age, gyro_delay=0.0)
         if len(windows):
             good = np.isfinite(windows.rotor_speed).all(axis=(1, 2)) & use_measured
             for measured in (True, False):

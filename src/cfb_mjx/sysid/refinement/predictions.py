@@ -127,7 +127,7 @@ class Predictions:
         flights = []
         for log in logs:
             delay = delay_of(log, model.parameters)
-            windows = find_windows(log, HORIZONS, delay, gyro_delay=float(model.parameters.gyro_delay))
+            windows = find_windows(log, HORIZONS, delay, float(model.parameters.gyro_delay))
             flights.append((windows, *(start_of_windows(model, log, windows, delay) if len(windows) else ((), ()))))
         held = [_norms(hold(windows, HORIZONS), windows) for windows, _, _ in flights if len(windows)]
         if not held:

@@ -47,7 +47,7 @@ class Kinematics:
     weight: np.ndarray
 
 
-def compare_sensors(log: FlightLog, delay: float, gyro_delay: float = 0.0, gravity: float = 9.81) -> Kinematics:
+def compare_sensors(log: FlightLog, delay: float, gyro_delay: float, gravity: float = 9.81) -> Kinematics:
     """Compare the sensors of one log.
 
     Args:

@@ -72,7 +72,7 @@ class SensorCheck:
         )
 
 
-def check_sensors(logs: list[FlightLog], delay: float, gyro_delay: float = 0.0) -> SensorCheck:
+def check_sensors(logs: list[FlightLog], delay: float, gyro_delay: float) -> SensorCheck:
     """Compare the sensors of a campaign's flights with each other.
 
     Args:
