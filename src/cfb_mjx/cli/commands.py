@@ -20,7 +20,7 @@ from cfb_mjx.errors import CfbError
 
 
 def import_log(
-    source: tyro.conf.Positional[Path],
+    sources: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")],
     output: Output,
     format: Literal["auto", "tabular", "idsia", "mcap", "usd_card", "crazyswarm", "radio_csv"] = "auto",
     motor_shift: float | None = None,
@@ -28,25 +28,29 @@ def import_log(
     topics_yaml: File = None,
     robot: str | None = None,
     time_unit: str | None = None,
+    keep_ground: bool = False,
 ) -> None:
     """Convert a flight log to MCAP.
 
     Checks units, frames and time stamps on the way, and says what it changed.
 
     Args:
-        source: log to read: parquet, csv, MCAP, Crazyflie micro SD card binary, Crazyswarm2 bag, radio csv.
+        sources: log to read: parquet, csv, MCAP, Crazyflie micro SD card binary, Crazyswarm2 bag, radio csv; several
+            tables, as cfclient writes one per log block, are one flight.
         output: MCAP file to write.
         format: layout of the source; auto looks at its content.
         motor_shift: s by which to delay the motor columns of an IDSIA log instead of the estimated shift.
         mapping: YAML saying which logged variable is what (micro SD card, Crazyswarm2, radio csv).
         topics_yaml: crazyflies.yaml with the variable names of the custom topics of a Crazyswarm2 bag.
         robot: whose flight to read from a Crazyswarm2 bag of several.
-        time_unit: unit of the time column of a radio csv.
+        time_unit: unit of the time column of a radio csv: s, ms, us or ns.
+        keep_ground: leave in what was recorded on the ground and in the hand.
     """
     from cfb_mjx.cli.importing import run_import
 
     options = {"motor_shift": motor_shift, "mapping": mapping, "topics_yaml": topics_yaml, "robot": robot}
-    run_import(source, output, None if format == "auto" else format, options | {"time_unit": time_unit})
+    options |= {"time_unit": time_unit, "keep_ground": keep_ground}
+    run_import(list(sources), output, None if format == "auto" else format, options)
 
 
 def evaluate(
@@ -178,11 +182,13 @@ def fit_rotors(
     json: File = None,
     figure: File = None,
     tared: bool = False,
+    rotors: int | None = None,
 ) -> None:
     """Fit motors and rotor maps on their own, from flights with rotor speed and from bench tables.
 
     What a file holds is seen from its content: a flight log, command steps (t, u or u1..u4, omega or omega1..omega4),
-    or steady force and torque (omega, force, torque, optionally motor). What the data cannot tell is named.
+    steady points (u, omega, vbat), steady force and torque (omega, force, torque, optionally motor), or any of these
+    under the names of Bitcraze's, RCbenchmark's or Tyto's tools. What the data cannot tell is named.
 
     Args:
         files: flight logs and bench tables (csv, parquet).
@@ -197,13 +203,15 @@ def fit_rotors(
         json: write the results here.
         figure: draw fits and residuals here (.png, .svg, .pdf).
         tared: the scale read zero at rest, so that no offset of its readings is tried and none is in the error bars.
+        rotors: of how many rotors force and torque are; without it of four where several rotors' speeds stand beside
+            them, else of one.
     """
     if not files:
         raise CfbError("fit-rotors needs at least one file; see 'cfb fit-rotors --help'.")
     from cfb_mjx.cli.rotor_fitting import run_fit_rotors
 
     run_fit_rotors(
-        list(files), output, model, flat(set), offset, asymmetric, dead_time, per_motor, robust, json, figure, tared
+        list(files), output, model, flat(set), offset, asymmetric, dead_time, per_motor, robust, json, figure, tared, rotors
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -10,17 +11,17 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import estimate_command_shift, read_log, write_mcap
 
 
-def run_import(source: Path, output: Path, format: str | None, options: dict[str, object]) -> None:
-    """Convert ``source`` to the MCAP ``output`` and report what was read.
+def run_import(sources: list[Path], output: Path, format: str | None, options: dict[str, Any]) -> None:
+    """Convert ``sources``, one flight, to the MCAP ``output`` and report what was read.
 
     Raises:
         CfbError: see `cfb_mjx.logs.read_log`; or the output is not an .mcap, or is the source itself.
     """
     if output.suffix != ".mcap":
         raise CfbError(f"{output}: the output must end in .mcap.")
-    if output.exists() and source.exists() and output.samefile(source):
+    if output.exists() and any(source.exists() and output.samefile(source) for source in sources):
         raise CfbError(f"{output}: is the source itself; choose another name.")
-    log = read_log(source, format, **options)
+    log = read_log(sources, format, **options)
     alignment = log.metadata.get("alignment")
     if alignment is None:
         alignment = {**estimate_command_shift(log).report(), "applied": False}

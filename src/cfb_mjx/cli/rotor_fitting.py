@@ -16,16 +16,19 @@ from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, require_folder, together, write_json
 from cfb_mjx.logs import read_log
-from cfb_mjx.logs.bench_tables import MapTable, MotorRecord, from_columns, recognises
+from cfb_mjx.logs.bench_layouts import Bench, SteadyPoints, read_bench_table, recognises
+from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
 from cfb_mjx.logs.tabular import read_table
 
 if TYPE_CHECKING:
     from cfb_mjx.parameters import ModelFile
     from cfb_mjx.sysid.rotors.motors import MotorFit
     from cfb_mjx.sysid.rotors.rotor_maps import MapFit
+    from cfb_mjx.sysid.rotors.steady import SteadyFit
 
 _FILE_NAMES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
 _COLUMN = {"thrust": "force", "torque": "torque"}
+_FOUR_LEAST = 2.5
 _LIMIT = "the model file has one time constant per motor and no dead time"
 
 
@@ -42,6 +45,7 @@ def run_fit_rotors(
     json: Path | None = None,
     figure: Path | None = None,
     tared: bool = False,
+    rotors: int | None = None,
 ) -> None:
     """Fit what the files hold, print a table, write the model.
 
@@ -54,60 +58,109 @@ def run_fit_rotors(
         from cfb_mjx.view.style import check_path
 
         check_path(figure)
-    records, tables = _read(paths)
+    records, tables, points, notes = _read(paths, rotors)
     configure_jax(x64=True)
     from cfb_mjx.parameters import save_model_file
     from cfb_mjx.sysid.rotors.motors import fit_motors
 
     base = changed_model(model, changes)
+    _require_one_rotor(tables, base)
     motors = None
     extras = {"offset": offset, "asymmetric": asymmetric, "dead_time": dead_time}
     if records:
         motors = fit_motors(
             records, base.parameters(), **extras, per_motor=per_motor, progress=Progress("fitting motors")
         )
+    steady = None
+    if points and not records:
+        from cfb_mjx.sysid.rotors.steady import fit_steady
+
+        steady = fit_steady(points)
+    elif points:
+        notes.append("steady points were not used: command steps tell gain and offset too, and the lag.")
     maps = _fit_maps(tables, base, per_motor, robust, tared)
-    corrected, written = _corrected(base, motors, maps, output, paths)
+    corrected, written = _corrected(base, motors, steady, maps, output, paths)
     if not written:
         reasons = "; ".join(motors.common.unidentifiable.values()) if motors else ""
         raise CfbError(f"{', '.join(p.name for p in paths)}: cannot tell any constant of the model ({reasons}).")
     with together():
         save_model_file(corrected, output)
         if json is not None:
-            write_json(json, _json(motors, maps, base, written))
+            write_json(json, _json(motors, steady, maps, base, written))
         if figure is not None:
             from cfb_mjx.sysid.rotors.motor_replay import replay
             from cfb_mjx.view.rotors import rotor_figure
 
             rotor_figure(replay(motors) if motors else [], maps, figure, output.stem)
-    _print(motors, maps, base, {name for name, on in extras.items() if on})
+    _print(motors, steady, maps, base, {name for name, on in extras.items() if on})
+    for note in notes:
+        print(note)
     print(f"model: {output} ({', '.join(written)})")
     if motors and motors.common.extras - {"offset"}:
         print(f"spin-up and spin-down constants and dead time are reported only: {_LIMIT}.")
     print_paths(results=json, figure=figure)
 
 
-def _read(paths: list[Path]) -> tuple[list[MotorRecord], list[MapTable]]:
-    """Every file by its content: bench tables by their columns, all else as a flight."""
-    records, tables = [], []
+def _read(paths: list[Path], rotors: int | None):
+    """Every file by its content: bench tables by their columns, all else as a flight.
+
+    Returns:
+        Records of motors in time, maps, steady points, and notes on how they were read.
+    """
+    records, tables, points, notes = [], [], [], []
     for path in paths:
-        found = _bench(path)
+        found = _bench(path, rotors)
         if found is None:
             from cfb_mjx.sysid.rotors.motor_tracks import record_of
 
-            found = record_of(read_log(path))
-            if found is None:
+            record = record_of(read_log(path, keep_ground=True))
+            if record is None:
                 raise CfbError(f"{path}: holds no rotor speeds; log them, or leave this flight out.")
-        (tables if isinstance(found, MapTable) else records).append(found)
-    return records, tables
+            found = Bench([record], [])
+        notes += found.notes
+        for part in found.parts:
+            kind = tables if isinstance(part, MapTable) else points if isinstance(part, SteadyPoints) else records
+            kind.append(part)
+    return records, tables, points, notes
 
 
-def _bench(path: Path) -> MotorRecord | MapTable | None:
+def _bench(path: Path, rotors: int | None) -> Bench | None:
     head = read_bytes(path, 4)
-    if path.suffix.lower() not in (".csv", ".txt", ".parquet") and head != b"PAR1":
+    if path.suffix.lower() not in (".csv", ".txt", ".tsv", ".parquet") and head != b"PAR1":
         return None
     table = read_table(path)
-    return from_columns(table, path) if recognises(table) else None
+    return read_bench_table(table, path, rotors) if recognises(table) else None
+
+
+def _require_one_rotor(tables: list[MapTable], base: ModelFile) -> None:
+    """Refuse thrust that is plainly that of four rotors, or a quarter of one's: no propeller this drone carries differs
+    that much from another."""
+    if not any(t.force is not None for t in tables):
+        return
+    sigma = float(base.entries["reference_rotor_speed"].value)
+    curve = np.asarray(base.entries["thrust_polynomial"].value, float)
+    scale = float(np.mean(base.entries["thrust_scale"].value))
+    for table in tables:
+        if table.force is None:
+            continue
+        s = table.rotor_speed / sigma
+        usual = (curve[0] * s**3 + curve[1] * s**2 + curve[2] * s) * scale
+        fast = table.rotor_speed > 0.6 * float(table.rotor_speed.max())
+        if not (fast & (usual > 0)).any():
+            continue
+        ratio = float(np.median(table.force[fast & (usual > 0)] / usual[fast & (usual > 0)]))
+        top = int(np.argmax(table.rotor_speed))
+        point = f"{table.force[top]:.3g} N at {table.rotor_speed[top]:.0f} rad/s"
+        if ratio > _FOUR_LEAST:
+            raise CfbError(
+                f"{table.name}: {point} is {ratio:.1f} times what one rotor of {base.name} pulls, so it is the thrust of "
+                "four; give --rotors 4."
+            )
+        if ratio < 1 / _FOUR_LEAST:
+            raise CfbError(
+                f"{table.name}: {point} is {ratio:.2f} of what a rotor of {base.name} pulls, as if the thrust of one had "
+                "been divided by four; give --rotors 1, or correct its unit."
+            )
 
 
 def _fit_maps(tables: list[MapTable], base: ModelFile, per_motor: bool, robust: bool, tared: bool) -> dict[str, MapFit]:
@@ -135,7 +188,7 @@ def _fit_maps(tables: list[MapTable], base: ModelFile, per_motor: bool, robust: 
     return found
 
 
-def _corrected(base: ModelFile, motors, maps, output: Path, paths: list[Path]) -> tuple[ModelFile, list[str]]:
+def _corrected(base: ModelFile, motors, steady, maps, output: Path, paths: list[Path]) -> tuple[ModelFile, list[str]]:
     """The model with what was identified, and the names of what changed."""
     from cfb_mjx.parameters import Entry
 
@@ -150,6 +203,9 @@ def _corrected(base: ModelFile, motors, maps, output: Path, paths: list[Path]) -
         found = motors.values(name)
         if found is not None:
             put(name, *found)
+    if steady is not None:
+        put("motor_gain", np.asarray(steady.gain), np.asarray(steady.gain_std))
+        put("motor_speed_offset", np.asarray(steady.offset), np.asarray(steady.offset_std))
     for name, fitted in maps.items():
         put(f"{name}_polynomial", fitted.coefficients, fitted.std)
         # The factors belong to the curve: old ones would count twice.
@@ -203,8 +259,34 @@ def _group_json(group) -> dict:
     }
 
 
-def _json(motors: MotorFit | None, maps: dict[str, MapFit], base: ModelFile, written: list[str]) -> dict:
-    result = {"parameters": (_rows(motors.common) if motors else {}) | _coefficients(maps, base)}
+def _steady_rows(steady: SteadyFit | None, base: ModelFile) -> dict[str, dict]:
+    if steady is None:
+        return {}
+    return {
+        f"motor_{name}": {
+            "value": getattr(steady, short),
+            "std": getattr(steady, f"{short}_std"),
+            "unit": "rad/s",
+            "preset": float(np.mean(base.entries[f"motor_{name}"].value)),
+        }
+        for name, short in (("gain", "gain"), ("speed_offset", "offset"))
+    }
+
+
+def _json(
+    motors: MotorFit | None, steady: SteadyFit | None, maps: dict[str, MapFit], base: ModelFile, written: list[str]
+) -> dict:
+    told = (_rows(motors.common) if motors else {}) | _steady_rows(steady, base)
+    result: dict = {"parameters": told | _coefficients(maps, base)}
+    if steady is not None:
+        result["steady"] = {
+            "gain_per_volt": steady.per_volt,
+            "battery_sag_slope": steady.sag_slope,
+            "spread_radps": steady.spread,
+            "spread_without_voltage_radps": steady.spread_without_voltage,
+            "share_of_outliers": steady.outliers,
+            "points": steady.points,
+        }
     result["unidentifiable"] = list(motors.common.unidentifiable) if motors else []
     if motors:
         result["motors"] = {"all": _group_json(motors.common)}
@@ -234,12 +316,23 @@ def _json(motors: MotorFit | None, maps: dict[str, MapFit], base: ModelFile, wri
     return result | {"written_to_model": written, "environment": environment()}
 
 
-def _print(motors: MotorFit | None, maps: dict[str, MapFit], base: ModelFile, asked: set[str]) -> None:
+def _print(
+    motors: MotorFit | None, steady: SteadyFit | None, maps: dict[str, MapFit], base: ModelFile, asked: set[str]
+) -> None:
     print(f"{'constant':<26}{'value':>12}{'std':>11}  {'unit':<8}{'preset':>11}{'change':>9}")
     groups = {"": motors.common, **{f" M{n}": g for n, g in motors.motors.items()}} if motors else {}
     for suffix, group in groups.items():
         _print_rows({name + suffix: row for name, row in _rows(group).items()})
-    _print_rows(_coefficients(maps, base))
+    _print_rows(_steady_rows(steady, base) | _coefficients(maps, base))
+    if steady is not None:
+        out = f", {steady.outliers:.0%} of them left out as outliers" if steady.outliers else ""
+        print(f"steady speed: {steady.points} points about a line, spread {steady.spread:.1f} rad/s{out}")
+        if steady.per_volt is not None:
+            print(
+                f"steady speed follows command times voltage, omega = {steady.offset:.0f} + {steady.per_volt:.0f} u V; a "
+                f"line in u alone leaves {steady.spread_without_voltage:.1f} rad/s. The gain is that at 3.7 V; the effect "
+                f"battery_sag with slope {steady.sag_slope:.2f} makes a model follow the voltage."
+            )
     for suffix, group in groups.items():
         for reason in dict.fromkeys(group.unidentifiable.values()):
             print(f"not identifiable{suffix}: {reason}")

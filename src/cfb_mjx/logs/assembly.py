@@ -11,9 +11,18 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
 from cfb_mjx.logs.flight_log import REQUIRED, FlightLog, quantise_time
-from cfb_mjx.logs.streams import Stream, central_difference, hold
+from cfb_mjx.logs.streams import Stream, central_difference, fresh, hold, neighbours
 from cfb_mjx.logs.variables import Choice, VariableMap
 
+_DERIVED = {
+    "velocity": "velocity: not logged; central differences of the positions, which look one sample ahead and carry their "
+    "noise. Log stateEstimate.vx vy vz.",
+    "body_rate": "body rate: not logged; central differences of the attitude, as late and as smooth as that is. Log "
+    "gyro.x y z.",
+    "specific_force": "specific force: not logged; central differences of the velocity plus gravity, in body axes, as "
+    "late and as smooth as that is. Log acc.x y z.",
+}
+_GRAVITY = np.array([0.0, 0.0, 9.81])
 _LATE = 0.002  # s of average age of a held pose worth a note: a quarter of the observation delay assumed otherwise
 COMMAND_NOTE = (
     "motor.m1..m4 is what the ESC is told: the command after battery compensation and thrust limit, where the firmware "
@@ -59,12 +68,13 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
     reference = _reference(streams, home, chosen, read.preferred)
     for name in reference.values:
         home[name] = reference
-    merger = _Merger(reference, home)
+    merger = _Merger(reference, home, chosen)
     fields = {f: merger.field(f, c) for f, c in chosen.items() if not c.derived}
-    if chosen["velocity"].derived:
-        fields["velocity"] = merger.derivative(chosen["position"])
-        read.notes.append("velocity: central differences of the logged positions, which look one sample ahead.")
     _into_frames(fields, chosen)
+    for field, choice in chosen.items():
+        if choice.derived:
+            fields[field] = merger.derived(field, fields)
+            read.warnings.append(_DERIVED[field])
     if "battery_voltage" in fields:
         fields["battery_voltage"] = _backfilled(fields["battery_voltage"][:, 0])
     keep = np.all([merger.usable[f] for f in chosen if f in REQUIRED], axis=0)
@@ -124,7 +134,8 @@ def _spoiled_quaternions(streams, mapping: VariableMap, home: dict[str, Stream])
 
 
 def _reference(streams, home, chosen: dict[str, Choice], preferred: str | None) -> Stream:
-    gyro = chosen["body_rate"].variables
+    # Where no gyro was logged, what its rates are derived from.
+    gyro = chosen["body_rate"].variables or chosen["quaternion"].variables
     for stream in streams:
         if stream.name == preferred and all(v in stream.values for v in gyro):
             return stream
@@ -134,8 +145,8 @@ def _reference(streams, home, chosen: dict[str, Choice], preferred: str | None) 
 class _Merger:
     """Brings variables onto the rows of the reference stream, field by field, and keeps account of it."""
 
-    def __init__(self, reference: Stream, home: dict[str, Stream]):
-        self.reference, self.home = reference, home
+    def __init__(self, reference: Stream, home: dict[str, Stream], chosen: dict[str, Choice]):
+        self.reference, self.home, self.chosen = reference, home, chosen
         self.usable: dict[str, np.ndarray] = {}
         self._held: dict[str, tuple[Stream, np.ndarray, np.ndarray]] = {}
 
@@ -144,26 +155,55 @@ class _Merger:
         columns, usable = zip(*(self._column(v) for v in choice.variables), strict=True)
         self.usable[field] = np.all(usable, axis=0)
         raw = np.stack(columns, axis=1)
+        if field != "rotor_speed":
+            # A cell without a value, as where a script wrote "nan" in place of a number: not known in that row.
+            self.usable[field] &= ~np.isnan(raw).any(axis=1)
         if field == "rotor_speed":
             raw = np.where(self.usable[field][:, None] & ~np.isin(raw, choice.invalid), raw, np.nan)
         elif choice.invalid:
             bad = np.isin(raw, choice.invalid).any(axis=1)
             self.usable[field] &= ~bad
-        if choice.form == "compressed":
-            return decompress_quaternion(raw[:, 0])
-        values = raw * choice.factors
-        return from_euler(values) if choice.form == "euler" else values
+        return _in_si(raw, choice)
 
-    def derivative(self, choice: Choice) -> np.ndarray:
-        """Velocity, m/s, from the positions that ``choice`` selects, each differentiated over its own samples."""
-        columns, usable = [], []
-        for name, factor in zip(choice.variables, choice.factors, strict=True):
-            stream = self.home[name]
-            column, ok = self._place(stream, central_difference(stream, stream.values[name]) * factor)
-            columns.append(column)
-            usable.append(ok & ~np.isnan(column))
-        self.usable["velocity"] = np.all(usable, axis=0)
-        return np.stack(columns, axis=1)
+    def derived(self, field: str, fields: dict[str, np.ndarray]) -> np.ndarray:
+        """(rows, 3) of a field that was not logged, from the samples of the one it is the derivative of."""
+        if field == "body_rate":
+            source, unit = self._samples("quaternion", fields)
+            rate = _turning_rate(source, rotation.tidy(unit))
+            rate, self.usable[field] = self._place_all(source, rate)
+            return rate
+        if field == "velocity":
+            source, position = self._samples("position", fields)
+            velocity, self.usable[field] = self._place_all(source, central_difference(source, position))
+            return velocity
+        source, velocity = self._samples("velocity", fields)
+        acceleration, ok = self._place_all(source, central_difference(source, velocity))
+        self.usable[field] = ok & self.usable["quaternion"]
+        return rotation.to_body(rotation.tidy(_held_where(fields["quaternion"], ok)), acceleration + _GRAVITY)
+
+    def _samples(self, field: str, fields: dict[str, np.ndarray]) -> tuple[Stream, np.ndarray]:
+        """A vector where it was sampled: its stream without repeated samples, and the values there in SI units.
+
+        Rows of the log stand for a vector whose columns came in several streams, or in body axes.
+        """
+        choice = self.chosen[field]
+        if choice.derived:
+            source, values = self._samples(choice.derived, fields)
+            return source, central_difference(source, values)
+        homes = {self.home[v].name for v in choice.variables}
+        if len(homes) == 1 and choice.frame != "body":
+            stream = self.home[choice.variables[0]]
+            values = _in_si(np.stack([stream.values[v] for v in choice.variables], axis=1), choice)
+            keep = fresh(values) & np.isfinite(values).all(axis=1)
+            # Under another name: what is held of it has its own ages.
+            return dataclasses.replace(stream, name=f"{stream.name}: {field}", time=stream.time[keep]), values[keep]
+        keep = self.usable[field]
+        return Stream(f"rows: {field}", self.reference.time[keep], {}), fields[field][keep]
+
+    def _place_all(self, source: Stream, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        columns, usable = zip(*(self._place(source, column) for column in values.T), strict=True)
+        placed = np.stack(columns, axis=1)
+        return placed, np.all(usable, axis=0) & np.isfinite(placed).all(axis=1)
 
     def _column(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         stream = self.home[name]
@@ -195,6 +235,28 @@ class _Merger:
                 "rows_too_old": int(np.isinf(age).sum()),
             }
         return out
+
+
+def _in_si(raw: np.ndarray, choice: Choice) -> np.ndarray:
+    """Logged numbers (n, columns) in SI units, quaternions as such whatever their form; not yet rotated."""
+    if choice.form == "compressed":
+        return decompress_quaternion(raw[:, 0])
+    values = raw * choice.factors
+    return from_euler(values) if choice.form == "euler" else values
+
+
+def _turning_rate(source: Stream, quaternion: np.ndarray) -> np.ndarray:
+    """Body rate, rad/s, (n, 3): between the samples before and after each, which takes it to its own time."""
+    before, after, span = neighbours(source)
+    turned = rotation.multiply(rotation.conjugate(quaternion[before]), quaternion[after])
+    # Half of the turn is behind the sample, half ahead: seen from its own axes to second order.
+    return rotation.rotation_vector(turned) / np.where(span > 0, span, np.nan)[:, None]
+
+
+def _held_where(quaternion: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The quaternions, with one that turns nothing where they are not known."""
+    fine = known & (np.linalg.norm(quaternion, axis=1) > 0)
+    return np.where(fine[:, None], quaternion, [1.0, 0.0, 0.0, 0.0])
 
 
 def _into_frames(fields: dict[str, np.ndarray], chosen: dict[str, Choice]) -> None:
@@ -262,5 +324,5 @@ def _check_rate_unit(log: FlightLog, choice: Choice, path: Path) -> None:
     if len(a) >= 5 and xx > 0.04 * len(a) and yy > 0 and xy > 0.7 * np.sqrt(xx * yy) and xy / xx < 0.05:
         raise CfbError(
             f"{path}: the attitude turns {xx / xy:.0f} times faster than the gyro ({' '.join(choice.variables)}, read "
-            f"as {choice.unit}) says; give its unit in a mapping file (mapping=..., see docs/logs.md)."
+            f"as {choice.unit}) says; give its unit in a mapping file (--mapping FILE, see docs/logs.md)."
         )

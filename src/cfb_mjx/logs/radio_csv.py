@@ -1,14 +1,17 @@
-"""Reader of csv files with firmware variable names as headers: what cfclient and scripts around cflib write.
+"""Reader of tables with firmware variable names as headers: what cfclient and scripts around cflib write.
 
 cfclient (``logdatawriter.py`` of bitcraze/crazyflie-clients-python) writes one file per log block: ``Timestamp`` in ms
-and the block's variables. Tables of several blocks leave cells empty where a block has no packet at a time.
+and the block's variables. Tables of several blocks leave cells empty where a block has no packet at a time. Scripts
+join names in their own way (``stateEstimate_x``), or write one value per line under ``timestamp, name, value``.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,75 +22,181 @@ from cfb_mjx.logs.streams import RADIO_WRAP_MS, Stream, ordered, unwrap
 from cfb_mjx.logs.tabular import Table, Text, read_table, require_numbers
 from cfb_mjx.logs.variables import VariableMap, load_mapping
 
-_PREFIXES = ("stateEstimate.", "stateEstimateZ.", "gyro.", "motor.", "acc.", "stabilizer.", "kalman.")
-_TIME_NAMES = ("timestamp", "timestamp_ms", "time_ms", "time", "t")  # the first of these that is there
-_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SHORTEST, _LONGEST = 2e-4, 0.45  # s: no log block is faster or slower than this, so the unit must be another
+_CLOCK = re.compile(
+    r"(?P<name>timestamp|time[_ .]?stamp|tick|time|t|stamp|clock|elapsed)[_ .]*[\[(]?(?P<unit>s|sec|seconds|ms|us|ns)?[\])]?",
+    re.IGNORECASE,
+)
+_CLOCKS = ("timestamp", "timestamp", "tick", "time", "t", "stamp", "clock", "elapsed")
+_HOST = re.compile(r"(host|pc|ros|unix|wall|system|log)[_ .]?(time|stamp|timestamp)?.*", re.IGNORECASE)
+_LONG = ({"name", "variable", "var", "key", "topic"}, {"value", "val", "data"})
+_FEWEST = 3  # columns with names of the firmware that make a table one of this kind
 
 
-def recognises(columns: Iterable[str]) -> bool:
-    """Whether the columns are named after firmware variables."""
-    return any(c.startswith(_PREFIXES) for c in columns)
+class Clock(NamedTuple):
+    """The time column of a table."""
+
+    column: str
+    unit: str | None
+    """As its name says; None where it does not."""
+
+
+def recognises(columns: Iterable[str], mapping: VariableMap) -> bool:
+    """Whether columns are named after logged variables, or name and value stand in columns of their own."""
+    columns = list(columns)
+    return len(_variables(columns, mapping)) >= _FEWEST or _long_form(columns) is not None
+
+
+def clock_of(columns: Iterable[str]) -> Clock | None:
+    """The time column: the firmware's clock rather than the computer's, a named one rather than ``t``."""
+    found = []
+    for column in columns:
+        match = _CLOCK.fullmatch(column.strip())
+        if match:
+            unit = (match["unit"] or "").lower() or None
+            unit = "s" if unit in ("sec", "seconds") else unit
+            found.append((_CLOCKS.index(re.sub("[_ .]", "", match["name"].lower())), Clock(column, unit)))
+        elif _HOST.fullmatch(column.strip()):
+            found.append((len(_CLOCKS), Clock(column, None)))
+    return min(found, key=lambda pair: pair[0])[1] if found else None
 
 
 def read_radio_csv(
-    path: str | os.PathLike, mapping: str | os.PathLike | VariableMap | None = None, time_unit: str = "ms"
+    path: str | os.PathLike | Sequence[str | os.PathLike],
+    mapping: str | os.PathLike | VariableMap | None = None,
+    time_unit: str | None = None,
 ) -> FlightLog:
-    """Read a table of firmware variables. `read_log` also validates the content.
+    """Read tables of named variables. `read_log` also validates the content.
 
-    Columns that are filled in the same rows form a stream; streams are merged onto the rows of the gyro, each value
-    held until its next one. A time stamp that overflows three bytes of milliseconds is continued.
+    Columns that are filled in the same rows form a stream; streams, of all files, are merged onto the rows of the gyro,
+    each value held until its next one. A time stamp that overflows three bytes of milliseconds is continued.
 
     Args:
-        path: csv (or parquet) with a time column (``Timestamp``) and columns like ``gyro.x``.
+        path: csv (or parquet) with a time column (``Timestamp``) and columns like ``gyro.x``; several files, as
+            cfclient writes one per log block, are one flight.
         mapping: which variable is which column; a mapping file, or None for ``configs/logs/crazyflie.yaml``.
-        time_unit: of the time column: ``ms``, ``us`` or ``s``.
+        time_unit: of the time column: ``s``, ``ms``, ``us`` or ``ns``. None takes what its name says, else ms for a
+            ``Timestamp`` and for other columns the only unit in which rows follow each other as in a log.
 
     Raises:
         CfbError: unreadable file, no time column, cells that are not numbers, a time column in another unit or that
             goes back, required variables that were not logged, fewer than two rows.
     """
-    path = Path(path)
-    return from_columns(read_table(path), path, mapping, time_unit)
+    paths = [Path(path)] if isinstance(path, str | os.PathLike) else [Path(p) for p in path]
+    return from_columns([(read_table(p), p) for p in paths], mapping, time_unit)
 
 
 def from_columns(
-    table: Table, path: Path, mapping: str | os.PathLike | VariableMap | None = None, time_unit: str = "ms"
+    tables: Sequence[tuple[Table, Path]],
+    mapping: str | os.PathLike | VariableMap | None = None,
+    time_unit: str | None = None,
 ) -> FlightLog:
     """`read_radio_csv` on columns already in memory."""
-    if time_unit not in _UNITS:
-        raise CfbError(f"{path}: time_unit must be one of {', '.join(_UNITS)}, not {time_unit!r}.")
+    first = tables[0][1]
+    if time_unit is not None and time_unit not in _UNITS:
+        raise CfbError(f"{first}: --time-unit must be one of {', '.join(_UNITS)}, not {time_unit!r}.")
     mapping = mapping if isinstance(mapping, VariableMap) else load_mapping(mapping)
-    clock = sorted((c for c in table if c.lower() in _TIME_NAMES), key=lambda c: _TIME_NAMES.index(c.lower()))
-    if not clock:
-        raise CfbError(f"{path}: there is no time column; name it Timestamp (ms).")
-    wanted = {v for choices in mapping.choices.values() for c in choices for v in c.variables}
-    names = [c for c in table if c in wanted]
-    require_numbers(table, [clock[0], *names], path)
-    ticks = table[clock[0]]
-    if not np.isfinite(ticks).all():
-        raise CfbError(
-            f"{path}: column {clock[0]} has no value in row {int(np.argmin(np.isfinite(ticks)))} (counted from 0); "
-            "every row needs a time."
-        )
     notes: list[str] = []
     warnings: list[str] = []
-    rows = np.arange(len(ticks))
-    if _ends_within_a_line(path):
-        rows = rows[:-1]
-        warnings.append("the file does not end with a line break, so its last row may be cut short and was left out.")
-    ticks = ticks[rows]
-    if time_unit == "ms" and len(ticks) and (ticks == np.rint(ticks)).all() and np.abs(ticks).max() < 2.0**62:
+    streams: list[Stream] = []
+    for table, path in tables:
+        said = [f"{path.name}: {note}" if len(tables) > 1 else note for note in getattr(table, "notes", ())]
+        warnings += [note for note in said if "left out" in note]
+        notes += [note for note in said if "left out" not in note]
+        streams += _of_table(table, path, mapping, time_unit, notes)
+    _require_one_flight(tables, streams)
+    return assemble(Import("radio_csv", streams, None, notes, warnings), mapping, first)
+
+
+def _of_table(table: Table, path: Path, mapping: VariableMap, time_unit: str | None, notes: list[str]) -> list[Stream]:
+    long = _long_form(table)
+    if long is not None:
+        return _of_long_form(table, *long, path, mapping, time_unit, notes)
+    clock = clock_of(table)
+    if clock is None:
+        raise CfbError(f"{path}: there is no time column; name it Timestamp (ms) or t (s).")
+    named = _variables(table, mapping)
+    require_numbers(table, [clock.column, *named.values()], path)
+    ticks = table[clock.column]
+    if not np.isfinite(ticks).all():
+        raise CfbError(
+            f"{path}: column {clock.column} has no value in row {int(np.argmin(np.isfinite(ticks)))} (counted from 0); "
+            "every row needs a time."
+        )
+    time, unit = _seconds(ticks, clock, time_unit, path, notes)
+    streams = [ordered(s, path, notes) for s in _streams({n: table[c] for n, c in named.items()}, time)]
+    _check_unit(streams, path, unit)
+    known = {*named.values(), clock.column}
+    ignored = [c for c, v in table.items() if c not in known and not isinstance(v, Text)]
+    if ignored:
+        notes.append(f"columns not in the mapping were left out: {', '.join(sorted(ignored))}.")
+    return streams
+
+
+def _variables(columns: Iterable[str], mapping: VariableMap) -> dict[str, str]:
+    """Logged name to column: the same name, or the same but for what joins its parts."""
+    wanted = {_bare(v): v for choices in mapping.choices.values() for c in choices for v in c.variables}
+    found: dict[str, str] = {}
+    for column in columns:
+        name = wanted.get(_bare(column))
+        if name is not None and (name not in found or column == name):
+            found[name] = column
+    return found
+
+
+def _bare(name: str) -> str:
+    return re.sub(r"[\s._/:-]", "", name).lower()
+
+
+def _long_form(columns: Iterable[str]) -> tuple[str, str] | None:
+    """The columns with names and values of a table of one value per line."""
+    by_name = {c.strip().lower(): c for c in columns}
+    found = [next((by_name[n] for n in sorted(names) if n in by_name), None) for names in _LONG]
+    return None if None in found or len(by_name) > 5 else tuple(found)
+
+
+def _of_long_form(table, name_column, value_column, path, mapping, time_unit, notes) -> list[Stream]:
+    clock = clock_of([c for c in table if c not in (name_column, value_column)])
+    if clock is None:
+        raise CfbError(f"{path}: there is no time column; name it timestamp (ms) or t (s).")
+    require_numbers(table, [clock.column, value_column], path)
+    names = table[name_column]
+    if not isinstance(names, Text):
+        raise CfbError(f"{path}: column {name_column} holds numbers instead of names of variables.")
+    labels = np.array(names.cells, dtype=object)
+    wanted = _variables(dict.fromkeys(labels), mapping)
+    time, unit = _seconds(table[clock.column], clock, time_unit, path, notes)
+    values, streams, groups = table[value_column], [], {}
+    for variable, label in wanted.items():
+        rows = np.flatnonzero((labels == label) & np.isfinite(time))
+        groups.setdefault(time[rows].tobytes(), []).append((variable, rows))
+    for members in groups.values():
+        rows = members[0][1]
+        stream = Stream(f"block of {members[0][0]}", time[rows], {v: values[r] for v, r in members})
+        streams.append(ordered(stream, path, notes))
+    _check_unit(streams, path, unit)
+    return streams
+
+
+def _seconds(ticks: np.ndarray, clock: Clock, asked: str | None, path: Path, notes: list[str]) -> tuple[np.ndarray, str]:
+    """Time in s, and the unit it was read in."""
+    unit = asked or clock.unit or _guessed_unit(ticks, clock)
+    if unit == "ms" and len(ticks) and (ticks == np.rint(ticks)).all() and np.abs(ticks).max() < 2.0**62:
         ticks, wraps = unwrap(ticks.astype(np.int64), RADIO_WRAP_MS)
         if wraps:
             notes.append(f"the 24-bit time stamp overflowed {wraps} times; it was continued.")
-    time = np.asarray(ticks, dtype=np.float64) * _UNITS[time_unit]
-    streams = [ordered(s, path, notes) for s in _streams({n: table[n][rows] for n in names}, time)]
-    _check_unit(streams, path, time_unit)
-    ignored = [c for c, v in table.items() if c not in wanted and c != clock[0] and not isinstance(v, Text)]
-    if ignored:
-        notes.append(f"columns not in the mapping were left out: {', '.join(sorted(ignored))}.")
-    return assemble(Import("radio_csv", streams, None, notes, warnings), mapping, path)
+    if asked is None and clock.unit is None and unit != "ms":
+        notes.append(f"column {clock.column} was read in {unit}, in which its rows follow each other as in a log.")
+    return np.asarray(ticks, dtype=np.float64) * _UNITS[unit], unit
+
+
+def _guessed_unit(ticks: np.ndarray, clock: Clock) -> str:
+    if _bare(clock.column) == "timestamp":
+        return "ms"
+    steps = np.diff(np.unique(ticks))
+    step = float(np.median(steps)) if len(steps) else 1.0
+    return next((u for u, factor in _UNITS.items() if _SHORTEST <= step * factor <= _LONGEST), "ms")
 
 
 def _streams(columns: dict[str, np.ndarray], time: np.ndarray) -> list[Stream]:
@@ -104,20 +213,25 @@ def _streams(columns: dict[str, np.ndarray], time: np.ndarray) -> list[Stream]:
     return streams
 
 
-def _check_unit(streams: list[Stream], path: Path, time_unit: str) -> None:
+def _check_unit(streams: list[Stream], path: Path, unit: str) -> None:
     fastest = min((s.interval for s in streams if s.interval > 0), default=None)
-    if fastest is not None and not _SHORTEST <= fastest <= _LONGEST:
-        others = " or ".join(f"{u!r}" for u in _UNITS if u != time_unit)
+    if fastest is None or _SHORTEST <= fastest <= _LONGEST:
+        return
+    fitting = [u for u, factor in _UNITS.items() if _SHORTEST <= fastest / _UNITS[unit] * factor <= _LONGEST]
+    remedy = f"give --time-unit {fitting[0]}" if fitting else "give the right one with --time-unit"
+    raise CfbError(
+        f"{path}: read in {unit}, the time advances by {fastest:.3g} s per row, so it is in another unit; {remedy}."
+    )
+
+
+def _require_one_flight(tables: Sequence[tuple[Table, Path]], streams: list[Stream]) -> None:
+    """Files that are to be one flight must have been recorded during the same time."""
+    if len(tables) < 2 or not streams:
+        return
+    latest_start, earliest_end = max(s.time[0] for s in streams), min(s.time[-1] for s in streams)
+    if latest_start > earliest_end:
+        late = max(streams, key=lambda s: s.time[0])
         raise CfbError(
-            f"{path}: read in {time_unit}, the time advances by {fastest:.3g} s per row, so it is in another unit; "
-            f"give time_unit={others}."
+            f"{', '.join(str(path) for _, path in tables)}: these are not one flight: {late.name} begins at "
+            f"{latest_start:.3f} s, when another has ended ({earliest_end:.3f} s); import each flight by itself."
         )
-
-
-def _ends_within_a_line(path: Path) -> bool:
-    """Whether a text file lacks its last line break. Parquet, which has its own marks, never does."""
-    with open(path, "rb") as file:
-        if file.read(4) == b"PAR1":
-            return False
-        file.seek(-1, os.SEEK_END)
-        return file.read(1) not in b"\r\n"

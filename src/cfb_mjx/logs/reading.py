@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
-from cfb_mjx.logs import crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, usd_card
+from cfb_mjx.logs import containers, crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, usd_card
 from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.flown import flown_part
 from cfb_mjx.logs.validation import validate
+from cfb_mjx.logs.variables import load_mapping
 
 FORMATS = ("mcap", "tabular", "idsia", "usd_card", "crazyswarm", "radio_csv")
 _OPTIONS = {
@@ -19,17 +22,25 @@ _OPTIONS = {
     "crazyswarm": ("mapping", "topics_yaml", "robot"),
     "radio_csv": ("mapping", "time_unit"),
 }
-_MCAP_MAGIC = b"\x89MCAP"
+_FLAGS = {name: "--" + name.replace("_", "-") for name in ("motor_shift", "mapping", "topics_yaml", "robot", "time_unit")}
 
 
-def read_log(path: str | os.PathLike, format: str | None = None, **options: Any) -> FlightLog:
+def read_log(
+    path: str | os.PathLike | Sequence[str | os.PathLike],
+    format: str | None = None,
+    *,
+    keep_ground: bool = False,
+    **options: Any,
+) -> FlightLog:
     """Read and validate a flight log.
 
     Args:
-        path: the file.
+        path: the file; the folder of a ROS 2 bag; or several tables of one flight, as cfclient writes one per log block.
         format: one of `FORMATS`; None detects it from the file's content. ``mcap`` is this library's own, ``tabular``
             and ``idsia`` are parquet or csv, ``usd_card`` is the Crazyflie's micro SD card binary, ``crazyswarm`` a
-            ROS 2 bag (MCAP), ``radio_csv`` a table with firmware variable names as headers.
+            ROS bag (MCAP, sqlite3 or ROS 1), ``radio_csv`` a table with firmware variable names as headers.
+        keep_ground: leave in what is not flight: standing, take-off, landing, being carried. This library's own files
+            are never cut.
         **options: ``motor_shift`` for ``idsia`` (`cfb_mjx.logs.read_idsia`); ``mapping`` for ``usd_card``,
             ``crazyswarm`` and ``radio_csv``; ``topics_yaml`` and ``robot`` for ``crazyswarm``
             (`cfb_mjx.logs.read_crazyswarm`); ``time_unit`` for ``radio_csv`` (`cfb_mjx.logs.read_radio_csv`). An
@@ -38,38 +49,70 @@ def read_log(path: str | os.PathLike, format: str | None = None, **options: Any)
     Raises:
         CfbError: one sentence naming the file, what is wrong with it and what to do.
     """
-    path = Path(path)
-    table = None
-    if format is None:
-        format, table = _detect(path)
-    if format not in FORMATS:
-        raise CfbError(f"{path}: unknown log format {format!r}; choose one of {', '.join(FORMATS)}.")
+    several = not isinstance(path, str | os.PathLike)
+    paths = [Path(p) for p in path] if several else [Path(path)]
+    if not paths:
+        raise CfbError("no log was given; give one.")
     options = {k: v for k, v in options.items() if v is not None}
+    first, tables = paths[0], {}
+    if format is None:
+        format = _detect(paths, options, tables)
+    if format not in FORMATS:
+        raise CfbError(f"{first}: unknown log format {format!r}; choose one of {', '.join(FORMATS)}.")
+    if len(paths) > 1 and format != "radio_csv":
+        raise CfbError(
+            f"{', '.join(map(str, paths))}: several files are one flight only where they are tables of log blocks, and "
+            f"{first} is of the format {format}; import them one by one."
+        )
     if unknown := sorted(set(options) - set(_OPTIONS.get(format, ()))):
-        raise CfbError(f"{path}: the {format} format has no option {', '.join(unknown)}; leave it out.")
+        flags = ", ".join(_FLAGS.get(name, name) for name in unknown)
+        raise CfbError(f"{first}: the {format} format has no option {flags}; leave it out.")
+    log = _read(paths, format, options, tables)
+    if format in ("mcap", "idsia"):  # cut when it was imported; cut by its own rules
+        return validate(log, first)
+    return validate(flown_part(log, first, keep_ground), first)
+
+
+def _read(paths: list[Path], format: str, options: dict[str, Any], tables: dict[Path, tabular.Table]) -> FlightLog:
+    path = paths[0]
     if format == "mcap":
-        return validate(mcap_reader.read_mcap(path), path)
+        return mcap_reader.read_mcap(path)
     if format == "usd_card":
-        return validate(usd_card.read_usd_card(path, **options), path)
+        return usd_card.read_usd_card(path, **options)
     if format == "crazyswarm":
-        return validate(crazyswarm.read_crazyswarm(path, **options), path)
-    table = tabular.read_table(path) if table is None else table
+        return crazyswarm.read_crazyswarm(path, **options)
+    found = [tables.get(p) or tabular.read_table(p) for p in paths]
     if format == "idsia":
-        return validate(idsia.from_columns(table, path, **options), path)
+        return idsia.from_columns(found[0], path, **options)
     if format == "radio_csv":
-        return validate(radio_csv.from_columns(table, path, **options), path)
-    return validate(tabular.from_columns(table, path), path)
+        return radio_csv.from_columns(list(zip(found, paths, strict=True)), **options)
+    return tabular.from_columns(found[0], path)
 
 
-def _detect(path: Path):
-    head = read_bytes(path, len(_MCAP_MAGIC))
+_MCAP_MAGIC = b"\x89MCAP"
+
+
+def _detect(paths: list[Path], options: dict[str, Any], tables: dict[Path, tabular.Table]) -> str:
+    """The format of files, from what they hold; tables that were read for it are kept."""
+    path = paths[0]
+    if path.is_dir():
+        if (path / "metadata.yaml").exists():
+            return "crazyswarm"
+        raise CfbError(f"{path}: this is a folder and not one of a ROS 2 bag; give the log itself.")
+    head = read_bytes(path, 64)
     if head.startswith(usd_card.MAGIC):
-        return "usd_card", None
-    if head == _MCAP_MAGIC:
-        return ("crazyswarm" if ros_bag.recognises(path) else "mcap"), None
+        return "usd_card"
+    if head.startswith(_MCAP_MAGIC):
+        return "crazyswarm" if ros_bag.recognises(path) else "mcap"
+    if (foreign := containers.name_of(path, head)) is not None:
+        raise CfbError(f"{path}: this is {foreign[0]}, which this library does not read; {foreign[1]}.")
     if path.suffix == ".mcap":
-        return "mcap", None
-    table = tabular.read_table(path)
+        return "mcap"
+    for one in paths:
+        tables[one] = tabular.read_table(one)
+    table = tables[path]
     if idsia.recognises(table):
-        return "idsia", table
-    return ("radio_csv" if radio_csv.recognises(table) else "tabular"), table
+        return "idsia"
+    if "mapping" in options or radio_csv.recognises(table, load_mapping()):
+        return "radio_csv"
+    return "tabular"

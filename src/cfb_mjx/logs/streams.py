@@ -10,6 +10,7 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.gaps import longest_step
 
+_MOSTLY_NEW = 0.7
 RADIO_WRAP_MS = 1 << 24  # a log packet carries its time stamp in three bytes of milliseconds: it wraps after 4.7 h
 
 
@@ -98,10 +99,26 @@ def hold(stream: Stream, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def central_difference(stream: Stream, values: np.ndarray) -> np.ndarray:
-    """Derivative of ``values`` over the stream's own samples: central inside, one-sided beside gaps, NaN if alone."""
+    """Derivative of ``values`` (n, ...) over the stream's own samples: central inside, one-sided beside gaps, NaN if
+    alone."""
+    before, after, span = neighbours(stream)
+    span = np.where(span > 0, span, np.nan).reshape(-1, *[1] * (values.ndim - 1))
+    return (values[after] - values[before]) / span
+
+
+def neighbours(stream: Stream) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """For each sample the one before and the one after, itself where a gap or the end is there, and the s between."""
     t, n = stream.time, len(stream.time)
     inside = np.diff(t) <= stream.gap_threshold  # whether sample i and i + 1 belong together
     before = np.where(np.concatenate([[False], inside]), np.arange(n) - 1, np.arange(n))
     after = np.where(np.concatenate([inside, [False]]), np.arange(n) + 1, np.arange(n))
-    span = t[after] - t[before]
-    return np.where(span > 0, (values[after] - values[before]) / np.where(span > 0, span, 1.0), np.nan)
+    return before, after, t[after] - t[before]
+
+
+def fresh(values: np.ndarray) -> np.ndarray:
+    """Which samples of (n, columns) are new where most only repeat the one before; all are, where most are not.
+
+    A value that the firmware updates at 100 Hz and logs at 500 Hz has steps, whose differences mean nothing.
+    """
+    new = np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
+    return new if new.mean() < _MOSTLY_NEW and new.sum() > 2 else np.ones(len(values), dtype=bool)

@@ -11,6 +11,7 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, replacing
 from cfb_mjx.logs.flight_log import FlightLog, quantise_time
+from cfb_mjx.logs.text_table import read_text_table
 
 COLUMNS = {
     "time": ("t",),
@@ -33,16 +34,26 @@ class Text(NamedTuple):
 
     row: int
     cell: str
+    cells: list[str]
 
 
-Table = dict[str, np.ndarray | Text]
+class Table(dict[str, np.ndarray | Text]):
+    """Columns by name.
+
+    Attributes:
+        notes: what was done to read them.
+    """
+
+    def __init__(self, columns=(), notes: list[str] | None = None):
+        super().__init__(columns)
+        self.notes = [] if notes is None else notes
 
 
 def read_table(path: str | os.PathLike) -> Table:
-    """Read a parquet or csv file, every numeric column as float64.
+    """Read a parquet or text file, every numeric column as float64.
 
     Args:
-        path: a parquet file (recognised by its first bytes) or a csv with a header line.
+        path: a parquet file (recognised by its first bytes) or a text with a header line (`read_text_table`).
 
     Returns:
         Column name to (n,) array with NaN for missing cells, or to `Text` for columns of anything but numbers.
@@ -57,8 +68,9 @@ def read_table(path: str | os.PathLike) -> Table:
     if not head:
         raise CfbError(f"{path}: the file is empty; export the log again.")
     is_parquet = head == b"PAR1"
+    notes: list[str] = []
     try:
-        table = _parquet(path) if is_parquet else _csv(path)
+        table = _to_arrays(_parquet(path) if is_parquet else read_text_table(path, read_bytes(path), notes))
     except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError, MemoryError, RuntimeError) as error:
         kind = "parquet" if is_parquet else "csv"
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -67,42 +79,36 @@ def read_table(path: str | os.PathLike) -> Table:
         ) from None
     if not table:
         raise CfbError(f"{path}: the table has no columns; the layout is {LAYOUT}.")
-    return table
+    return Table(table, notes)
 
 
 def require_numbers(table: Table, columns: list[str], path: Path) -> None:
     """Raise `CfbError` naming the first of ``columns`` that holds something else than numbers."""
     for column in columns:
         if isinstance(table[column], Text):
-            row, cell = table[column]
+            row, cell, _ = table[column]
             raise CfbError(
                 f"{path}: column {column} holds {cell!r} in row {row} (counted from 0) instead of a number; "
                 "export it as plain decimal numbers and leave missing cells empty."
             )
 
 
-def _parquet(path: Path) -> Table:
+def _parquet(path: Path):
     import pyarrow.parquet as pq
 
     # ParquetFile rather than read_table: the latter guesses partitions from folder names.
     with pq.ParquetFile(path, memory_map=False, page_checksum_verification=True) as file:
-        return _to_arrays(file.read())
+        return file.read()
 
 
-def _csv(path: Path) -> Table:
-    import pyarrow.csv as pc
-
-    return _to_arrays(pc.read_csv(path, read_options=pc.ReadOptions(use_threads=False)))
-
-
-def _to_arrays(table) -> Table:
+def _to_arrays(table) -> dict[str, np.ndarray | Text]:
     import pyarrow as pa
     import pyarrow.compute as pcm
 
     names = [name.strip() for name in table.column_names]
     if twice := sorted({n for n in names if names.count(n) > 1}):
         raise ValueError(f"column {twice[0]!r} appears twice")
-    arrays: Table = {}
+    arrays: dict[str, np.ndarray | Text] = {}
     for name, column in zip(names, table.columns, strict=True):
         kind = column.type
         if pa.types.is_null(kind):
@@ -115,12 +121,13 @@ def _to_arrays(table) -> Table:
 
 
 def _first_text(column) -> Text:
-    for row, cell in enumerate(column):
+    cells = [str(cell) for cell in column.to_pylist()]
+    for row, cell in enumerate(cells):
         try:
-            float(str(cell))
+            float(cell)
         except ValueError:
-            return Text(row, str(cell)[:40])
-    return Text(0, str(column[0])[:40] if len(column) else "")
+            return Text(row, cell[:40], cells)
+    return Text(0, cells[0][:40] if cells else "", cells)
 
 
 def read_tabular(path: str | os.PathLike) -> FlightLog:

@@ -36,6 +36,8 @@ FIELDS = tuple(f for f in (*REQUIRED, *OPTIONAL) if f != "time")
 _WIDTH = {"quaternion": 4, "command": 4, "rotor_speed": 4, "battery_voltage": 1}
 _FORM_WIDTH = {"components": 4, "compressed": 1, "euler": 3}
 _FRAMES = {"velocity": "world", "specific_force": "body"}  # the only fields with a choice, and its default
+DERIVED_FROM = {"velocity": "position", "body_rate": "quaternion", "specific_force": "velocity"}
+"""What a field can be derived from where it was not logged: its derivative is it, or holds it."""
 _CHOICE_KEYS = {"variables", "unit", "sign", "frame", "form", "invalid"}
 _FIRMWARE_KEYS = ("version", "battery_compensation", "thrust_limit")
 
@@ -45,12 +47,13 @@ class Choice:
     """One way to fill a field.
 
     Attributes:
-        variables: logged names in the order of the field's columns; empty for a velocity derived from positions.
+        variables: logged names in the order of the field's columns; empty where the field is derived.
         unit: of the logged numbers, a key of `UNITS` of the field.
         factors: to SI, sign included, one per variable.
         frame: ``world`` or ``body``, for velocity and specific force.
         form: of a quaternion: ``components``, ``compressed`` or ``euler``.
         invalid: logged numbers that stand for a missing measurement.
+        derived: the field it is the derivative of, a value of `DERIVED_FROM`; empty where it was logged.
     """
 
     variables: tuple[str, ...]
@@ -59,16 +62,12 @@ class Choice:
     frame: str = ""
     form: str = ""
     invalid: tuple[float, ...] = ()
-
-    @property
-    def derived(self) -> bool:
-        """Whether this velocity is to be derived from the positions."""
-        return not self.variables
+    derived: str = ""
 
     def report(self) -> dict:
         """What was read, in JSON terms."""
         if self.derived:
-            return {"derived": "position"}
+            return {"derived": self.derived}
         extra = {k: getattr(self, k) for k in ("frame", "form") if getattr(self, k)}
         signs = [1 if f > 0 else -1 for f in self.factors]
         return {"variables": list(self.variables), "unit": self.unit, **extra} | (
@@ -94,7 +93,7 @@ class VariableMap:
         found = {}
         for field in FIELDS:
             for choice in self.choices.get(field, ()):
-                usable = "position" in found if choice.derived else all(v in available for v in choice.variables)
+                usable = choice.derived in found if choice.derived else all(v in available for v in choice.variables)
                 if usable:
                     found[field] = choice
                     break
@@ -104,8 +103,8 @@ class VariableMap:
             listed = ", ".join(sorted(available)) or "none"
             raise CfbError(
                 f"{path}: no logged variables for {wanted}. Found: {listed}. Log the missing ones too, or say under "
-                "which names and units they are with a mapping file (mapping=..., a changed copy of "
-                "configs/logs/crazyflie.yaml, see docs/logs.md)."
+                "which names and units they are with --mapping FILE, a changed copy of configs/logs/crazyflie.yaml (see "
+                "docs/logs.md)."
             )
         return found
 
@@ -156,9 +155,10 @@ def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
 def _choice(field: str, raw: dict, path: Path) -> Choice:
     where = f"fields.{field}"
     if "derived" in raw:
-        if field != "velocity" or raw != {"derived": "position"}:
-            raise CfbError(f"{path}: {where}: 'derived: position' stands alone and exists for the velocity only.")
-        return Choice(())
+        if raw != {"derived": DERIVED_FROM.get(field)}:
+            possible = ", ".join(f"derived: {source} for {what}" for what, source in DERIVED_FROM.items())
+            raise CfbError(f"{path}: {where}: 'derived' stands alone, and is one of {possible}.")
+        return Choice((), derived=raw["derived"])
     _only(raw, _CHOICE_KEYS, path, where)
     form = raw.get("form", "components") if field == "quaternion" else ""
     if (field != "quaternion" and "form" in raw) or form not in ("", *_FORM_WIDTH):

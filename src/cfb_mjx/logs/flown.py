@@ -1,0 +1,168 @@
+"""Which rows of a recording are measured flight: no standing, no carrying, no glitches, no frozen estimates.
+
+What is taken out is told in the log's notes; where it lay within the flight it becomes a gap.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs.flight_log import FlightLog, quantise_time
+
+_CARRIES = 0.5  # of the command in hover: with less for longer than a flip lasts nothing flies
+_FLIP = 0.7  # s: a drone in the air may fall this long with its motors low
+_CLEAR = 0.1  # m above where it stood: off the ground
+_SETTLED = 0.3  # s after it left the ground and before it came back: air flow and feet are not those of flight
+_SHORTEST = 0.2  # s: a stretch of flight shorter than this tells nothing
+_LEAP = 0.3  # m by which a position leaps against what the velocity says: no estimate of a flight does
+_BACK = 1.0  # s within which an excursion of the motion capture comes back
+_FROZEN = 0.15  # s that an estimate may stay the same to the last bit
+_RARELY = 0.2  # a fault in more than this share of the rows is no fault but what such a file is like
+_UNDER_COMMAND = 0.15  # of full: a brushless rotor turns at a third of its speed
+_SPIN_UP = 0.1  # s after which a motor under command has left standstill
+
+
+def flown_part(log: FlightLog, path: Path, keep_ground: bool = False) -> FlightLog:
+    """The log without rows that are no measured flight; notes and warnings say what was left out.
+
+    Args:
+        log: as read, not yet validated.
+        path: named in messages.
+        keep_ground: leave in what was recorded on the ground and in the hand.
+
+    Raises:
+        CfbError: nothing of it is flight.
+    """
+    if len(log) < 2 or not (np.diff(log.time) > 0).all():
+        return log  # for `validate` to refuse
+    notes: list[str] = []
+    warnings: list[str] = []
+    log = _without_lost_readings(log, warnings)
+    if not keep_ground and np.isfinite(log.command).all():
+        log = _airborne(log, path, notes)
+    log = _without(log, _leaps(log), "the position leaps by more than the velocity allows", warnings)
+    log = _without(log, _frozen(log), "position, velocity and attitude stay the same to the last bit", warnings)
+    if not notes and not warnings:
+        return log
+    said = {"notes": notes, "warnings": warnings}
+    return log.replace(metadata={key: [*(log.metadata.get(key) or ()), *new] for key, new in said.items()})
+
+
+def _without_lost_readings(log: FlightLog, warnings: list[str]) -> FlightLog:
+    """A rotor under command does not stand still: a reading of 0 there is none."""
+    if log.rotor_speed is None:
+        return log
+    on = log.command > _UNDER_COMMAND
+    row = np.arange(len(log))[:, None]
+    # The last row without command, or before the log: how long each motor has been under it.
+    off = np.maximum.accumulate(np.where(on, -1, row), axis=0)
+    since = np.where(off >= 0, log.time[:, None] - log.time[np.maximum(off, 0)], np.inf)
+    lost = (log.rotor_speed == 0) & on & (since > _SPIN_UP)
+    if not lost.any():
+        return log
+    told = ", ".join(f"motor {m + 1} {lost[:, m].mean():.1%}" for m in range(4) if lost[:, m].any())
+    warnings.append(
+        f"rotor speeds of 0 under command are lost readings and became NaN: {told} of the rows are such dead readings."
+    )
+    return log.replace(rotor_speed=np.where(lost, np.nan, log.rotor_speed))
+
+
+def _airborne(log: FlightLog, path: Path, notes: list[str]) -> FlightLog:
+    command, z = log.command.mean(axis=1), log.position[:, 2]
+    top = float(np.percentile(command, 95))
+    if top <= 0:
+        raise CfbError(f"{path}: the motors are off throughout, so nothing of it is flight; --keep-ground reads it.")
+    carries = command >= _CARRIES * float(np.median(command[command > 0.3 * top]))
+    flies, stood = carries.copy(), []
+    for start, stop in _runs(~carries):
+        long = log.time[stop - 1] - log.time[start] > _FLIP
+        flies[start:stop] = not (long or start == 0 or stop == len(log))
+        if long:
+            stood.append((start, stop, float(np.median(z[start:stop]))))
+    keep = np.zeros(len(log), dtype=bool)
+    for start, stop in _runs(flies):
+        before = next((floor for _, b, floor in stood if b == start), -np.inf)
+        after = next((floor for a, _, floor in stood if a == stop), -np.inf)
+        left = start + np.flatnonzero(z[start:stop] > before + _CLEAR)
+        back = start + np.flatnonzero(z[start:stop] > after + _CLEAR)
+        if not (len(left) and len(back)):
+            continue  # it never left the ground
+        begin = log.time[left[0]] + _SETTLED * np.isfinite(before)
+        end = log.time[back[-1]] - _SETTLED * np.isfinite(after)
+        inside = (log.time >= begin) & (log.time <= end)
+        inside[:start] = inside[stop:] = False
+        if end - begin >= _SHORTEST:
+            keep |= inside
+    if keep.all() or (not keep.any() and flies.all()):
+        return log
+    if not keep.any():
+        raise CfbError(
+            f"{path}: nothing of it is flight: the motors are low or the drone stays where it stood; --keep-ground "
+            "reads it all the same."
+        )
+    gone = log.duration - float(sum(log.time[b - 1] - log.time[a] for a, b in _runs(keep)))
+    notes.append(
+        f"{gone:.1f} s on the ground or in the hand (motors off, standing, take-off, landing) were cut; --keep-ground "
+        "keeps them."
+    )
+    log = log.rows(keep)
+    return log.replace(time=quantise_time(log.time - log.time[0]))
+
+
+def _leaps(log: FlightLog) -> np.ndarray:
+    """Rows between a leap of the position and the leap back, or beside one that stays."""
+    bad = np.zeros(len(log), dtype=bool)
+    new = np.flatnonzero(_changes(log.position))
+    if len(new) < 3:
+        return bad
+    step, moved = np.diff(log.time[new]), np.diff(log.position[new], axis=0)
+    expected = (log.velocity[new[1:]] + log.velocity[new[:-1]]) / 2 * step[:, None]
+    leap = np.flatnonzero((np.linalg.norm(moved - expected, axis=1) > _LEAP) & (step < log.gap_threshold * 3))
+    if not len(leap) or len(leap) > 0.05 * len(new):
+        return bad
+    at = 0
+    while at < len(leap):
+        first, last = new[leap[at]] + 1, new[leap[at] + 1]
+        back = at + 1 < len(leap) and log.time[new[leap[at + 1]]] - log.time[first] < _BACK
+        if back:
+            last = new[leap[at + 1] + 1] - 1
+            at += 1
+        bad[max(first - 1, 0) : last + 2] = True
+        at += 1
+    return bad
+
+
+def _frozen(log: FlightLog) -> np.ndarray:
+    """Rows in which a whole estimate repeats for far longer than it usually does."""
+    estimate = np.concatenate([log.position, log.velocity, log.quaternion], axis=1)
+    same = ~_changes(estimate)
+    bad = np.zeros(len(log), dtype=bool)
+    runs = [(a, b, log.time[b - 1] - log.time[a - 1]) for a, b in _runs(same) if a > 0]
+    usual = float(np.median([length for *_, length in runs])) if runs else 0.0
+    for start, stop, length in runs:
+        bad[start:stop] = length > max(_FROZEN, 5 * usual)
+    return bad if bad.mean() < _RARELY else np.zeros(len(log), dtype=bool)
+
+
+def _without(log: FlightLog, bad: np.ndarray, what: str, warnings: list[str]) -> FlightLog:
+    if not bad.any() or (~bad).sum() < 2:
+        return log
+    times = ", ".join(f"{log.time[a]:.2f}" for a, _ in _runs(bad)[:5])
+    count = len(_runs(bad))
+    more = f" and {count - 5} more" if count > 5 else ""
+    warnings.append(f"{what}: {int(bad.sum())} rows at {times}{more} s were left out.")
+    return log.rows(~bad)
+
+
+def _changes(values: np.ndarray) -> np.ndarray:
+    """Which rows of (n, columns) differ from the one before; the first does."""
+    return np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
+
+
+def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """First row of every run of true values, and the row behind its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,0 +1,115 @@
+"""Motor gain and offset from steady points without time: ``omega = a + b u V``, or ``a + b u`` without a voltage.
+
+A brushless controller switches the battery's voltage on for the share u of the time, so the speed follows u V: on a
+bench where the battery sags by a volt that leaves 10 rad/s where a line in u alone leaves 46.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs.bench_layouts import SteadyPoints
+from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE
+from cfb_mjx.model.effects.fields import HOVER_SPEED
+
+_FEWEST, _LEVELS = 6, 3
+_VARIES = 0.05  # V of spread from which the voltage can be told
+_OUTLIER = 5.0
+
+
+@dataclass(frozen=True)
+class SteadyFit:
+    """Gain and offset of the motors.
+
+    Attributes:
+        gain: rad/s of a command of one, at 3.7 V where the voltage was measured. ``gain_std``: its deviation.
+        offset: rad/s, of the line at no command. ``offset_std``: its deviation.
+        per_volt: rad/s of a command of one and V; None where the voltage was not measured or did not change.
+        spread: rad/s, of the points about the line. ``spread_without_voltage``: about a line in the command alone.
+        outliers: share of points more than five spreads off, left out.
+        points: number of points.
+    """
+
+    gain: float
+    gain_std: float
+    offset: float
+    offset_std: float
+    per_volt: float | None
+    spread: float
+    spread_without_voltage: float
+    outliers: float
+    points: int
+
+    @property
+    def sag_slope(self) -> float | None:
+        """Relative change of speed per relative change of voltage in hover: the slope of `battery_sag`."""
+        return None if self.per_volt is None else 1.0 - self.offset / HOVER_SPEED
+
+
+def fit_steady(tables: list[SteadyPoints]) -> SteadyFit:
+    """Fit the line through all points, all motors as one.
+
+    Raises:
+        CfbError: too few points or too few different commands.
+    """
+    label = ", ".join(t.name for t in tables)
+    u, omega = (np.concatenate([getattr(t, f) for t in tables]) for f in ("command", "rotor_speed"))
+    levels = len(np.unique(np.round(u, 2)))
+    if len(u) < _FEWEST or levels < _LEVELS:
+        raise CfbError(
+            f"{label}: {len(u)} steady points at {levels} different commands; a line needs {_FEWEST} at {_LEVELS}."
+        )
+    known = all(t.battery_voltage is not None for t in tables)
+    voltage = np.concatenate([t.battery_voltage for t in tables]) if known else None
+    plain = _line(u, omega, u)
+    if voltage is None or np.std(voltage) < _VARIES:
+        (offset, slope), std, spread, outliers = plain
+        return SteadyFit(slope, std[1], offset, std[0], None, spread, spread, outliers, len(u))
+    (offset, slope), std, spread, outliers = _line(u * voltage, omega, u)
+    return SteadyFit(
+        slope * NOMINAL_VOLTAGE,
+        std[1] * NOMINAL_VOLTAGE,
+        offset,
+        std[0],
+        slope,
+        spread,
+        plain[2],
+        outliers,
+        len(u),
+    )
+
+
+def _line(x: np.ndarray, y: np.ndarray, setting: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Offset and slope, their deviations, spread of the points, share of outliers.
+
+    Sensors that count a blade twice or miss one read half or double for whole settings: the line starts from least
+    absolute residuals, and what is far from it is left out. Points of one setting share their error.
+    """
+    from scipy.optimize import least_squares
+
+    design = np.stack([np.ones_like(x), x], axis=1)
+    size = np.array([1000.0, 1000.0 / max(float(np.abs(x).max()), 1e-9)])
+    start = np.linalg.lstsq(design, y, rcond=None)[0]
+    theta = least_squares(
+        lambda t: design @ t - y, start, jac=lambda t: design, loss="soft_l1", f_scale=1.0, x_scale=size
+    ).x
+    good = np.ones(len(y), dtype=bool)
+    for _ in range(20):
+        residual = y - design @ theta
+        spread = 1.4826 * float(np.median(np.abs(residual[good] - np.median(residual[good])))) + 1e-9
+        now = np.abs(residual) <= _OUTLIER * spread
+        theta = np.linalg.lstsq(design[now], y[now], rcond=None)[0]
+        if (now == good).all():
+            break
+        good = now
+    residual = (y - design @ theta)[good]
+    inverse = np.linalg.inv(design[good].T @ design[good])
+    _, group = np.unique(np.round(setting[good], 4), return_inverse=True)
+    scores = np.zeros((group.max() + 1, 2))
+    np.add.at(scores, group, design[good] * residual[:, None])
+    covariance = inverse @ (scores.T @ scores) @ inverse
+    spread = float(np.sqrt(np.mean(residual**2)))
+    return theta, np.sqrt(np.diag(covariance)), spread, float(1 - good.mean())
