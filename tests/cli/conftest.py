@@ -31,14 +31,15 @@ def flight() -> FlightLog:
     n = len(time)
     roll = 0.2 * np.sin(4 * time)
     zero = np.zeros(n)
-    velocity = np.stack([zero, 0.3 * np.sin(2 * time), zero], axis=1)
+    # Thrust that carries the drone, tilted by the roll.
+    sideways = np.cumsum(-9.81 * np.tan(roll)) * 0.004 + 0.49
     return FlightLog(
         time=time,
-        position=np.stack([zero, 0.15 * (1 - np.cos(2 * time)), 1 + zero], axis=1),
-        velocity=velocity,
+        position=np.stack([zero, np.cumsum(sideways) * 0.004, 1 + zero], axis=1),
+        velocity=np.stack([zero, sideways, zero], axis=1),
         quaternion=np.stack([np.cos(roll / 2), np.sin(roll / 2), zero, zero], axis=1),
         body_rate=np.stack([0.8 * np.cos(4 * time), zero, zero], axis=1) + 0.01 * rng.normal(size=(n, 3)),
-        specific_force=np.tile([0.0, 0.0, 9.81], (n, 1)) + 0.05 * rng.normal(size=(n, 3)),
+        specific_force=np.stack([zero, zero, 9.81 / np.cos(roll)], axis=1) + 0.05 * rng.normal(size=(n, 3)),
         command=np.full((n, 4), 0.55) + 0.01 * rng.normal(size=(n, 4)),
         rotor_speed=None,
         battery_voltage=np.linspace(4.0, 3.9, n),

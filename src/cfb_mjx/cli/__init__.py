@@ -17,6 +17,7 @@ from cfb_mjx.interrupts import heard
 
 SUMMARY = {
     "import": "convert a flight log to MCAP",
+    "check": "say what recordings hold, whether their signals agree, what they are good for",
     "evaluate": "measure how well a model predicts flights, open loop",
     "benchmark-nanodrone": "judge a model by the rules of the IDSIA nano-drone benchmark",
     "fit": "refit the model to flights, with uncertainty",

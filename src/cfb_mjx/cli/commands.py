@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat, with_plugins
+from cfb_mjx.cli.argument_types import Changes, File, Model, Output, Pairs, flat, with_plugins
 from cfb_mjx.cli.deploying_commands import export
 from cfb_mjx.cli.learning_commands import fly, train
 from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce, view
@@ -20,8 +20,8 @@ from cfb_mjx.errors import CfbError
 
 
 def import_log(
-    sources: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")],
-    output: Output,
+    sources: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")] = (),
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
     format: Literal["auto", "tabular", "idsia", "mcap", "usd_card", "crazyswarm", "radio_csv"] = "auto",
     motor_shift: float | None = None,
     mapping: File = None,
@@ -29,6 +29,8 @@ def import_log(
     robot: str | None = None,
     time_unit: str | None = None,
     keep_ground: bool = False,
+    fix: Changes = (),
+    print_config: Literal["sd", "radio"] | None = None,
 ) -> None:
     """Convert a flight log to MCAP.
 
@@ -45,12 +47,57 @@ def import_log(
         robot: whose flight to read from a Crazyswarm2 bag of several.
         time_unit: unit of the time column of a radio csv: s, ms, us or ns.
         keep_ground: leave in what was recorded on the ground and in the hand.
+        fix: a change of unit, axes or order, as a refusal names it, for instance velocity-frame=body.
+        print_config: print what to log, and read nothing: the config.txt of the micro SD card deck, or the log blocks
+            of
+            the radio for cfclient.
     """
-    from cfb_mjx.cli.importing import run_import
+    from cfb_mjx.cli.importing import print_logging, run_import
 
+    if print_config is not None:
+        print_logging(print_config)
+        return
+    if not sources or output is None:
+        raise CfbError("import needs a log and -o FILE.mcap; see 'cfb import --help'.")
     options = {"motor_shift": motor_shift, "mapping": mapping, "topics_yaml": topics_yaml, "robot": robot}
-    options |= {"time_unit": time_unit, "keep_ground": keep_ground}
+    options |= {"time_unit": time_unit, "keep_ground": keep_ground, "fix": flat(fix)}
     run_import(list(sources), output, None if format == "auto" else format, options)
+
+
+def check(
+    logs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")],
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")] = None,
+    json: File = None,
+    mapping: File = None,
+    topics_yaml: File = None,
+    robot: str | None = None,
+    time_unit: str | None = None,
+    keep_ground: bool = False,
+    fix: Changes = (),
+) -> None:
+    """Say what recordings hold, whether their signals agree, what they are good for and what to log next time.
+
+    Every recording is read as by import, by itself; one that is refused stops none of the others.
+
+    Args:
+        logs: recordings of any format.
+        output: folder for a page with figures (index.html).
+        json: write the results here.
+        mapping: as for import.
+        topics_yaml: as for import.
+        robot: as for import.
+        time_unit: as for import.
+        keep_ground: as for import.
+        fix: as for import.
+    """
+    if not logs:
+        raise CfbError("check needs at least one log; see 'cfb check --help'.")
+    from cfb_mjx.cli.checking import run_check
+
+    options = {"mapping": mapping, "topics_yaml": topics_yaml, "robot": robot, "time_unit": time_unit}
+    options |= {"keep_ground": keep_ground, "fix": flat(fix)}
+    if refused := run_check(list(logs), output, json, options):
+        raise CfbError(f"{refused} of {len(logs)} recordings were refused, for the reasons above.")
 
 
 def evaluate(
@@ -211,7 +258,19 @@ def fit_rotors(
     from cfb_mjx.cli.rotor_fitting import run_fit_rotors
 
     run_fit_rotors(
-        list(files), output, model, flat(set), offset, asymmetric, dead_time, per_motor, robust, json, figure, tared, rotors
+        list(files),
+        output,
+        model,
+        flat(set),
+        offset,
+        asymmetric,
+        dead_time,
+        per_motor,
+        robust,
+        json,
+        figure,
+        tared,
+        rotors,
     )
 
 
@@ -379,6 +438,7 @@ def version() -> None:
 
 COMMANDS = {
     "import": import_log,
+    "check": check,
     "evaluate": evaluate,
     "benchmark-nanodrone": benchmark_nanodrone,
     "fit": fit,

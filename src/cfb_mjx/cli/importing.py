@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.files import shipped
 from cfb_mjx.logs import estimate_command_shift, read_log, write_mcap
+from cfb_mjx.logs.gate import judge
 
 
 def run_import(sources: list[Path], output: Path, format: str | None, options: dict[str, Any]) -> None:
@@ -42,9 +44,16 @@ def run_import(sources: list[Path], output: Path, format: str | None, options: d
     for key, value in (log.metadata.get("cleaning") or {}).items():
         if value and (key.startswith("dropped") or key in ("held_rows_kept", "invalid_rotor_speeds")):
             print(f"  {key.replace('_', ' ')}: {value}")
+    print(f"  {judge(log).summary()}")
     print(f"  {describe_alignment(alignment)}")
     for line in [*(log.metadata.get("warnings") or ()), *(log.metadata.get("notes") or ())]:
         print(f"  {line}")
+
+
+def print_logging(kind: str) -> None:
+    """Print what to log: ``sd`` for the micro SD card deck, ``radio`` for cfclient."""
+    name = {"sd": "config.txt", "radio": "radio.json"}[kind]
+    print(shipped("configs", "logs", name).read_text(encoding="utf-8"), end="")
 
 
 def describe_alignment(alignment: dict | None) -> str:

@@ -17,7 +17,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, require_folder, together, write_json
 from cfb_mjx.logs import read_log
 from cfb_mjx.logs.bench_layouts import Bench, SteadyPoints, read_bench_table, recognises
-from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
+from cfb_mjx.logs.bench_tables import MapTable
 from cfb_mjx.logs.tabular import read_table
 
 if TYPE_CHECKING:
@@ -153,12 +153,14 @@ def _require_one_rotor(tables: list[MapTable], base: ModelFile) -> None:
         point = f"{table.force[top]:.3g} N at {table.rotor_speed[top]:.0f} rad/s"
         if ratio > _FOUR_LEAST:
             raise CfbError(
-                f"{table.name}: {point} is {ratio:.1f} times what one rotor of {base.name} pulls, so it is the thrust of "
+                f"{table.name}: {point} is {ratio:.1f} times what one rotor of {base.name} pulls, so it is the "
+                "thrust of "
                 "four; give --rotors 4."
             )
         if ratio < 1 / _FOUR_LEAST:
             raise CfbError(
-                f"{table.name}: {point} is {ratio:.2f} of what a rotor of {base.name} pulls, as if the thrust of one had "
+                f"{table.name}: {point} is {ratio:.2f} of what a rotor of {base.name} pulls, as if the thrust "
+                "of one had "
                 "been divided by four; give --rotors 1, or correct its unit."
             )
 
@@ -329,8 +331,10 @@ def _print(
         print(f"steady speed: {steady.points} points about a line, spread {steady.spread:.1f} rad/s{out}")
         if steady.per_volt is not None:
             print(
-                f"steady speed follows command times voltage, omega = {steady.offset:.0f} + {steady.per_volt:.0f} u V; a "
-                f"line in u alone leaves {steady.spread_without_voltage:.1f} rad/s. The gain is that at 3.7 V; the effect "
+                f"steady speed follows command times voltage, omega = {steady.offset:.0f} + "
+                f"{steady.per_volt:.0f} u V; a "
+                f"line in u alone leaves {steady.spread_without_voltage:.1f} rad/s. The gain is that at 3.7 V; "
+                "the effect "
                 f"battery_sag with slope {steady.sag_slope:.2f} makes a model follow the voltage."
             )
     for suffix, group in groups.items():
@@ -340,7 +344,7 @@ def _print(
         verdict = "supported by the data" if test.supported else "not supported by the data"
         hint = ""
         if test.supported and test.name not in asked:
-            hint = "; --offset fits it" if test.name == "offset" else "; the fit allows for it"
+            hint = "; the fit allows for it"
         print(f"{test.name.replace('_', ' ')}: {verdict} (p = {test.p_value:.2g}, BIC {-test.bic_gain:+.1f}){hint}")
     for name, p in (motors.differences if motors else {}).items():
         if p < 0.01:

@@ -13,6 +13,7 @@ import itertools
 import numpy as np
 
 from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.gaps import stretches
 
 BAND_HZ = (5.0, 17.0)
 MAX_SHIFT = 0.06  # s: under one period of the band's centre, so that the neighbouring correlation peak stays outside
@@ -86,7 +87,7 @@ def estimate_command_shift(
         valid = ~np.isnan(log.rotor_speed).any(axis=1)
         times, speeds, gyro = log.time[valid], log.rotor_speed[valid], log.body_rate[valid]
     elif method == "command":
-        times, speeds, gyro = log.time, _motors(log), log.body_rate
+        times, speeds, gyro = log.time, nominal_speeds(log), log.body_rate
     else:
         raise ValueError(f"method must be 'rotor_speed' or 'command', not {method!r}")
     s = speeds / _GAIN
@@ -139,7 +140,7 @@ def delay_by_samples(log: FlightLog, samples: int) -> FlightLog:
     return log.replace(command=log.command[source], rotor_speed=None if speed is None else speed[source])
 
 
-def _motors(log: FlightLog) -> np.ndarray:
+def nominal_speeds(log: FlightLog) -> np.ndarray:
     """Rotor speeds (n, 4) that the commands, held between rows, give through the first-order motor."""
     decay = np.exp(-np.diff(log.time) / _TIME_CONSTANT)
     target = _GAIN * log.command
@@ -147,6 +148,11 @@ def _motors(log: FlightLog) -> np.ndarray:
     for k, keep in enumerate(decay):
         speed[k + 1] = target[k] + (speed[k] - target[k]) * keep
     return speed
+
+
+def nominal_thrust(rotor_speed: np.ndarray) -> np.ndarray:
+    """Thrust, N, of each rotor at a speed, rad/s, of the nominal drone."""
+    return np.polyval(_THRUST, rotor_speed / _GAIN)
 
 
 def _spectra(t, predicted, gyro, log, band_hz):
@@ -188,3 +194,53 @@ def _peak(lags: np.ndarray, correlation: np.ndarray) -> tuple[np.ndarray, np.nda
     bend = left - 2 * middle + right
     offset = np.clip(np.where(bend < 0, 0.5 * (left - right) / np.where(bend < 0, bend, -1.0), 0.0), -1.0, 1.0)
     return lags[k] + offset * (lags[1] - lags[0]), middle - 0.25 * (left - right) * offset
+
+
+WIDE_BAND_HZ = (2.0, 17.0)
+_LAGS = np.arange(-0.03, 0.0601, 0.002)
+
+
+def motor_spectra(log: FlightLog, source: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Each motor's thrust beside how the drone turns, in a band of 2 to 17 Hz.
+
+    Args:
+        log: the flight.
+        source: ``rotor_speed``, or ``command`` through a first-order motor of 50 ms.
+
+    Returns:
+        Products of each motor's nominal thrust with the roll and pitch acceleration for lags of -30 to 60 ms, (lags, 4,
+        2); of the motors with each other, (4, 4); of the two accelerations with themselves, (2,). None without data.
+    """
+    step = log.nominal_interval
+    low, high = WIDE_BAND_HZ[0], min(WIDE_BAND_HZ[1], 0.4 / step) if step > 0 else 0.0
+    if high < 2 * low:
+        return None
+    if source == "rotor_speed":
+        if log.rotor_speed is None:
+            return None
+        known = np.isfinite(log.rotor_speed).all(axis=1)
+        time, speed, gyro = log.time[known], log.rotor_speed[known], log.body_rate[known, :2]
+    else:
+        time, speed, gyro = log.time, nominal_speeds(log), log.body_rate[:, :2]
+    thrust = np.polyval(_THRUST, speed / _GAIN)
+    size = max(8, round(_BLOCK / 2 / step))
+    window = np.hanning(size)[:, None]
+    frequency = np.fft.rfftfreq(size, step)
+    band = (frequency >= low) & (frequency <= high)
+    pieces = []
+    for part in stretches(time, log.gap_threshold):
+        if part.stop - part.start < size or time[part][-1] - time[part][0] < size * step:
+            continue
+        grid = np.arange(time[part][0], time[part][-1], step)
+        both = [np.stack([np.interp(grid, time[part], v) for v in values[part].T], 1) for values in (thrust, gyro)]
+        for start in range(0, len(grid) - size + 1, size // 2):
+            cut = [values[start : start + size] for values in both]
+            x, y = (np.fft.rfft((c - c.mean(axis=0)) * window, axis=0)[band] for c in cut)
+            pieces.append((x, y * (2j * np.pi * frequency[band])[:, None]))
+    if not pieces:
+        return None
+    x, y = (np.stack(values) for values in zip(*pieces, strict=True))
+    steer = np.exp(2j * np.pi * np.outer(_LAGS, frequency[band]))
+    cross = np.einsum("lf,fij->lij", steer, np.einsum("bfi,bfj->fij", np.conj(x), y)).real
+    power = np.einsum("bfi,bfk->ik", np.conj(x), x).real
+    return cross, power, np.sum(np.abs(y) ** 2, axis=(0, 1))

@@ -15,7 +15,8 @@ from cfb_mjx.logs.streams import Stream, central_difference, fresh, hold, neighb
 from cfb_mjx.logs.variables import Choice, VariableMap
 
 _DERIVED = {
-    "velocity": "velocity: not logged; central differences of the positions, which look one sample ahead and carry their "
+    "velocity": "velocity: not logged; central differences of the positions, which look one sample ahead and "
+    "carry their "
     "noise. Log stateEstimate.vx vy vz.",
     "body_rate": "body rate: not logged; central differences of the attitude, as late and as smooth as that is. Log "
     "gyro.x y z.",
@@ -74,7 +75,9 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
     for field, choice in chosen.items():
         if choice.derived:
             fields[field] = merger.derived(field, fields)
-            read.warnings.append(_DERIVED[field])
+            parts = mapping.logged_parts(field, home)
+            beside = f" ({', '.join(parts)} alone does not tell it.)" if parts else ""
+            read.warnings.append(_DERIVED[field] + beside)
     if "battery_voltage" in fields:
         fields["battery_voltage"] = _backfilled(fields["battery_voltage"][:, 0])
     keep = np.all([merger.usable[f] for f in chosen if f in REQUIRED], axis=0)
@@ -114,7 +117,6 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
             **read.metadata,
         },
     )
-    _check_rate_unit(log, chosen["body_rate"], path)
     return log.replace(metadata={"notes": read.notes, "warnings": read.warnings})
 
 
@@ -307,22 +309,3 @@ def from_euler(angles: np.ndarray) -> np.ndarray:
     """Quaternions (n, 4) of roll, pitch, yaw (n, 3), rad: the rotation R_z(yaw) R_y(pitch) R_x(roll)."""
     roll, pitch, yaw = (rotation.exponential(angles[:, [i]] * np.eye(3)[i]) for i in range(3))
     return rotation.multiply(yaw, rotation.multiply(pitch, roll))
-
-
-def _check_rate_unit(log: FlightLog, choice: Choice, path: Path) -> None:
-    """Refuse a gyro far slower than the attitude turns: rad/s read as deg/s. `validate` sees the opposite mistake."""
-    stride = max(1, round(0.1 / log.nominal_interval))
-    a = np.arange(0, len(log) - stride, stride)
-    turned = rotation.rotation_vector(
-        rotation.multiply(rotation.conjugate(log.quaternion[a]), log.quaternion[a + stride])
-    )
-    rate = turned / (log.time[a + stride] - log.time[a])[:, None]
-    sums = np.concatenate([np.zeros((1, 3)), np.cumsum(log.body_rate, axis=0)])
-    gyro = (sums[a + stride] - sums[a]) / stride
-    xx, yy, xy = float(np.sum(rate**2)), float(np.sum(gyro**2)), float(np.sum(rate * gyro))
-    # The attitude must really turn (0.2 rad/s rms), or the quantised pose of a drone at rest would decide.
-    if len(a) >= 5 and xx > 0.04 * len(a) and yy > 0 and xy > 0.7 * np.sqrt(xx * yy) and xy / xx < 0.05:
-        raise CfbError(
-            f"{path}: the attitude turns {xx / xy:.0f} times faster than the gyro ({' '.join(choice.variables)}, read "
-            f"as {choice.unit}) says; give its unit in a mapping file (--mapping FILE, see docs/logs.md)."
-        )

@@ -57,6 +57,7 @@ _NAMES: dict[str, tuple[tuple[str, str], ...]] = {
 _MOTOR = re.compile(r"(?P<name>[a-z]+?)_?(?P<motor>[1-4])?")
 _LEAST_COMMAND = 0.05
 _DEAD = 0.5  # of the rows under command: with more zeros than that a sensor tells nothing
+_STEP, _STEPS, _AFTER, _ANSWERED = 0.05, 3, 5, 0.05
 _SETTLED = 0.01  # of the speed over 0.1 s: faster changes are not steady
 
 
@@ -107,16 +108,19 @@ def read_bench_table(table: Table, path: Path, rotors: int | None = None) -> Ben
     found = _columns(table)
     steady = "t" not in table and {"u", "omega"} <= set(table) and not {"force", "torque"} & set(table)
     if standard(table) and not steady and not any(name not in _STANDARD for _, name in found if name in table):
-        part = from_columns(table, path)
-        if isinstance(part, MapTable) and rotors not in (None, 1):
+        part, notes = from_columns(table, path), []
+        if isinstance(part, MotorRecord):
+            part = _command_before(part, notes)
+        elif rotors not in (None, 1):
             part = _of_one(part, rotors)
-        return Bench([part], [])
+        return Bench([part], notes)
     notes: list[str] = []
     si, names = _in_si(table, found, path)
     speeds = {key: si[key] for key in si if re.fullmatch(r"omega[1-4]?", key)}
     if not speeds:
         raise CfbError(
-            f"{path}: has no rotor speed (a column rpm1..rpm4 or omega), and thrust against command alone tells neither "
+            f"{path}: has no rotor speed (a column rpm1..rpm4 or omega), and thrust against command alone tells "
+            "neither "
             "the motors nor the rotors; measure the speed too."
         )
     command = {key: si[key] for key in si if re.fullmatch(r"u[1-4]?", key)}
@@ -126,7 +130,16 @@ def read_bench_table(table: Table, path: Path, rotors: int | None = None) -> Ben
 
 
 _STANDARD = frozenset(
-    ["t", "u", "omega", "force", "torque", "motor", *(f"u{i}" for i in range(1, 5)), *(f"omega{i}" for i in range(1, 5))]
+    [
+        "t",
+        "u",
+        "omega",
+        "force",
+        "torque",
+        "motor",
+        *(f"u{i}" for i in range(1, 5)),
+        *(f"omega{i}" for i in range(1, 5)),
+    ]
 )
 
 
@@ -199,7 +212,9 @@ def _living(speeds, command, names, path: Path, notes: list[str]) -> dict[str, n
         lost = (values == 0) & on
         share = float(lost[on].mean()) if on.any() else 0.0
         if share > _DEAD:
-            notes.append(f"{path.name}: {names[key]} reads 0 in {share:.0%} of the rows under command and was left out.")
+            notes.append(
+                f"{path.name}: {names[key]} reads 0 in {share:.0%} of the rows under command and was left out."
+            )
             continue
         if lost.any():
             notes.append(f"{path.name}: {int(lost.sum())} readings of 0 under command in {names[key]} were left out.")
@@ -220,7 +235,7 @@ def _parts(si, speeds, command, path: Path, rotors, names, notes) -> list[MotorR
     if command and "t" in si:
         table = {"t": si["t"]} | {f"omega{numbers[k] or ''}": v for k, v in speeds.items()}
         table |= {k: np.clip(v, 0, None) for k, v in command.items()}
-        parts.append(from_columns(Table(table), path))
+        parts.append(_command_before(from_columns(Table(table), path), notes))
         steady = _steady(si["t"], _mean(speeds))
     elif command:
         parts.append(_steady_points(speeds, command, si.get("vbat"), path))
@@ -248,6 +263,30 @@ def _parts(si, speeds, command, path: Path, rotors, names, notes) -> list[MotorR
     return [*parts, from_columns(Table(table), path)]
 
 
+def _command_before(record: MotorRecord, notes: list[str]) -> MotorRecord:
+    """The record with every command in the row from which it acts.
+
+    Some scripts write a command, wait, and then write the row: the speed in it has already answered. A command that
+    acts from its row on cannot have moved the speed there.
+    """
+    moved = []
+    for u, speed in zip(record.command.T, record.rotor_speed.T, strict=True):
+        step = np.flatnonzero(np.abs(np.diff(u)) > _STEP)
+        step = step[(step > 0) & (step < len(u) - _AFTER)]
+        before, at = np.abs(speed[step] - speed[step - 1]), np.abs(speed[step + 1] - speed[step])
+        final = np.abs(speed[np.minimum(step + _AFTER, len(u) - 1)] - speed[step])
+        moved.append((at - before) / np.maximum(final, 1.0))
+    moved = np.concatenate(moved)
+    if len(moved) < _STEPS or not np.nanmedian(moved) > _ANSWERED:
+        return record
+    notes.append(
+        f"{record.name}: the speed answers in the very row of a new command, so each row's command is the one "
+        "that led to "
+        "it; it was moved to the row before."
+    )
+    return MotorRecord(record.name, record.time[:-1], record.command[1:], record.rotor_speed[:-1], record.motors)
+
+
 def _of_one(part: MapTable, rotors: int) -> MapTable:
     force, torque = (None if x is None else x / rotors for x in (part.force, part.torque))
     return MapTable(part.name, part.rotor_speed, force, torque, part.motor)
@@ -261,17 +300,14 @@ def _steady(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
 
 
 def _steady_points(speeds, command, voltage, path: Path) -> SteadyPoints:
-    u, omega, v = [], [], []
-    for key, values in speeds.items():
-        given = command.get(f"u{key[5:]}", next(iter(command.values())))
-        good = np.isfinite(values) & np.isfinite(given) & (given > _LEAST_COMMAND)
-        if voltage is not None:
-            good &= np.isfinite(voltage) & (voltage > 0)
-            v.append(voltage[good])
-        u.append(given[good])
-        omega.append(values[good])
-    u = np.concatenate(u)
+    """One point a row: the median of its rotors, which one that is counted double does not move."""
+    omega = np.nanmedian(np.stack(list(speeds.values()), axis=1), axis=1)
+    u = _mean(command)
+    good = np.isfinite(omega) & np.isfinite(u) & (u > _LEAST_COMMAND)
+    if voltage is not None:
+        good &= np.isfinite(voltage) & (voltage > 0)
+    u, omega = u[good], omega[good]
     if len(u) and (u.min() < 0 or u.max() > 1.001):
         unit, factor = ("percent", 100) if u.max() <= 100.5 else ("raw PWM in 0..65535", 65535)
         raise CfbError(f"{path}: the command reaches {u.max():.4g}, which looks like {unit}; divide it by {factor}.")
-    return SteadyPoints(path.stem, u, np.concatenate(omega), np.concatenate(v) if v else None)
+    return SteadyPoints(path.stem, u, omega, None if voltage is None else voltage[good])

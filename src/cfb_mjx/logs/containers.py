@@ -11,8 +11,6 @@ _UNPACK = "unpack it and import what is inside"
 # First bytes, what that is, what to do. Longer marks stand before shorter ones they begin with.
 _MARKS: tuple[tuple[bytes, str, str], ...] = (
     (b"version https://git-lfs.github.com", "a Git LFS pointer, not the file itself", "fetch it with: git lfs pull"),
-    (b"SQLite format 3\0", "a SQLite database, as ROS 2 Humble records bags", f"{_TO_TABLE}"),
-    (b"#ROSBAG V2.0", "a ROS 1 bag", f"convert it with: rosbags-convert, or {_TO_TABLE}"),
     (b"#ROSBAG V1", "a ROS 1 bag of an old version", "migrate it with: rosbag fix"),
     (b"ULog\x01\x12\x35", "a PX4 ULog", f"convert it with ulog2csv and {_TO_TABLE}"),
     (b"\x93NUMPY", "a NumPy array (.npy)", f"save several arrays under their names with numpy.savez, or {_TO_TABLE}"),

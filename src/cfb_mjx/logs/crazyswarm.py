@@ -1,14 +1,16 @@
-"""Reader of ROS 2 bags (MCAP) recorded with Crazyswarm2.
+"""Reader of ROS bags recorded with Crazyswarm2, or with Crazyswarm 1.
 
 The bag describes its messages; what it does not hold are the names of the variables in a custom log topic
 (``crazyflie_interfaces/LogDataGeneric``: header, firmware time stamp in ms, values). They stand in the
 ``crazyflies.yaml`` the server was started with, under ``firmware_logging: custom_topics: NAME: {frequency, vars}`` of
-``all``, the robot's type or the robot (later ones win, as in IMRCLab/crazyswarm2).
+``all``, the robot's type or the robot (later ones win, as in IMRCLab/crazyswarm2). Crazyswarm 1 has them as parameters
+``genericLogTopic_NAME_Variables``.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from collections import defaultdict
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,23 +19,23 @@ import numpy as np
 
 from cfb_mjx.documents import load_yaml, told
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import read_bytes
 from cfb_mjx.logs.assembly import Import, assemble
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.ros_bag import (
     GENERIC,
-    MAGIC,
+    GENERIC_1,
+    IMU,
     ODOMETRY,
     POSE,
     STATUS,
     VARIABLES,
     BagMessage,
-    lacks_checksums,
-    read_messages,
+    read_bag,
 )
 from cfb_mjx.logs.streams import RADIO_WRAP_MS, Stream, ordered, unwrap
 from cfb_mjx.logs.variables import FIELDS, VariableMap, load_mapping
 
+_CRAZYSWARM_1 = re.compile(r"genericLogTopic_(\w+)_Variables")
 _TICK = 0.001  # s: the firmware's stamps are no finer, nor can another clock be brought closer to them
 _OVERTAKING = 0.1  # s by which messages may overtake each other on their way into the bag
 _BIN = 5.0  # s over which the fastest packet is looked for when two clocks are compared
@@ -54,7 +56,7 @@ def read_crazyswarm(
     time of a packet. Without firmware time stamps all rests on the computer's clock.
 
     Args:
-        path: the ``.mcap`` of the bag.
+        path: the ``.mcap``, ``.db3`` or ``.bag``, or the folder of a ROS 2 bag.
         mapping: which variable is which column; a mapping file, or None for ``configs/logs/crazyflie.yaml``. Poses are
             ``pose.x .. pose.qz``, odometry ``odom.x .. odom.wz``, the battery of Status ``status.battery_voltage``.
         topics_yaml: the ``crazyflies.yaml`` in use; without it custom log topics cannot be read.
@@ -66,14 +68,29 @@ def read_crazyswarm(
     """
     path = Path(path)
     mapping = mapping if isinstance(mapping, VariableMap) else load_mapping(mapping)
-    data = read_bytes(path)
-    if not data.startswith(MAGIC):
-        raise CfbError(f"{path}: this is not an MCAP file; give the .mcap inside the bag's folder.")
     notes: list[str] = []
     warnings: list[str] = []
-    messages = read_messages(data, path, warnings)
-    if lacks_checksums(data):
+    bag = read_bag(path, warnings)
+    if not bag.checked:
         notes.append("the bag has no checksums, so damage to values in it would go unnoticed.")
+    try:
+        return _flight(bag.messages, path, mapping, topics_yaml, robot, notes, warnings)
+    except CfbError as error:
+        said = str(error).removeprefix(f"{path}: ")
+        if said == str(error):
+            raise
+        raise CfbError(f"{path}: {bag.storage}: {said}") from None
+
+
+def _flight(
+    messages: list[BagMessage],
+    path: Path,
+    mapping: VariableMap,
+    topics_yaml: str | os.PathLike | None,
+    robot: str | None,
+    notes: list[str],
+    warnings: list[str],
+) -> FlightLog:
     robot = _robot(messages, robot, path)
     by_topic: dict[str, list[BagMessage]] = defaultdict(list)
     for message in messages:
@@ -85,14 +102,16 @@ def read_crazyswarm(
     except AttributeError as error:  # a message of a known name with other fields
         raise CfbError(f"{path}: a message is not what Crazyswarm2 records ({error}); record the bag again.") from None
     tables = [t for t in read if t is not None]
-    if topics_yaml is None and any(group[0].kind == GENERIC for group in by_topic.values()):
-        notes.append("custom log topics were left out: their variable names are in the crazyflies.yaml (topics_yaml=).")
+    if topics_yaml is None and any(group[0].kind in (GENERIC, GENERIC_1) for group in by_topic.values()):
+        notes.append(
+            "custom log topics were left out: their variable names are in the crazyflies.yaml (--topics-yaml FILE)."
+        )
     streams, clock = _one_clock(tables, path, notes, warnings)
     try:
         imported = Import("crazyswarm", streams, None, notes, warnings, {"robot": robot, "clock": clock})
         log = assemble(imported, mapping, path)
     except CfbError as error:
-        left_out = [n for n in notes if "left out: their variable names" in n or "float32" in n]
+        left_out = [n for n in notes if "their variable names" in n or "float32" in n]
         raise CfbError(" ".join([str(error), *left_out])) from None
     used = log.metadata["variables"]
     from_odometry = [f for f in FIELDS if f in used and used[f].get("variables", [""])[0].startswith("odom.")]
@@ -121,13 +140,16 @@ def _robot(messages: list[BagMessage], robot: str | None, path: Path) -> str:
         raise CfbError(f"{path}: there is no robot {robot!r} in the bag; its robots are {listed}.")
     if robot is None and len(robots) != 1:
         what = "holds several robots" if robots else "holds no pose, odometry or log topic like /cf231/pose"
-        raise CfbError(f"{path}: the bag {what} (found: {listed}); choose one with robot=NAME.")
+        raise CfbError(f"{path}: the bag {what} (found: {listed}); choose one with --robot NAME.")
     return robots[0] if robot is None else robot.strip("/")
 
 
 def _custom_topics(path: Path, robot: str) -> dict[str, list[str]]:
     """Variable names per custom topic of the robot."""
     document = load_yaml(path)
+    first = {m[1]: (m[0], v) for k, v in document.items() if (m := _CRAZYSWARM_1.fullmatch(str(k))) is not None}
+    if first:
+        return {name: _names(names, path, key) for name, (key, names) in first.items()}
     robots = _mapping(document.get("robots"), path, "robots")
     own = _mapping(robots.get(robot), path, f"robots.{robot}")
     types, kind = _mapping(document.get("robot_types"), path, "robot_types"), own.get("type")
@@ -143,11 +165,15 @@ def _custom_topics(path: Path, robot: str) -> dict[str, list[str]]:
         where = f"{where}.firmware_logging"
         logging = _mapping(_mapping(block, path, where).get("firmware_logging"), path, where)
         for name, topic in _mapping(logging.get("custom_topics"), path, f"{where}.custom_topics").items():
-            names = _mapping(topic, path, f"{where}.custom_topics.{name}").get("vars")
-            if not isinstance(names, list) or not names or not all(isinstance(v, str) for v in names):
-                raise CfbError(f"{path}: {where}.custom_topics.{name}.vars must list the names of the variables.")
-            topics[str(name)] = names
+            label = f"{where}.custom_topics.{name}"
+            topics[str(name)] = _names(_mapping(topic, path, label).get("vars"), path, f"{label}.vars")
     return topics
+
+
+def _names(names: Any, path: Path, where: str) -> list[str]:
+    if not isinstance(names, list) or not names or not all(isinstance(v, str) for v in names):
+        raise CfbError(f"{path}: {where} must list the names of the variables.")
+    return names
 
 
 def _mapping(value: Any, path: Path, where: str) -> dict:
@@ -167,13 +193,13 @@ def _table(topic: str, group: list[BagMessage], names: dict, path: Path, notes: 
         notes.append(f"{topic}: headers without a time stamp; the time of recording was used.")
         stamps = logged
     ticks, single = None, False
-    if kind == GENERIC:
+    if kind in (GENERIC, GENERIC_1):
         if topic not in names:
             if names:
-                notes.append(f"{topic}: not in topics_yaml; left out.")
+                notes.append(f"{topic}: not in the file of --topics-yaml; left out.")
             return None
         values = _generic(topic, group, names[topic], path)
-        ticks = np.array([m.content.timestamp for m in group], dtype=np.int64)
+        ticks = np.array([getattr(m.content, "timestamp", 0) for m in group], dtype=np.int64)
         ticks, single = None if (ticks == 0).all() else ticks, group[0].float32
     else:
         rows = np.array([_row(kind, m.content) for m in group], dtype=np.float64)
@@ -185,7 +211,8 @@ def _generic(topic: str, group: list[BagMessage], names: list[str], path: Path) 
     for row, message in enumerate(group):
         if len(message.content.values) != len(names):
             raise CfbError(
-                f"{path}: message {row} of {topic} has {len(message.content.values)} values, but topics_yaml names "
+                f"{path}: message {row} of {topic} has {len(message.content.values)} values, but the file of "
+                "--topics-yaml names "
                 f"{len(names)} ({', '.join(names)}); give the crazyflies.yaml that was in use."
             )
     rows = np.array([m.content.values for m in group], dtype=np.float64)
@@ -195,6 +222,9 @@ def _generic(topic: str, group: list[BagMessage], names: list[str], path: Path) 
 def _row(kind: str, message: Any) -> list[float]:
     if kind == STATUS:
         return [message.battery_voltage]
+    if kind == IMU:
+        w, a = message.angular_velocity, message.linear_acceleration
+        return [w.x, w.y, w.z, a.x, a.y, a.z]
     pose = message.pose if kind == POSE else message.pose.pose
     p, q = pose.position, pose.orientation
     row = [p.x, p.y, p.z, q.w, q.x, q.y, q.z]

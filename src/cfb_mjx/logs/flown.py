@@ -43,6 +43,8 @@ def flown_part(log: FlightLog, path: Path, keep_ground: bool = False) -> FlightL
     log = _without_lost_readings(log, warnings)
     if not keep_ground and np.isfinite(log.command).all():
         log = _airborne(log, path, notes)
+    if not all(np.isfinite(getattr(log, f)).all() for f in ("position", "velocity", "quaternion")):
+        return log
     log = _without(log, _leaps(log), "the position leaps by more than the velocity allows", warnings)
     log = _without(log, _frozen(log), "position, velocity and attitude stay the same to the last bit", warnings)
     if not notes and not warnings:
@@ -141,7 +143,8 @@ def _frozen(log: FlightLog) -> np.ndarray:
     same = ~_changes(estimate)
     bad = np.zeros(len(log), dtype=bool)
     runs = [(a, b, log.time[b - 1] - log.time[a - 1]) for a, b in _runs(same) if a > 0]
-    usual = float(np.median([length for *_, length in runs])) if runs else 0.0
+    # Where it is held between packets of its own, most rows repeat.
+    usual = float(np.median([length for *_, length in runs])) if same.mean() > _RARELY else 0.0
     for start, stop, length in runs:
         bad[start:stop] = length > max(_FROZEN, 5 * usual)
     return bad if bad.mean() < _RARELY else np.zeros(len(log), dtype=bool)

@@ -25,7 +25,8 @@ from cfb_mjx.logs.variables import VariableMap, load_mapping
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SHORTEST, _LONGEST = 2e-4, 0.45  # s: no log block is faster or slower than this, so the unit must be another
 _CLOCK = re.compile(
-    r"(?P<name>timestamp|time[_ .]?stamp|tick|time|t|stamp|clock|elapsed)[_ .]*[\[(]?(?P<unit>s|sec|seconds|ms|us|ns)?[\])]?",
+    r"(?P<name>timestamp|time[_ .]?stamp|tick|time|t|stamp|clock|elapsed)"
+    r"[_ .]*[\[(]?(?P<unit>s|sec|seconds|ms|us|ns)?[\])]?",
     re.IGNORECASE,
 )
 _CLOCKS = ("timestamp", "timestamp", "tick", "time", "t", "stamp", "clock", "elapsed")
@@ -179,7 +180,9 @@ def _of_long_form(table, name_column, value_column, path, mapping, time_unit, no
     return streams
 
 
-def _seconds(ticks: np.ndarray, clock: Clock, asked: str | None, path: Path, notes: list[str]) -> tuple[np.ndarray, str]:
+def _seconds(
+    ticks: np.ndarray, clock: Clock, asked: str | None, path: Path, notes: list[str]
+) -> tuple[np.ndarray, str]:
     """Time in s, and the unit it was read in."""
     unit = asked or clock.unit or _guessed_unit(ticks, clock)
     if unit == "ms" and len(ticks) and (ticks == np.rint(ticks)).all() and np.abs(ticks).max() < 2.0**62:

@@ -10,6 +10,7 @@ from typing import Any
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
 from cfb_mjx.logs import containers, crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, usd_card
+from cfb_mjx.logs.fixes import fix_of
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.flown import flown_part
 from cfb_mjx.logs.validation import validate
@@ -22,7 +23,9 @@ _OPTIONS = {
     "crazyswarm": ("mapping", "topics_yaml", "robot"),
     "radio_csv": ("mapping", "time_unit"),
 }
-_FLAGS = {name: "--" + name.replace("_", "-") for name in ("motor_shift", "mapping", "topics_yaml", "robot", "time_unit")}
+_FLAGS = {
+    name: "--" + name.replace("_", "-") for name in ("motor_shift", "mapping", "topics_yaml", "robot", "time_unit")
+}
 
 
 def read_log(
@@ -30,17 +33,21 @@ def read_log(
     format: str | None = None,
     *,
     keep_ground: bool = False,
+    fix: Sequence[str] = (),
     **options: Any,
 ) -> FlightLog:
     """Read and validate a flight log.
 
     Args:
-        path: the file; the folder of a ROS 2 bag; or several tables of one flight, as cfclient writes one per log block.
+        path: the file; the folder of a ROS 2 bag; or several tables of one flight, as cfclient writes one per log
+        block.
         format: one of `FORMATS`; None detects it from the file's content. ``mcap`` is this library's own, ``tabular``
             and ``idsia`` are parquet or csv, ``usd_card`` is the Crazyflie's micro SD card binary, ``crazyswarm`` a
             ROS bag (MCAP, sqlite3 or ROS 1), ``radio_csv`` a table with firmware variable names as headers.
         keep_ground: leave in what is not flight: standing, take-off, landing, being carried. This library's own files
             are never cut.
+        fix: changes of convention to make, in this order, as a refusal names them: ``velocity-frame=body``
+            (`cfb_mjx.logs.fixes`). Nothing of the kind is done unasked.
         **options: ``motor_shift`` for ``idsia`` (`cfb_mjx.logs.read_idsia`); ``mapping`` for ``usd_card``,
             ``crazyswarm`` and ``radio_csv``; ``topics_yaml`` and ``robot`` for ``crazyswarm``
             (`cfb_mjx.logs.read_crazyswarm`); ``time_unit`` for ``radio_csv`` (`cfb_mjx.logs.read_radio_csv`). An
@@ -67,7 +74,13 @@ def read_log(
     if unknown := sorted(set(options) - set(_OPTIONS.get(format, ()))):
         flags = ", ".join(_FLAGS.get(name, name) for name in unknown)
         raise CfbError(f"{first}: the {format} format has no option {flags}; leave it out.")
+    changes = [fix_of(name) for name in fix]
     log = _read(paths, format, options, tables)
+    for change in changes:
+        log = change.apply(log)
+    if changes:
+        told = [f"--fix {change.name}: {change.words}, as asked." for change in changes]
+        log = log.replace(metadata={"notes": [*(log.metadata.get("notes") or ()), *told]})
     if format in ("mcap", "idsia"):  # cut when it was imported; cut by its own rules
         return validate(log, first)
     return validate(flown_part(log, first, keep_ground), first)
@@ -100,6 +113,8 @@ def _detect(paths: list[Path], options: dict[str, Any], tables: dict[Path, tabul
             return "crazyswarm"
         raise CfbError(f"{path}: this is a folder and not one of a ROS 2 bag; give the log itself.")
     head = read_bytes(path, 64)
+    if head.startswith((ros_bag.SQLITE, ros_bag.ROS1)):
+        return "crazyswarm"
     if head.startswith(usd_card.MAGIC):
         return "usd_card"
     if head.startswith(_MCAP_MAGIC):

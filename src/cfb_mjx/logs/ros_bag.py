@@ -1,4 +1,9 @@
-"""ROS 2 bags stored as MCAP: telling them from other files, decoding the messages that hold a flight."""
+"""ROS bags: telling them from other files, decoding the messages that hold a flight.
+
+MCAP, the storage of ROS 2 since Iron, is read with its checksums; sqlite3 (Humble and before) and ROS 1 have none and
+are
+read by the library `rosbags <https://gitlab.com/ternaris/rosbags>`_.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +14,27 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.files import read_bytes, scratch
+
+SQLITE, ROS1 = b"SQLite format 3\0", b"#ROSBAG V2.0"
+_LOG_DATA = "std_msgs/Header header\nuint32 timestamp\nfloat{}[] values\n"
+"""Bags in sqlite3 do not describe their messages; this one is Crazyswarm2's own."""
 
 MAGIC = b"\x89MCAP0\r\n"
 GENERIC = "crazyflie_interfaces/LogDataGeneric"
+GENERIC_1 = "crazyflie_driver/GenericLogData"
+"""Of Crazyswarm 1: without the firmware's time stamp."""
 POSE, ODOMETRY, STATUS = "geometry_msgs/PoseStamped", "nav_msgs/Odometry", "crazyflie_interfaces/Status"
+IMU = "sensor_msgs/Imu"
 _XYZ_QUATERNION = ("x", "y", "z", "qw", "qx", "qy", "qz")
 # Message type to the variables made of it; those of a custom log topic come from the crazyflies.yaml.
 VARIABLES = {
     GENERIC: (),
+    GENERIC_1: (),
     POSE: tuple(f"pose.{c}" for c in _XYZ_QUATERNION),
     ODOMETRY: tuple(f"odom.{c}" for c in (*_XYZ_QUATERNION, "vx", "vy", "vz", "wx", "wy", "wz")),
     STATUS: ("status.battery_voltage",),
+    IMU: tuple(f"imu.{c}" for c in ("wx", "wy", "wz", "ax", "ay", "az")),
 }
 
 
@@ -49,7 +64,9 @@ def recognises(path: str | os.PathLike) -> bool:
             summary = file.read()
     if not footer.endswith(MAGIC):
         return head[21 : 21 + int.from_bytes(head[17:21], "little")] == b"ros2"
-    return b"ros2" in summary and any(kind.replace("/", "/msg/").encode() in summary for kind in VARIABLES)
+    # An IMU alone is anybody's.
+    kinds = [kind for kind in VARIABLES if kind != IMU]
+    return b"ros2" in summary and any(kind.replace("/", "/msg/").encode() in summary for kind in kinds)
 
 
 def read_messages(data: bytes, path: Path, warnings: list[str]) -> list[BagMessage]:
@@ -93,6 +110,85 @@ def read_messages(data: bytes, path: Path, warnings: list[str]) -> list[BagMessa
             f"{path}: {', '.join(sorted(foreign))} is not encoded as CDR with ros2msg descriptions, which is what this "
             "library reads; record the bag again with a newer rosbag2 (storage mcap)."
         )
+    return out
+
+
+class Bag(NamedTuple):
+    """Messages of a bag, what kind of file it is, and whether its values are covered by checksums."""
+
+    messages: list[BagMessage]
+    storage: str
+    checked: bool
+
+
+def read_bag(path: Path, warnings: list[str]) -> Bag:
+    """Messages of the types in `VARIABLES`, of a file or of the folder of a ROS 2 bag.
+
+    Raises:
+        CfbError: nothing could be read. What is lost after something could be read goes into ``warnings``.
+    """
+    if path.is_dir():
+        return _read_folder(path, warnings)
+    head = read_bytes(path, 16)
+    if head.startswith(MAGIC):
+        data = read_bytes(path)
+        return Bag(read_messages(data, path, warnings), "a ROS 2 bag (MCAP)", not lacks_checksums(data))
+    if head.startswith(SQLITE):
+        return Bag(_by_rosbags(path, ".db3", warnings), "a ROS 2 bag in sqlite3 storage", False)
+    if head.startswith(ROS1):
+        return Bag(_by_rosbags(path, ".bag", warnings), "a ROS 1 bag", False)
+    raise CfbError(f"{path}: this is no ROS bag; give the .mcap, .db3 or .bag, or the folder of a ROS 2 bag.")
+
+
+def _read_folder(path: Path, warnings: list[str]) -> Bag:
+    files = sorted(f for f in path.iterdir() if f.suffix in (".mcap", ".db3"))
+    if not files:
+        packed = ", ".join(sorted(f.name for f in path.iterdir() if f.suffix == ".zstd"))
+        way = f"unpack {packed} with unzstd" if packed else "give the folder that the recorder wrote"
+        raise CfbError(f"{path}: this folder of a ROS 2 bag holds no .mcap and no .db3; {way}.")
+    bags = [read_bag(file, warnings) for file in files]
+    return Bag([m for bag in bags for m in bag.messages], bags[0].storage, all(bag.checked for bag in bags))
+
+
+def _by_rosbags(path: Path, suffix: str, warnings: list[str]) -> list[BagMessage]:
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    kind = "crazyflie_interfaces/msg/LogDataGeneric"
+    stores = {}
+    for bits in (32, 64):
+        stores[bits] = get_typestore(Stores.ROS2_HUMBLE)
+        stores[bits].register(get_types_from_msg(_LOG_DATA.format(bits), kind))
+    out: list[BagMessage] = []
+    try:
+        with scratch() as folder:
+            # The library goes by the file's ending.
+            link = Path(folder) / f"bag{suffix}"
+            link.symlink_to(path.resolve())
+            with AnyReader([link], default_typestore=stores[32]) as reader:
+                described = any(c.msgdef.data for c in reader.connections)
+                wanted = [
+                    c
+                    for c in reader.connections
+                    if (name := c.msgtype.replace("/msg/", "/")) in VARIABLES
+                    and c.topic.count("/") >= 2
+                    # Its fields differ between versions.
+                    and (described or name != STATUS)
+                ]
+                for connection, logged, raw in reader.messages(connections=wanted):
+                    content, single = reader.deserialize(raw, connection.msgtype), False
+                    if connection.msgtype == kind:
+                        single = content.values.dtype.itemsize == 4
+                        if not described and single and len(stores[32].serialize_cdr(content, kind)) < len(raw) - 4:
+                            content, single = stores[64].deserialize_cdr(raw, kind), False
+                    name = connection.msgtype.replace("/msg/", "/")
+                    out.append(BagMessage(connection.topic, name, logged, content, single))
+    except Exception as error:  # of damaged bytes come errors of sqlite, struct, codecs and lookups
+        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
+        if not out:
+            what = "ROS 2 bag in sqlite3 storage" if suffix == ".db3" else "ROS 1 bag"
+            raise CfbError(f"{path}: this {what} cannot be read ({reason}); copy it again.") from None
+        warnings.append(f"the bag is damaged or cut short ({reason}); what follows in it was left out.")
     return out
 
 

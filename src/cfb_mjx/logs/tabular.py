@@ -162,10 +162,25 @@ def from_columns(table: Table, path: Path) -> FlightLog:
         values = stack(names) if names[0] in table else None
         # A column without a single value means "not measured", as does a missing one.
         fields[field] = None if values is None or np.isnan(values).all() else values
+    notes = list(getattr(table, "notes", ()))
+    if fields["battery_voltage"] is not None and np.isnan(fields["battery_voltage"]).any():
+        fields["battery_voltage"] = _held(fields["battery_voltage"])
+        notes.append("vbat has values in some rows only; each was held until the next.")
     if np.isfinite(fields["time"]).all() and np.abs(fields["time"]).max(initial=0.0) < 1e12:
         fields["time"] = quantise_time(fields["time"])
     metadata = {"name": path.stem, "source": path.name, "format": "tabular", "observation_delay": None}
+    if notes:
+        metadata |= {
+            "warnings": [n for n in notes if "left out" in n],
+            "notes": [n for n in notes if "left out" not in n],
+        }
     return FlightLog(**fields, metadata=metadata)
+
+
+def _held(values: np.ndarray) -> np.ndarray:
+    """The last known value of each row; before the first one that one."""
+    known = np.flatnonzero(~np.isnan(values))
+    return values[known[np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)]]
 
 
 def write_tabular(log: FlightLog, path: str | os.PathLike) -> None:

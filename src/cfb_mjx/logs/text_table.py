@@ -1,4 +1,4 @@
-"""Tables in text files as people's scripts leave them: delimiter, decimal comma, comments, encoding, a cut last line."""
+"""Tables in text as people's scripts leave them: delimiter, decimal comma, comments, encoding, a cut last line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,24 @@ from pathlib import Path
 
 from cfb_mjx.errors import CfbError
 
-NO_VALUE = ("", "nan", "NaN", "NAN", "-nan", "None", "none", "null", "NULL", "Null", "NA", "N/A", "n/a", "<NA>", "-", "--")
+NO_VALUE = (
+    "",
+    "nan",
+    "NaN",
+    "NAN",
+    "-nan",
+    "None",
+    "none",
+    "null",
+    "NULL",
+    "Null",
+    "NA",
+    "N/A",
+    "n/a",
+    "<NA>",
+    "-",
+    "--",
+)
 _BOMS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
 _DELIMITERS = (",", ";", "\t", "|")
 _LOOKED_AT = 50  # lines that decide on the delimiter
@@ -44,7 +61,8 @@ def read_text_table(path: Path, data: bytes, notes: list[str]):
     header = _cells(lines[0], delimiter)
     if len(header) > 1 and all(_is_number(cell) for cell in header):
         raise CfbError(
-            f"{path}: the first line holds numbers, so the table has no header; write the columns' names in its first line."
+            f"{path}: the first line holds numbers, so the table has no header; write the columns' names in its "
+            "first line."
         )
     rows = _whole_rows(path, lines, delimiter, len(header), ended, notes)
     comma = delimiter != "," and any(_DECIMAL_COMMA.fullmatch(c) for row in rows[:5] for c in _cells(row, delimiter))
@@ -94,8 +112,9 @@ def _decoded(path: Path, data: bytes, notes: list[str]) -> str:
     encoding = next((name for mark, name in _BOMS if data.startswith(mark)), None)
     if encoding is None and b"\0" in data[:1000]:
         # Every second byte of Latin text in UTF-16 is zero.
-        if len(data) > 3 and (data[1] == 0) != (data[0] == 0):
-            encoding = "utf-16-le" if data[1] == 0 else "utf-16-be"
+        zeros = [sum(byte == 0 for byte in data[i:1000:2]) / len(data[i:1000:2] or b"1") for i in (0, 1)]
+        if max(zeros) > 0.8 and min(zeros) < 0.2:
+            encoding = "utf-16-le" if zeros[1] > zeros[0] else "utf-16-be"
         else:
             raise CfbError(f"{path}: this is neither a text table nor another format this library knows.")
     if encoding is not None:
@@ -109,9 +128,7 @@ def _decoded(path: Path, data: bytes, notes: list[str]) -> str:
         return data.decode("utf-8")
     except UnicodeDecodeError:
         if sum(byte < 9 or 13 < byte < 32 for byte in data[:1000]) > 5:
-            raise CfbError(
-                f"{path}: this is neither a text table nor another format this library knows."
-            ) from None
+            raise CfbError(f"{path}: this is neither a text table nor another format this library knows.") from None
         return data.decode("latin-1")
 
 

@@ -7,7 +7,7 @@ import os
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs import plausibility, rotation
+from cfb_mjx.logs import gate, rotation
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.tabular import COLUMNS, OPTIONAL_COLUMNS
 
@@ -15,6 +15,10 @@ _NORM_TOLERANCE = 0.05
 _COMMAND_TOLERANCE = 1e-3
 # No Crazyflie rotor turns faster than about 2900 rad/s; twice that can only be another unit or a bad packet.
 _ROTOR_SPEED_LIMIT = 6000.0
+_FASTEST = 1.5e-4  # s between rows: no sensor of a Crazyflie is read more than 4000 times a second
+# No flight of a Crazyflie has more: an arena of 10 km, twice the range of gyro and accelerometer.
+_LIMITS = {"position": 1e4, "velocity": 60.0, "body_rate": 70.0, "specific_force": 320.0}
+_UNITS = {"position": "m", "velocity": "m/s", "body_rate": "rad/s", "specific_force": "m/s^2"}
 
 
 def validate(log: FlightLog, path: str | os.PathLike) -> FlightLog:
@@ -24,10 +28,14 @@ def validate(log: FlightLog, path: str | os.PathLike) -> FlightLog:
         log: the log as read.
         path: the file to name in messages.
 
+    Returns:
+        The log. Metadata adds ``checks``, what its signals say about each other; where they contradict each other and
+        no change is known that makes them agree, a warning says so.
+
     Raises:
         CfbError: fewer than two rows; time that does not increase; NaN or infinity in a required column; quaternions
-            that are not unit; commands or rotor speeds out of range; and, when the signals are large enough to tell,
-            a wrong unit or axis convention (see `cfb_mjx.logs.plausibility`).
+            that are not unit; values out of range; signals that contradict each other where a change of unit, axes or
+            order makes them agree (see `cfb_mjx.logs.gate`).
     """
 
     def fail(problem: str):
@@ -45,8 +53,15 @@ def validate(log: FlightLog, path: str | os.PathLike) -> FlightLog:
             f"vbat has a median of {np.median(log.battery_voltage):.0f}, which looks like millivolts; divide it by 1000"
         )
     log = log.replace(quaternion=rotation.tidy(log.quaternion), command=np.clip(log.command, 0.0, 1.0))
-    if problem := plausibility.first_problem(log):
-        fail(problem)
+    verdict = gate.judge(log)
+    if verdict.remedy or (verdict.problem and verdict.certain):
+        fail(verdict.sentence())
+    # A file of one's own that was checked before comes back bit for bit.
+    _magnitudes(log, fail)
+    if verdict.problem:
+        said = f"signals contradict each other: {verdict.problem}; no change of unit, axes or order makes them agree."
+        if said not in (log.metadata.get("warnings") or ()):
+            log = log.replace(metadata={"warnings": [*(log.metadata.get("warnings") or ()), said]})
     return log
 
 
@@ -81,7 +96,17 @@ def _time(log: FlightLog, fail) -> None:
     median = float(np.median(steps))
     if median >= 0.5:
         unit, factor = ("milli", "1e3") if median < 500 else ("micro", "1e6") if median < 5e5 else ("nano", "1e9")
-        fail(f"the median interval of t is {median:g} s, so t looks like {unit}seconds; divide it by {factor}")
+        flag = f"{unit[0] if unit != 'micro' else 'u'}s"
+        fail(
+            f"the median interval of t is {median:g} s, so t looks like {unit}seconds; divide it by {factor} (--fix "
+            f"time-unit={flag})"
+        )
+    if median < _FASTEST:
+        fits = [u for u, s in (("min", 60.0), ("h", 3600.0)) if _FASTEST * 5 <= median * s <= 0.2]
+        hint = (
+            f", so t looks like {dict(min='minutes', h='hours')[fits[0]]} (--fix time-unit={fits[0]})" if fits else ""
+        )
+        fail(f"the median interval of t is {median:.3g} s, faster than any log{hint}; give t in seconds")
 
 
 def _quaternion_norm(log: FlightLog, fail) -> None:
@@ -99,10 +124,11 @@ def _command(log: FlightLog, fail) -> None:
     low, high = float(log.command.min()), float(log.command.max())
     if low >= -_COMMAND_TOLERANCE and high <= 1.0 + _COMMAND_TOLERANCE:
         return
-    if low >= -_COMMAND_TOLERANCE and high > 100.5:
-        fail(f"u1..u4 reach {high:.0f}, which looks like raw PWM in 0..65535; divide the commands by 65535")
-    if low >= -_COMMAND_TOLERANCE and float(np.median(log.command)) > 2.0:
-        fail(f"u1..u4 reach {high:.1f}, which looks like percent; divide the commands by 100")
+    if low >= -_COMMAND_TOLERANCE and float(np.median(log.command)) > 1.0:
+        force = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
+        looks = gate.command_unit(log.command, force if force > 1.0 else 9.81)
+        if looks is not None:
+            fail(f"u1..u4 reach {high:.4g}: they {looks}")
     row, motor = np.unravel_index(int(np.argmax(np.abs(log.command - 0.5))), log.command.shape)
     fail(
         f"u{motor + 1} is {log.command[row, motor]:.4g} in {_at(log, int(row))}, outside [0, 1]; "
@@ -131,3 +157,16 @@ def _rotor_speed(log: FlightLog, fail) -> None:
         f"omega{motor + 1} is {speed[row, motor]:.0f} rad/s in {_at(log, int(row))}, faster than any rotor turns; "
         "leave invalid samples empty (NaN)"
     )
+
+
+def _magnitudes(log: FlightLog, fail) -> None:
+    for field, limit in _LIMITS.items():
+        values = np.abs(getattr(log, field))
+        if values.max() > limit:
+            row = int(np.argmax(values.max(axis=1)))
+            rows = int((values > limit).any(axis=1).sum())
+            fail(
+                f"{field.replace('_', ' ')} reaches {values.max():.4g} {_UNITS[field]} in {_at(log, row)}, "
+                "which no flight "
+                f"has ({rows} rows in all); drop those rows, or give the right unit"
+            )

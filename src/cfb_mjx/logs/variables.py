@@ -103,10 +103,15 @@ class VariableMap:
             listed = ", ".join(sorted(available)) or "none"
             raise CfbError(
                 f"{path}: no logged variables for {wanted}. Found: {listed}. Log the missing ones too, or say under "
-                "which names and units they are with --mapping FILE, a changed copy of configs/logs/crazyflie.yaml (see "
+                "which names and units they are with --mapping FILE, a changed copy of "
+                "configs/logs/crazyflie.yaml (see "
                 "docs/logs.md)."
             )
         return found
+
+    def logged_parts(self, field: str, available: Collection[str]) -> list[str]:
+        """Variables of a field that were logged without the others that it takes."""
+        return sorted({v for c in self.choices.get(field, ()) for v in c.variables if v in available})
 
     def _wanted(self, field: str, available: Collection[str]) -> str:
         options = [c for c in self.choices.get(field, ()) if not c.derived]

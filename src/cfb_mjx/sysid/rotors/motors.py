@@ -81,8 +81,8 @@ class GroupFit:
             there are extras it is the nearest to them (`common_lag`).
         unidentifiable: what the data cannot tell: name to explanation.
         tests: of the extras, also of those that were not asked for.
-        extras: the fit holds: those asked for, and those of spin-up/down and dead time that the data support, without
-            which the other constants would be wrong.
+        extras: the fit holds: those asked for, and those that the data support, without which the other constants
+            would be wrong.
         optimum: of the fit with those extras.
     """
 
@@ -140,7 +140,8 @@ def fit_motors(
     Args:
         records: flights (`record_of`) or bench steps; run with x64 enabled.
         nominal: where to start, and the value of the offset unless it is fitted.
-        offset: fit the steady rotor speed at zero command (``motor_speed_offset``).
+        offset: fit the steady rotor speed at zero command (``motor_speed_offset``) also where the data do not ask for
+            it.
         asymmetric: separate time constants for spin-up and spin-down.
         dead_time: fit the time from a command to its first effect; any number, not a multiple of the row interval.
         per_motor: fit every motor on its own as well.
@@ -204,7 +205,11 @@ def _decide(data: MotorData, asked: frozenset, guess: np.ndarray) -> tuple[Optim
     known = {all_of: whole} | {all_of - {e}: fit for e, fit in smaller.items()}
     best = known[extras] if extras in known else maximise(data, _free(extras), guess)
     if "offset" not in asked:
-        tests.append(_test("offset", maximise(data, _free(extras | {"offset"}), best.vector), best))
+        shifted = maximise(data, _free(extras | {"offset"}), best.vector)
+        tests.append(_test("offset", shifted, best))
+        if tests[-1].supported:
+            # Held at zero where the data contradict it, it would bend the gain and with it the lag.
+            best, extras = shifted, extras | {"offset"}
     return best, tuple(tests), extras
 
 

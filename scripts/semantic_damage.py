@@ -1,0 +1,97 @@
+"""Let the signals of good flights contradict each other and see what the gate makes of it; note the result in a page.
+
+    python scripts/semantic_damage.py [FLIGHT...] [-o docs/logs.md]
+
+FLIGHT are recordings of real drones or of anybody's simulator; without any the shipped ones are used. Every
+contradiction
+of ``tests/logs/contradictions.py`` is put into 20 of them, spread over what was given; all are read undamaged for false
+alarms. Exits with status 1 if fewer than 95 % of what shows is noticed, or if an undamaged flight is doubted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests" / "logs"))
+from contradictions import CONTRADICTIONS, shows  # noqa: E402
+from marked_block import write_block  # noqa: E402
+
+from cfb_mjx.errors import CfbError  # noqa: E402
+from cfb_mjx.logs import FlightLog, read_log, validate  # noqa: E402
+
+
+def noticed(log: FlightLog) -> str | None:
+    """What the gate says, or None."""
+    try:
+        checked = validate(log, "flight")
+    except CfbError as error:
+        return str(error)
+    doubts = [w for w in checked.metadata.get("warnings") or () if "contradict" in w]
+    return doubts[0] if doubts else None
+
+
+def main() -> int:
+    """Run the study and write the block of the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("flights", nargs="*", type=Path)
+    parser.add_argument("-n", type=int, default=20, help="flights to damage")
+    parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "logs.md")
+    arguments = parser.parse_args()
+    paths = arguments.flights or sorted((ROOT / "data" / "flight_logs").glob("*.mcap"))
+    logs, alarms = [], []
+    for path in paths:
+        try:
+            log = read_log(path)
+        except CfbError as error:
+            alarms.append(str(error))
+            continue
+        if noticed(log) or any("contradict" in w for w in log.metadata.get("warnings") or ()):
+            alarms.append(f"{path.name}: {noticed(log)}")
+        else:
+            logs.append(log)
+    chosen = [logs[i] for i in np.unique(np.linspace(0, len(logs) - 1, arguments.n).round().astype(int))]
+    counts: dict[str, list[int]] = defaultdict(
+        lambda: [0, 0, 0, 0]
+    )  # shows, noticed, right advice; noticed though gentle
+    for name, contradiction in CONTRADICTIONS.items():
+        for log in chosen:
+            said = noticed(contradiction.change(log))
+            if not shows(log, contradiction):
+                counts[name][3] += said is not None
+                continue
+            counts[name][0] += 1
+            counts[name][1] += said is not None
+            right = said is not None and any(a in said for a in contradiction.advice)
+            counts[name][2] += right
+            if not right:
+                print(f"{name} in {log.name}: {said}")
+    total = np.array(list(counts.values())).sum(axis=0)
+    rows = [f"| {name} | {c[0]} | {c[1]} | {c[2]} |" for name, c in counts.items()]
+    text = "\n".join(
+        [
+            f"{len(CONTRADICTIONS)} contradictions in {len(chosen)} flights each: of {total[0]} that show (the "
+            "flight moves "
+            f"along the axis in question) {total[1]} were noticed ({total[1] / total[0]:.1%}), {total[2]} with "
+            "the right "
+            f"advice ({total[2] / total[0]:.1%}). False alarms: {len(alarms)} of {len(paths)} undamaged flights.",
+            "",
+            "| contradiction | shows in | noticed | right advice |",
+            "|---|---:|---:|---:|",
+            *rows,
+        ]
+    )
+    print(text)
+    for alarm in alarms:
+        print("FALSE ALARM", alarm)
+    write_block(arguments.output, "contradictions", text)
+    return int(total[1] < 0.95 * total[0] or len(alarms) > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

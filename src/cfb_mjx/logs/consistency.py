@@ -1,0 +1,260 @@
+"""What a log's signals say about each other: displacement against velocity, turned attitude against gyro, velocity
+against accelerometer, gravity, and the motors against how the drone turns.
+
+Every comparison is over short windows, per axis, with a lag of its own: a slope, a correlation, and how much of both
+signals stays unexplained. An axis that hardly moves decides nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import numpy as np
+
+from cfb_mjx.logs import rotation
+from cfb_mjx.logs.alignment import motor_spectra
+from cfb_mjx.logs.flight_log import FlightLog
+
+GRAVITY = 9.81
+CONTRADICTS = 0.2
+"""Unexplained share from which two signals contradict each other: in 335 good flights it is at most 0.07."""
+_LAGS = (0.0, 0.01, 0.02, 0.04, 0.08, 0.12)  # s by which pose and velocity may be late
+_MOST_WINDOWS = 4000
+_TRIMMED = 0.1  # share of the worst windows that does not count: a glitch is no wrong unit
+_RARE = 0.03  # share of the liveliest windows that do not make an axis move
+_FEWEST = 10
+_PUSHES, _CROSSED = 0.4, 0.65  # correlations: with motion along the axis; against motion along the other
+_FAST = 5.0  # rad/s: rotations are compared over half the time
+ORDER = (0, 1, 2, 3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Relation:
+    """Two signals that should be the same, along one axis.
+
+    Attributes:
+        name: ``displacement``, ``attitude``, ``velocity``, ``gravity``, ``upright`` or ``drag``.
+        axis: ``x``, ``y``, ``z``; empty for gravity and upright.
+        slope: of the first, measured one on the second, which is integrated.
+        lag: s by which the first is late.
+        correlation: of the two.
+        unexplained: mean square of their difference over the mean of their mean squares; 0 agree, 2 have nothing in
+            common, 4 are opposite. Of drag, which only has a sign: twice its correlation where that is wrong.
+        moves: whether the axis moves enough to tell.
+    """
+
+    name: str
+    axis: str
+    slope: float
+    lag: float
+    correlation: float
+    unexplained: float
+    moves: bool
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the two plainly are not the same."""
+        return self.moves and self.unexplained > CONTRADICTS
+
+
+@dataclasses.dataclass(frozen=True)
+class Motors:
+    """How well roll and pitch follow from the motors, by which motor stands in which column.
+
+    Attributes:
+        agreement: order of the columns (M1 to M4 stand in these, counted from 0) and sign of the command to the mean
+            correlation of both axes, -1 to 1. Empty without data.
+        source: ``rotor_speed`` or ``command``.
+    """
+
+    agreement: dict[tuple[tuple[int, ...], int], float]
+    source: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Changes of a measured signal over windows, beside the integral of the one that should be its derivative.
+
+    Attributes:
+        time: (n,) s, where the windows begin.
+        width: of the windows, s.
+        lag: s by which the measured signal is late.
+        integrated: (n, 3). ``measured``: (n, 3).
+    """
+
+    time: np.ndarray
+    width: float
+    lag: float
+    integrated: np.ndarray
+    measured: np.ndarray
+
+
+_LEAST = {"displacement": 0.013, "attitude": 0.018, "velocity": 0.065}
+"""rms of either side, in m, rad and m/s over a window, from which an axis moves."""
+
+
+def comparisons(log: FlightLog) -> dict[str, Comparison]:
+    """``displacement``, m, ``attitude``, rad, and ``velocity``, m/s, over windows.
+
+    Those that the log is too short for are left out.
+    """
+    q = rotation.tidy(log.quaternion)
+    turns = 0.05 if np.sqrt(np.mean(np.sum(log.body_rate**2, axis=1))) > _FAST else 0.1
+
+    def turned(a, b):
+        return rotation.rotation_vector(rotation.multiply(rotation.conjugate(q[a]), q[b]))
+
+    found = {
+        "displacement": _compared(log, 0.2, log.velocity, lambda a, b: log.position[b] - log.position[a]),
+        "attitude": _compared(log, turns, log.body_rate, turned),
+        "velocity": _compared(log, 0.2, _acceleration(log, q), lambda a, b: log.velocity[b] - log.velocity[a], True),
+    }
+    return {name: c for name, c in found.items() if c is not None}
+
+
+def kinematics(log: FlightLog) -> list[Relation]:
+    """The relations of pose, velocity, gyro and accelerometer, thirteen in all; fewer where the log is too short."""
+    q = rotation.tidy(log.quaternion)
+    found = [r for name, c in comparisons(log).items() for r in _relations(name, c)]
+    return [*found, *_gravity(log, _acceleration(log, q)), *_drag(log, q)]
+
+
+def when(log: FlightLog, relation: Relation) -> str:
+    """`` between A and B s``: where a relation of three axes does not hold; empty for others."""
+    compared = comparisons(log).get(relation.name)
+    if compared is None:
+        return ""
+    axis = "xyz".index(relation.axis)
+    off = np.abs(compared.integrated - compared.measured)[:, axis] > _LEAST[relation.name]
+    times = compared.time[off]
+    return f" between {times[0]:.1f} and {times[-1] + compared.width:.1f} s" if len(times) else ""
+
+
+def _acceleration(log: FlightLog, q: np.ndarray) -> np.ndarray:
+    return rotation.to_world(q, log.specific_force) - [0.0, 0.0, GRAVITY]
+
+
+def _compared(log, width, integrand, change, centred=False) -> Comparison | None:
+    """``change(a, b)`` between rows beside the integral of ``integrand``, at the lag at which they are most alike."""
+    time, step = log.time, log.nominal_interval
+    gap = np.concatenate([[0], np.cumsum(np.diff(time) > log.gap_threshold)])
+    steps = np.diff(time)[:, None]
+    integral = np.concatenate([np.zeros((1, 3)), np.cumsum((integrand[1:] + integrand[:-1]) / 2 * steps, axis=0)])
+    width = max(width, 3 * step)
+    stride = max(1, round(width / 2 / step), len(time) // _MOST_WINDOWS)
+    first = np.arange(0, len(time), stride)
+    last = np.searchsorted(time, time[first] + width - step / 2)
+    best: tuple[float, Comparison] | None = None
+    for late in dict.fromkeys(round(lag / step) for lag in _LAGS):
+        inside = last + late < len(time)
+        a, b = first[inside], last[inside]
+        whole = gap[a] == gap[b + late]
+        a, b = a[whole], b[whole]
+        if len(a) < _FEWEST:
+            continue
+        x, y = integral[b] - integral[a], change(a + late, b + late)
+        if centred:
+            # A tilted attitude or a biased accelerometer adds the same to every window.
+            x, y = x - np.median(x, axis=0), y - np.median(y, axis=0)
+        cost = float(np.sum(_trimmed(np.sum((x - y) ** 2, axis=1))))
+        if best is None or cost < best[0]:
+            best = cost, Comparison(time[a], width, late * step, x, y)
+    return None if best is None else best[1]
+
+
+def _relations(name: str, compared: Comparison) -> list[Relation]:
+    found = []
+    for axis, (u, v) in enumerate(zip(compared.integrated.T, compared.measured.T, strict=True)):
+        keep = _kept((u - v) ** 2)
+        uu, vv, uv = (float(np.mean(p[keep])) for p in (u * u, v * v, u * v))
+        # Not of the kept windows: where the two contradict each other, the liveliest are those that were left out.
+        both = u * u + v * v
+        usual = both <= np.quantile(both, 1 - _RARE)
+        size = float(np.sqrt(max(np.mean(p[usual] ** 2) for p in (u, v))))
+        found.append(
+            Relation(
+                name,
+                "xyz"[axis],
+                uv / uu if uu > 0 else 0.0,
+                compared.lag,
+                uv / np.sqrt(uu * vv) if uu * vv > 0 else 0.0,
+                2 * float(np.mean((u - v)[keep] ** 2)) / max(uu + vv, 1e-300),
+                size > _LEAST[name],
+            )
+        )
+    return found
+
+
+def _kept(values: np.ndarray) -> np.ndarray:
+    return values <= np.quantile(values, 1 - _TRIMMED)
+
+
+def _trimmed(values: np.ndarray) -> np.ndarray:
+    return values[_kept(values)]
+
+
+def _gravity(log: FlightLog, force: np.ndarray) -> list[Relation]:
+    """Over a whole flight the accelerometer reads gravity and the change of the velocity; free fall is short."""
+    if log.duration < 1.0:
+        return []
+    steps = np.diff(log.time)
+    whole = steps <= log.gap_threshold
+    mean = np.sum(((force[1:] + force[:-1]) / 2 * steps[:, None])[whole], axis=0) / np.sum(steps[whole])
+    changes = np.sum(np.diff(log.velocity, axis=0)[whole], axis=0) / np.sum(steps[whole])
+    off = mean - changes
+    read = float(mean[2] + GRAVITY)
+    up = float(np.median(log.specific_force[:, 2])) / GRAVITY
+    return [
+        Relation("gravity", "", read / GRAVITY, 0.0, 1.0, float(off @ off) / GRAVITY**2, True),
+        Relation("upright", "", up, 0.0, 1.0, 2.0 * (up < 0), abs(up) > 0.5),
+    ]
+
+
+def _drag(log: FlightLog, q: np.ndarray) -> list[Relation]:
+    """Along x and y of the body nothing but the air pushes, and that against the motion."""
+    width = max(1, round(0.2 / log.nominal_interval))
+    count = len(log) // width
+    if count < _FEWEST:
+        return []
+
+    def blocks(values):
+        means = values[: count * width, :2].reshape(count, width, 2).mean(axis=1)
+        return means - np.median(means, axis=0)
+
+    speed, force = blocks(rotation.to_body(q, log.velocity)), blocks(log.specific_force)
+    sizes = np.sqrt(np.mean(speed**2, axis=0)), np.sqrt(np.mean(force**2, axis=0))
+    matrix = speed.T @ force / count / np.maximum(np.outer(*sizes), 1e-12)
+    found = []
+    swapped = max(matrix[0, 1], matrix[1, 0]) < -_CROSSED and np.abs(np.diag(matrix)).max() < 0.5 * _CROSSED
+    for axis in range(2):
+        own = float(matrix[axis, axis])
+        wrong = 1.0 if swapped else 2 * own if own > _PUSHES else 0.0
+        slope = own * float(sizes[1][axis] / max(sizes[0][axis], 1e-12))
+        moves = bool(sizes[0][axis] > 0.2 and sizes[1][axis] > 0.12)
+        found.append(Relation("drag", "xy"[axis], slope, 0.0, own, wrong, moves))
+    return found
+
+
+def agreement(log: FlightLog, source: str) -> Motors:
+    """Which order of the motor columns explains roll and pitch, by ``rotor_speed`` or ``command``."""
+    spectra = motor_spectra(log, source)
+    if spectra is None:
+        return Motors({}, source)
+    cross, power, turning = spectra  # (lags, 4, 2), (4, 4), (2,)
+    scores = {}
+    for order in itertools.permutations(range(4)):
+        parts = []
+        for axis in range(2):
+            pattern = np.zeros(4)
+            pattern[list(order)] = _PATTERN[axis]
+            own = float(pattern @ power @ pattern)
+            # Motors that all do the same turn nothing.
+            told = own > 1e-6 * float(np.trace(power)) and turning[axis] > 0
+            parts.append(cross[:, :, axis] @ pattern / np.sqrt(own * turning[axis]) if told else 0.0 * cross[:, 0, 0])
+        both = np.mean(parts, axis=0)
+        scores[order, 1], scores[order, -1] = float(both.max()), float(-both.min())
+    return Motors(scores, source)
+
+
+_PATTERN = np.array([[-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, 1.0, -1.0]])  # roll and pitch of M1 to M4

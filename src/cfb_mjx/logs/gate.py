@@ -1,0 +1,401 @@
+"""The gate behind every reader: a log that contradicts itself is named, with the change that mends it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from cfb_mjx.logs import consistency
+from cfb_mjx.logs.alignment import nominal_speeds, nominal_thrust
+from cfb_mjx.logs.consistency import ORDER, Relation
+from cfb_mjx.logs.fixes import Fix, candidates, command_fixes, motor_fix
+from cfb_mjx.logs.flight_log import FlightLog
+
+_ROWS = 6000  # of a long log that decide: the liveliest stretch
+_UNTOLD, _GONE = 0.5, 2.0  # cost of an axis that moved before a change and does not after it, or cannot be compared
+_DISORDER = 0.2  # share of rows whose position leaps
+_GAIN = (1100.0, 6500.0)  # rad/s of a rotor for a command of one, brushed and brushless
+_MUCH = 1.5  # of the cost that a change takes off without mending all
+_ALIKE = 0.1  # changes that leave about as little are told as alternatives
+_PAIRS = 3  # of the best single changes are tried with a second one
+_MOTORS_TELL, _MOTORS_BETTER = 0.6, 0.25
+_OFF = 0.03  # of full: the motors are off
+_FOLLOWS, _HEAVES = 0.6, 0.2
+_MASSES = (0.012, 0.16)  # kg that four rotors of a Crazyflie carry, by the nominal thrust curve
+_NAMES = {
+    "displacement": "the position moves {slope:.2f} times as far along {axis} as the velocity says",
+    "attitude": "the attitude turns {slope:.2f} times as fast about {axis} as the gyro says",
+    "velocity": "the velocity changes {slope:.2f} times as much along {axis} as the accelerometer says",
+    "gravity": "the specific force ax ay az reads {slope:.3g} g upwards in the mean",
+    "upright": "the specific force along z has a median of {slope:.3g} g (body axes are forward, left, up)",
+    "drag": "the accelerometer says that the air pushes along {axis} the way the drone moves, or across it",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What the signals of a log say about each other.
+
+    Attributes:
+        relations: of pose, velocity, gyro, accelerometer.
+        agreement: mean correlation of roll and pitch with the motors as they stand, by ``rotor_speed`` and
+            ``command``; what does not tell is left out.
+        problem: the contradiction, as half a sentence; None where there is none.
+        remedy: changes that make all agree; empty where none was found.
+        alternatives: other changes that do so as well.
+        left: how many comparisons still disagree with the remedy.
+        certain: that it is a fault though no change mends it.
+    """
+
+    relations: list[Relation]
+    agreement: dict[str, float]
+    problem: str | None = None
+    remedy: tuple[Fix, ...] = ()
+    alternatives: tuple[Fix, ...] = ()
+    certain: bool = False
+    left: int = 0
+
+    def sentence(self) -> str:
+        """The problem and what to do, without a full stop."""
+        if not self.remedy:
+            return str(self.problem)
+        words = ", and ".join(fix.words for fix in self.remedy)
+        flags = " ".join(f"--fix {fix.name}" for fix in self.remedy)
+        others = "".join(f"; --fix {fix.name} would too" for fix in self.alternatives)
+        all_but = f"all signals agree but for {self.left} comparisons" if self.left else "all signals agree"
+        return f"{self.problem}; {words}: that makes {all_but} ({flags} does it{others})"
+
+    def report(self) -> dict:
+        """In JSON terms."""
+        rows = [dataclasses.asdict(r) | {"contradicts": r.contradicts} for r in self.relations]
+        return {"relations": rows, "motors": self.agreement}
+
+    def summary(self) -> str:
+        """One line: what agrees, and what moves too little to tell."""
+        agree, gentle = {}, {}
+        for r in self.relations:
+            if r.name not in ("gravity", "upright", "drag"):
+                (agree if r.moves else gentle).setdefault(r.name, []).append(r.axis)
+        said = [f"{name} {' '.join(axes)}" for name, axes in agree.items()]
+        motors = [name for name, value in self.agreement.items() if value > _MOTORS_TELL]
+        if motors:
+            said.append("motors")
+        text = f"signals agree: {', '.join(said)}" if said else "signals: nothing moves enough to compare them"
+        rest = [f"{name} {' '.join(axes)}" for name, axes in gentle.items()]
+        rest += [] if motors else ["motors"]
+        return f"{text}; too gentle to tell: {', '.join(rest)}" if rest and said else text
+
+
+def judge(log: FlightLog) -> Verdict:
+    """Compare all signals of a log with each other."""
+    relations = _independent(log, consistency.kinematics(log))
+    bad = [r for r in relations if r.contradicts]
+    if bad and (disorder := _disorder(log)) is not None:
+        return Verdict(relations, {}, disorder, certain=True)
+    if bad:
+        problem = _worst(bad)
+        remedy, alternatives, left = _remedy(_liveliest(log))
+        heavy = any(r.name in ("gravity", "upright") for r in bad)
+        if not remedy:
+            problem += consistency.when(log, max(bad, key=lambda r: r.unexplained))
+        if heavy and not remedy:
+            problem += "; give what the accelerometer reads, gravity included, in m/s^2"
+        return Verdict(relations, {}, problem, remedy, alternatives, heavy, left)
+    if (repeated := _repeated(log)) is not None:
+        return Verdict(relations, {}, repeated, certain=True)
+    return _judge_motors(log, relations)
+
+
+def _independent(log: FlightLog, relations: list[Relation]) -> list[Relation]:
+    """Without those between a signal and what was derived from it."""
+    made = log.metadata.get("variables") or {}
+    derived = {name for field, name in _OF.items() if "derived" in (made.get(field) or {})}
+    return [r for r in relations if r.name not in derived]
+
+
+_OF = {"velocity": "displacement", "body_rate": "attitude", "specific_force": "velocity"}
+
+
+def _worst(bad: list[Relation]) -> str:
+    # Gravity first, it is the plainest.
+    worst = max(bad, key=lambda r: (r.name in ("gravity", "upright"), r.name == "upright", min(r.unexplained, 4.0)))
+    text = _NAMES[worst.name].format(slope=worst.slope, axis=worst.axis)
+    if worst.name not in ("gravity", "upright"):
+        text += f" (correlation {worst.correlation:.2f})"
+    more = len(bad) - 1
+    return f"{text}, and {more} more comparison{'s' * (more > 1)} disagree" if more else text
+
+
+def _liveliest(log: FlightLog) -> FlightLog:
+    if len(log) <= _ROWS:
+        return log
+    activity = np.cumsum(np.sum(log.body_rate**2, axis=1) + np.sum(log.velocity**2, axis=1))
+    start = int(np.argmax(activity[_ROWS:] - activity[:-_ROWS]))
+    return log.rows(slice(start, start + _ROWS))
+
+
+def _cost(relations: list[Relation], moved: frozenset) -> tuple[float, int]:
+    """How little the relations agree, and how many contradict."""
+    cost = sum(min(r.unexplained, 2.0) for r in relations if r.moves)
+    there = {(r.name, r.axis) for r in relations}
+    still = moved & {(r.name, r.axis) for r in relations if r.moves and r.name != "drag"}
+    kinds = {pair for pair in moved if pair[0] != "drag"}
+    cost += _UNTOLD * len((kinds & there) - still) + _GONE * len(kinds - there)
+    return cost, sum(r.contradicts for r in relations)
+
+
+def _remedy(log: FlightLog) -> tuple[tuple[Fix, ...], tuple[Fix, ...], int]:
+    """Changes that make signals agree, others that do as well, and how many comparisons still disagree.
+
+    One change that mends all, else two; else the one that mends most, if that is much.
+    """
+    relations = consistency.kinematics(log)
+    moved = frozenset((r.name, r.axis) for r in relations if r.moves)
+    before, many = _cost(relations, moved)
+    with np.errstate(all="ignore"):
+        tried = sorted(_tried(log, moved), key=lambda t: (round(t[0] / 0.02), t[3]))
+        found = [((fix,), cost) for cost, bad, fix, _ in tried if not bad]
+        if not found:
+            for _, _, first, _ in tried[:_PAIRS]:
+                found += [((first, fix), cost) for cost, bad, fix, _ in _tried(first.apply(log), moved) if not bad]
+            found.sort(key=lambda f: round(f[1] / 0.02))
+    if not found:
+        cost, left, fix, _ = tried[0]
+        return ((fix,), (), left) if cost < before - _MUCH and left < many else ((), (), 0)
+    if found[0][1] > before - 0.2:
+        return (), (), 0
+    best, least = found[0]
+    part = best[-1].name.split("=")[0]
+    others = [f[0] for f, cost in found[1:] if len(best) == 1 and cost < least + _ALIKE]
+    # Of another part, or another unit of the same: a velocity that is 10 % off is feet or kilometres an hour.
+    others = [fix for fix in others if fix.name.split("=")[0] != part or part.endswith("-unit")]
+    others = [fix for fix in others if part.endswith("-unit") or fix.name.split("-")[0] != part.split("-")[0]]
+    return best, tuple(others[:2]), 0
+
+
+def _tried(log: FlightLog, moved: frozenset) -> list[tuple[float, int, Fix, int]]:
+    found = []
+    for rank, fix in enumerate(candidates()):
+        if not fix.name.startswith("command"):
+            cost, bad = _cost(consistency.kinematics(fix.apply(log)), moved)
+            if np.isfinite(cost):
+                found.append((cost, bad, fix, rank))
+    return found
+
+
+def _disorder(log: FlightLog) -> str | None:
+    """Rows that do not follow each other: the position leaps everywhere."""
+    step = np.diff(log.time)
+    moved = np.linalg.norm(np.diff(log.position, axis=0), axis=1)
+    speed = np.linalg.norm(log.velocity[1:] + log.velocity[:-1], axis=1) / 2
+    reach = float(np.linalg.norm(np.ptp(log.position, axis=0)))
+    leaps = (moved > 20 * speed * step + 0.02 * reach) & (moved > 0.01)
+    # A unit that is wrong stretches all steps alike, and leaves the path smooth.
+    bend = np.linalg.norm(np.diff(log.position, n=2, axis=0), axis=1)
+    rough = float(np.median(bend)) > 0.5 * float(np.median(moved)) and float(np.median(moved)) > 0.02 * reach
+    if leaps.mean() < _DISORDER or not rough:
+        return None
+    return (
+        f"the position leaps in {leaps.mean():.0%} of the rows, so rows do not stand in order of time; sort them by it"
+    )
+
+
+def _repeated(log: FlightLog) -> str | None:
+    """Rows that come again, to the last bit: a copy pasted behind the original, or rows out of order."""
+    rows = np.concatenate([log.position, log.velocity, log.quaternion, log.body_rate, log.specific_force], axis=1)
+    new = np.concatenate([[True], (np.diff(rows, axis=0) != 0).any(axis=1)])
+    kept = np.flatnonzero(new)
+    # Only rows in which something moves: a simulated hover repeats itself.
+    kept = kept[np.abs(log.body_rate[kept]).max(axis=1) > 1e-3]
+    if len(kept) < 20:
+        return None
+    _, first, inverse = np.unique(rows[kept], axis=0, return_index=True, return_inverse=True)
+    again = np.flatnonzero(first[np.ravel(inverse)] != np.arange(len(kept)))
+    if len(again) < max(5, 0.01 * len(kept)):
+        return None
+    row = kept[again[0]]
+    return (
+        f"{len(again)} rows from {log.time[row]:.2f} s on repeat earlier rows to the last bit, so a part of the "
+        "log was "
+        "copied; delete the copy"
+    )
+
+
+def _judge_motors(log: FlightLog, relations: list[Relation]) -> Verdict:
+    if (found := _command_against_speed(log)) is not None:
+        return Verdict(relations, {}, found[0], (found[1],))
+    agreement, moving = {}, {}
+    for source in ("rotor_speed", "command"):
+        found = consistency.agreement(log, source).agreement
+        if found:
+            agreement[source] = found[ORDER, 1]
+            # Inverted commands turn the drone as another order does; only its thrust tells them apart.
+            likely = -1 if _heave(log, source) < -_HEAVES else 1
+            best = max(found, key=lambda key: (round(found[key], 3), key[1] * likely))
+            if found[best] > _MOTORS_TELL and found[best] - found[ORDER, 1] > _MOTORS_BETTER:
+                moving[source] = best, found[best]
+    for source, ((order, sign), value) in moving.items():
+        what = "rotor speeds" if source == "rotor_speed" else "commands"
+        problem = (
+            f"roll and pitch do not follow from the {what} as they stand (correlation {agreement[source]:.2f}; "
+            "in another "
+            f"order {value:.2f})"
+        )
+        return Verdict(relations, agreement, problem, (motor_fix(order, sign),))
+    problem = _gain(log) or _carried(log)
+    return Verdict(relations, agreement, problem, certain=problem is not None)
+
+
+def _heave(log: FlightLog, source: str) -> float:
+    """Correlation of what all motors together change with the specific force along z."""
+    thrust = log.rotor_speed if source == "rotor_speed" else nominal_speeds(log)
+    both = _swings(log, np.stack([np.nansum(thrust, axis=1), log.specific_force[:, 2]], axis=1))
+    size = float(np.sqrt(np.mean(both[:, 0] ** 2) * np.mean(both[:, 1] ** 2)))
+    return float(np.mean(both[:, 0] * both[:, 1])) / size if size > 0 else 0.0
+
+
+def _command_against_speed(log: FlightLog) -> tuple[str, Fix] | None:
+    """Each rotor must follow its own command; of two orders the one by which the drone turns is right."""
+    if log.rotor_speed is None or log.duration < 1.0:
+        return None
+    known = np.isfinite(log.rotor_speed).all(axis=1)
+    if known.mean() < 0.5:
+        return None
+    expected, speed = _swings(log, nominal_speeds(log))[known], _swings(log, log.rotor_speed)[known]
+    size_e, size_s = (np.sqrt(np.mean(x**2, axis=0)) for x in (expected, speed))
+    if (size_e < 5.0).any() or (size_s < 5.0).any():
+        return None
+    matrix = expected.T @ speed / len(speed) / np.outer(size_e, size_s)
+    own = np.diag(matrix)
+    if (own < -_FOLLOWS).all():
+        return "every rotor slows down when its command rises", motor_fix(ORDER, -1)
+    order = np.argmax(matrix, axis=1)
+    best = matrix[np.arange(4), order]
+    if sorted(order) == [0, 1, 2, 3] and (best > _FOLLOWS).all() and np.max(best - own) > _MOTORS_BETTER:
+        follow = tuple(int(i) for i in order)  # command i drives the rotor in this column
+        problem = "rotor speeds do not follow the commands of their own motors but those of others"
+        turns = {s: consistency.agreement(log, s).agreement.get((ORDER, 1), 0.0) for s in ("rotor_speed", "command")}
+        if turns["command"] > turns["rotor_speed"]:
+            return problem, motor_fix(follow, key="rotor-order")
+        return problem, motor_fix(tuple(follow.index(i) for i in range(4)), key="command-order")
+    return None
+
+
+def _gain(log: FlightLog) -> str | None:
+    """How fast rotors turn for their commands."""
+    if log.rotor_speed is None or not np.isfinite(log.rotor_speed).any():
+        return None
+    speed, command = float(np.nanmedian(log.rotor_speed)), float(np.median(log.command))
+    low, high = _GAIN
+    if speed < 200.0 or command <= 0 or low < speed / command < high:
+        return None
+    force = float(np.median(log.specific_force[:, 2]))
+    total = float(np.sum(np.median(log.command, axis=0)))
+    text = f"rotors turn at {speed:.0f} rad/s under commands of {command:.3g}, which no motor of a Crazyflie does"
+    if force > 4.0 and _MASSES[0] < total / force < _MASSES[1] and speed / command > high:
+        return f"{text}: the commands look like thrust in newtons; give the duty, motor.m1..m4 over 65535"
+    if low < speed * 2 * np.pi / command < high:
+        return f"{text}: the speeds look like turns per second; multiply omega1..omega4 by 2 pi"
+    return f"{text}; give rotor speeds in rad/s and the duty in [0, 1]"
+
+
+def _swings(log: FlightLog, values: np.ndarray) -> np.ndarray:
+    """Values without what is slower than half a second."""
+    width = max(3, round(0.5 / log.nominal_interval) | 1)
+    filled = np.where(np.isfinite(values), values, np.nanmean(values, axis=0))
+    sums = np.cumsum(np.pad(filled, ((width // 2 + 1, width // 2), (0, 0)), mode="edge"), axis=0)
+    return filled - (sums[width:] - sums[:-width]) / width
+
+
+def _carried(log: FlightLog) -> str | None:
+    """What the motors pull must carry a Crazyflie."""
+    force = float(np.median(log.specific_force[:, 2]))
+    if log.duration < 1.0 or force < 4.0 or np.median(log.command) < _OFF:
+        return None
+    low, high = _MASSES
+    if log.rotor_speed is not None and np.isfinite(log.rotor_speed).any():
+        mass = carried_mass(np.nanmedian(log.rotor_speed, axis=0), force)
+        if not low < mass < high:
+            hint = (
+                " (they look like turns per second; multiply by 2 pi)"
+                if low < carried_mass(np.nanmedian(log.rotor_speed, axis=0) * 2 * np.pi, force) < high
+                else ""
+            )
+            return (
+                f"rotors at {np.nanmedian(log.rotor_speed):.0f} rad/s carry {mass * 1e3:.3g} g, which is no "
+                f"Crazyflie{hint}; "
+                "give omega1..omega4 in rad/s"
+            )
+        return None
+    return carried_by_commands(log.command, force)
+
+
+def carried_by_commands(command: np.ndarray, force: float) -> str | None:
+    """What is wrong with commands within [0, 1] that carry no Crazyflie; None where they do."""
+    low, high = _MASSES
+    typical = np.median(command, axis=0)
+    mass = carried_mass(2900.0 * typical, force)
+    if low < mass < high:
+        return None
+    if low < float(np.sum(typical)) / force < high:
+        return (
+            f"the commands (median {np.median(command):.3g}) look like thrust in newtons; give the duty, "
+            "motor.m1..m4 over "
+            "65535"
+        )
+    return (
+        f"commands of {np.median(command):.3g} carry {mass * 1e3:.3g} g, which is no Crazyflie; give the duty in [0, 1]"
+    )
+
+
+def carried_mass(rotor_speed: np.ndarray, force: float) -> float:
+    """kg that four rotors at these speeds carry at a specific force, by the nominal thrust curve."""
+    return float(np.sum(nominal_thrust(rotor_speed))) / force
+
+
+def command_unit(command: np.ndarray, force: float) -> str | None:
+    """What commands outside [0, 1] look like, with the remedy; None if like nothing known."""
+    low, high = _MASSES
+    for fix in _by_range(command):
+        duty = fix.apply(FlightOnly(command)).command
+        typical = np.median(duty, axis=0)
+        if duty.min() > -0.05 and duty.max() < 1.02 and low < carried_mass(2900.0 * typical, force) < high:
+            return f"{fix.words} (--fix {fix.name})"
+    total = float(np.sum(np.median(command, axis=0)))
+    for unit, newton in (("grams", 9.81e-3), ("millinewtons", 1e-3)):
+        if low < total * newton / force < high:
+            return f"look like thrust in {unit}, which is no duty; give the duty, motor.m1..m4 over 65535"
+    return None
+
+
+def _by_range(command: np.ndarray) -> list[Fix]:
+    """Units in the order in which their range fits: the narrowest that holds all values first."""
+    tops = {
+        "percent": 100.5,
+        "0-255": 255.5,
+        "0-1000": 1000.5,
+        "1023": 1023.5,
+        "us": 2100.0,
+        "dshot": 2047.5,
+        "pwm16": 65535.5,
+    }
+    top, bottom = float(command.max()), float(command[command > 0].min(initial=np.inf))
+    fixes = {fix.name.split("=")[1]: fix for fix in command_fixes()}
+    order = [u for u, limit in sorted(tops.items(), key=lambda t: t[1]) if top <= limit]
+    if bottom >= 900.0 and top <= 2100.0:
+        order = ["us", *[u for u in order if u != "us"]]
+    elif top <= 2047.5 and top > 255.5:
+        order = ["dshot", *[u for u in order if u != "dshot"]]
+    return [fixes[u] for u in order]
+
+
+@dataclasses.dataclass(frozen=True)
+class FlightOnly:
+    """Stands for a log where only its commands matter."""
+
+    command: np.ndarray
+
+    def replace(self, command: np.ndarray) -> FlightOnly:
+        """With other commands."""
+        return FlightOnly(command)

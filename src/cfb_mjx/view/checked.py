@@ -1,0 +1,58 @@
+"""What the signals of a flight say about each other, drawn: measured changes over what should add up to them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+
+import numpy as np
+
+from cfb_mjx.logs.consistency import Comparison
+from cfb_mjx.view import style
+
+_WORDS = {
+    "displacement": ("moved", "velocity added up", "m"),
+    "attitude": ("attitude turned", "gyro added up", "rad"),
+    "velocity": ("velocity changed", "accelerometer added up", "m/s"),
+}
+
+
+def checked_figure(compared: Mapping[str, Comparison], path: str | os.PathLike, title: str = "") -> None:
+    """Draw the comparisons of `cfb check`, a row each, a column per axis.
+
+    Args:
+        compared: by ``displacement``, ``attitude``, ``velocity``.
+        path: file to write, ``.svg``, ``.png`` or ``.pdf``.
+        title: heading.
+
+    Raises:
+        CfbError: an unknown ending, or the file cannot be written.
+    """
+    path = style.check_path(path)
+    with style.context():
+        figure = style.new_figure(11.0, 1.0 + 1.9 * len(compared))
+        panels = figure.subplots(len(compared), 3, squeeze=False, sharex=True)
+        for row, (name, c) in zip(panels, compared.items(), strict=True):
+            measured, integrated, unit = _WORDS[name]
+            for axis, panel in enumerate(row):
+                # Windows overlap by half; a gap of the log shows as a step in time.
+                gap = np.concatenate([[False], np.diff(c.time) > 3 * np.median(np.diff(c.time))])
+                for values, label, colour, width in (
+                    (c.measured, measured, style.MEASURED, 1.2),
+                    (c.integrated, integrated, style.COLOURS["commands_in"], 0.9),
+                ):
+                    panel.plot(
+                        c.time, np.where(gap, np.nan, values[:, axis]), color=colour, linewidth=width, label=label
+                    )
+                panel.set_title("xyz"[axis], fontsize=9)
+            row[0].set_ylabel(f"{unit} in {c.width:.2g} s")
+            row[0].legend(fontsize=7, loc="upper right")
+        for panel in panels[-1]:
+            panel.set_xlabel("s")
+        height = figure.get_figheight()
+        figure.subplots_adjust(
+            left=0.07, right=0.99, top=1 - 0.65 / height, bottom=0.5 / height, wspace=0.18, hspace=0.3
+        )
+        if title:
+            figure.suptitle(title, fontsize=11)
+        style.save(figure, path)

@@ -1,0 +1,139 @@
+"""Bench tables under the names of the programs that write them: four rotors on a scale, dead sensors, voltage."""
+
+import numpy as np
+import pytest
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs.bench_layouts import SteadyPoints, read_bench_table, recognises
+from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
+from cfb_mjx.logs.tabular import read_table
+from cfb_mjx.sysid.rotors.steady import fit_steady
+
+KF, RPM = 3.72e-8, 30 / np.pi
+RNG = np.random.default_rng(3)
+U = RNG.uniform(0.15, 0.95, 80)
+VOLT = np.linspace(3.9, 3.3, 80)
+SPEED = 350 + 613 * U * VOLT
+GRAMS = 4 * KF * SPEED**2 / 9.81e-3
+
+
+def read(folder, columns, rotors=None):
+    path = folder / "bench.csv"
+    rows = zip(*(np.broadcast_to(c, U.shape) for c in columns.values()), strict=True)
+    path.write_text("\n".join([",".join(columns), *(",".join(repr(float(x)) for x in row) for row in rows)]) + "\n")
+    return read_bench_table(read_table(path), path, rotors)
+
+
+def vehicle(**changes):
+    columns = {"pwm": 65535 * U, "vbat[V]": VOLT, **{f"rpm{i}": SPEED * RPM for i in (1, 2, 3, 4)}, "thrust[g]": GRAMS}
+    return {k: v for k, v in (columns | changes).items() if v is not None}
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        vehicle(),
+        {"weight[g]": GRAMS, **vehicle(**{"thrust[g]": None}), "v[V]": VOLT, "i[A]": 1.0, "p[W]": VOLT},
+        {"Throttle (%)": 100 * U, "Voltage (V)": VOLT, "Motor Optical Speed (RPM)": SPEED * RPM,
+         "Thrust (N)": GRAMS * 9.81e-3 / 4},
+        {"ESC signal (µs)": 1000 + 1000 * U, "Thrust (kgf)": GRAMS / 4e3, "Motor Optical Speed (RPM)": SPEED * RPM,
+         "Voltage (V)": VOLT},
+        {"Powertrain 1 - throttle (%)": 100 * U, "Powertrain 1 - thrust (N)": GRAMS * 9.81e-3 / 4,
+         "Powertrain 1 - rotational speed (rpm)": SPEED * RPM, "Powertrain 1 - voltage (V)": VOLT},
+    ],
+    ids=["systemid", "weight", "one rotor", "RCbenchmark", "Tyto"],
+)  # fmt: skip
+def test_thrust_of_one_rotor_and_steady_points(tmp_path, columns):
+    assert recognises(dict.fromkeys(columns, U))
+    parts, _ = read(tmp_path, columns)
+    (points,) = [p for p in parts if isinstance(p, SteadyPoints)]
+    (table,) = [p for p in parts if isinstance(p, MapTable)]
+    assert np.allclose(table.force, KF * table.rotor_speed**2, rtol=1e-3)
+    fit = fit_steady([points])
+    assert fit.per_volt == pytest.approx(613, rel=1e-3)
+    assert fit.offset == pytest.approx(350, abs=1)
+    assert fit.gain == pytest.approx(613 * 3.7, rel=1e-3)
+    assert fit.spread < 1 < 40 < fit.spread_without_voltage
+
+
+def test_a_dead_sensor_is_left_out_with_a_word(tmp_path):
+    lost = SPEED * RPM
+    lost[::10] = 0.0
+    parts, notes = read(tmp_path, vehicle(rpm1=0.0 * U, rpm2=lost))
+    table = next(p for p in parts if isinstance(p, MapTable))
+    assert np.allclose(table.force, KF * table.rotor_speed**2, rtol=1e-3)
+    assert any("rpm1 reads 0 in 100%" in n for n in notes)
+    assert any("8 readings of 0 under command in rpm2" in n for n in notes)
+    with pytest.raises(CfbError, match="no rotor speed sensor reads anything"):
+        read(tmp_path, vehicle(**{f"rpm{i}": 0.0 * U for i in (1, 2, 3, 4)}))
+
+
+def test_how_many_rotors(tmp_path):
+    alone = {"omega": SPEED, "force": 4 * KF * SPEED**2}
+    (table,), _ = read(tmp_path, alone, rotors=4)
+    assert np.allclose(table.force, KF * SPEED**2)
+    parts, notes = read(tmp_path, vehicle())
+    assert any("is what 4 rotors give together" in n for n in notes)
+    parts, _ = read(tmp_path, vehicle(), rotors=1)
+    assert np.allclose(parts[-1].force, 4 * KF * parts[-1].rotor_speed ** 2, rtol=1e-3)
+
+
+def test_a_scale_that_was_not_read(tmp_path):
+    parts, notes = read(tmp_path, vehicle(**{"thrust[g]": 0.0 * U}))
+    assert [type(p) for p in parts] == [SteadyPoints]
+    assert any("the scale was not read" in n for n in notes)
+
+
+def test_commands_under_the_name_of_rpm(tmp_path):
+    with pytest.raises(
+        CfbError, match=r"column rpm reaches 6807 rad/s .* these look like 16-bit commands; name the column pwm"
+    ):
+        read(tmp_path, {"rpm": np.linspace(5000, 65000, 80), "weight[g]": GRAMS})
+    with pytest.raises(CfbError, match="has no rotor speed"):
+        read(tmp_path, {"pwm": 65535 * U, "thrust[g]": GRAMS})
+
+
+def test_a_unit_nobody_knows(tmp_path):
+    with pytest.raises(CfbError, match=r"column thrust\[lbf\] is in lbf"):
+        read(tmp_path, {"omega": SPEED, "thrust[lbf]": GRAMS})
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_command_steps_act_where_the_speed_answers(tmp_path, late):
+    """Scripts that write the row after waiting have the command of the interval before in it."""
+    time = np.arange(400) * 0.01
+    u = np.where(time % 1.0 < 0.5, 0.2, 0.7)
+    speed, w = [], 350 + 613 * 3.8 * 0.2
+    for now in u:
+        before = w
+        w += (350 + 613 * 3.8 * now - w) * (1 - np.exp(-0.01 / 0.05))
+        speed.append(w if late else before)
+    path = tmp_path / "steps.csv"
+    body = [
+        f"{float(1e3 * t)!r},{float(65535 * c)!r},{float(s * RPM)!r}" for t, c, s in zip(time, u, speed, strict=True)
+    ]
+    path.write_text("\n".join(["time[ms],pwm,rpm", *body, ""]))
+    (record,), notes = read_bench_table(read_table(path), path)
+    assert isinstance(record, MotorRecord)
+    assert bool(notes) == late
+    step = int(np.flatnonzero(np.diff(record.command[:, 0]) > 0.1)[0]) + 1
+    gone = np.abs(np.diff(record.rotor_speed[:, 0]))
+    assert gone[step] > 10 * gone[step - 1]
+
+
+def test_too_few_steady_points():
+    few = SteadyPoints("a", U[:4], SPEED[:4], None)
+    with pytest.raises(CfbError, match="a: 4 steady points at 4 different commands"):
+        fit_steady([few])
+    one = SteadyPoints("a", np.full(20, 0.5), SPEED[:20], None)
+    with pytest.raises(CfbError, match="at 1 different commands"):
+        fit_steady([one])
+
+
+def test_sensors_that_count_blades_twice(tmp_path):
+    """A fifth of the settings read double: left out as outliers."""
+    wrong = np.where(np.arange(80) % 5 == 0, 2.0, 1.0) * SPEED + RNG.normal(0, 5, 80)
+    fit = fit_steady([SteadyPoints("a", U, wrong, VOLT)])
+    assert fit.per_volt == pytest.approx(613, abs=6)
+    assert fit.outliers == pytest.approx(0.2, abs=0.02)
+    assert abs(fit.offset - 350) < 4 * fit.offset_std
