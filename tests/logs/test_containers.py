@@ -39,9 +39,7 @@ KINDS = {
     "a.ulg": (b"ULog\x01\x12\x35\x01" + bytes(50), "PX4 ULog", "parquet"),
     "a.json": (b'{"t": [0.0]}\n', "JSON", "parquet"),
     "a.html": (b"<!DOCTYPE html><html></html>", "HTML page", "login"),
-    "a.npz": (saved(np.savez, t=np.zeros(3)), "NumPy archive", "parquet"),
     "a.npy": (saved(np.save, np.zeros(3)), "NumPy array", "parquet"),
-    "a.mat": (b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM", "MATLAB", "parquet"),
     "a.mcap": (b"version https://git-lfs.github.com/spec/v1\n", "a Git LFS pointer", "git lfs pull"),
 }
 

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import shipped
+from cfb_mjx.files import shipped, write_text
 from cfb_mjx.logs import estimate_command_shift, read_log, write_mcap
 from cfb_mjx.logs.gate import judge
+from cfb_mjx.logs.proposal import UnknownNames
 
 
 def run_import(sources: list[Path], output: Path, format: str | None, options: dict[str, Any]) -> None:
@@ -23,7 +24,15 @@ def run_import(sources: list[Path], output: Path, format: str | None, options: d
         raise CfbError(f"{output}: the output must end in .mcap.")
     if output.exists() and any(source.exists() and output.samefile(source) for source in sources):
         raise CfbError(f"{output}: is the source itself; choose another name.")
-    log = read_log(sources, format, **options)
+    try:
+        log = read_log(sources, format, **options)
+    except UnknownNames as error:
+        proposed = output.with_suffix(".mapping.yaml")
+        write_text(proposed, error.mapping)
+        said = str(error).partition("; cfb import")[0]
+        raise CfbError(
+            f"{said}; a mapping was written to {proposed}: check it, then add --mapping {proposed}."
+        ) from None
     alignment = log.metadata.get("alignment")
     if alignment is None:
         alignment = {**estimate_command_shift(log).report(), "applied": False}

@@ -33,6 +33,7 @@ def read_mcap(path: str | os.PathLike) -> FlightLog:
         raise CfbError(f"{path}: the file is empty; export the log again.")
     if not data.startswith(_MAGIC):
         raise CfbError(f"{path}: this is not an MCAP file; give a log written by cfb_mjx or a table (parquet, csv).")
+    mcap_schema.refuse_bombs(data, path)
     try:
         schemas, channels, payloads, record = _records(data)
     except Exception as error:  # the MCAP library lets struct, codec and lookup errors of damaged bytes through

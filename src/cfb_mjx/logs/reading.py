@@ -9,12 +9,13 @@ from typing import Any
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
-from cfb_mjx.logs import containers, crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, usd_card
+from cfb_mjx.logs import arrays, containers, crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, usd_card
 from cfb_mjx.logs.fixes import fix_of
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.flown import flown_part
+from cfb_mjx.logs.proposal import UnknownNames, propose
 from cfb_mjx.logs.validation import validate
-from cfb_mjx.logs.variables import load_mapping
+from cfb_mjx.logs.variables import MissingNames, load_mapping
 
 FORMATS = ("mcap", "tabular", "idsia", "usd_card", "crazyswarm", "radio_csv")
 _OPTIONS = {
@@ -43,7 +44,8 @@ def read_log(
         block.
         format: one of `FORMATS`; None detects it from the file's content. ``mcap`` is this library's own, ``tabular``
             and ``idsia`` are parquet or csv, ``usd_card`` is the Crazyflie's micro SD card binary, ``crazyswarm`` a
-            ROS bag (MCAP, sqlite3 or ROS 1), ``radio_csv`` a table with firmware variable names as headers.
+            ROS bag (MCAP, sqlite3 or ROS 1), ``radio_csv`` a table with firmware variable names as headers. Arrays by
+            name (.npz, .mat) are tables.
         keep_ground: leave in what is not flight: standing, take-off, landing, being carried. This library's own files
             are never cut.
         fix: changes of convention to make, in this order, as a refusal names them: ``velocity-frame=body``
@@ -54,6 +56,7 @@ def read_log(
             option that is None counts as not given.
 
     Raises:
+        UnknownNames: a table with names of its own, for which a mapping can be proposed.
         CfbError: one sentence naming the file, what is wrong with it and what to do.
     """
     several = not isinstance(path, str | os.PathLike)
@@ -94,14 +97,47 @@ def _read(paths: list[Path], format: str, options: dict[str, Any], tables: dict[
         return usd_card.read_usd_card(path, **options)
     if format == "crazyswarm":
         return crazyswarm.read_crazyswarm(path, **options)
-    found = [tables.get(p) or tabular.read_table(p) for p in paths]
+    found = [tables.get(p) or _table(p) for p in paths]
+    if format != "idsia" and "mapping" not in options:
+        return _or_proposed(found, paths, format, options)
     if format == "idsia":
         return idsia.from_columns(found[0], path, **options)
+    return _of_tables(found, paths, format, options)
+
+
+def _of_tables(tables: list[tabular.Table], paths: list[Path], format: str, options: dict[str, Any]) -> FlightLog:
     if format == "radio_csv":
-        return radio_csv.from_columns(list(zip(found, paths, strict=True)), **options)
-    return tabular.from_columns(found[0], path)
+        return radio_csv.from_columns(list(zip(tables, paths, strict=True)), **options)
+    return tabular.from_columns(tables[0], paths[0])
 
 
+def _or_proposed(tables: list[tabular.Table], paths: list[Path], format: str, options: dict[str, Any]) -> FlightLog:
+    """The log; where the columns have names of their own, a mapping for them is proposed."""
+    try:
+        return _of_tables(tables, paths, format, options)
+    except MissingNames as error:
+        if sum(name in tables[0] for names in tabular.COLUMNS.values() for name in names) > _OWN_LAYOUT:
+            raise  # this library's own layout, not whole
+        proposal = propose(tables[0]) if len(tables) == 1 else None
+        head = read_bytes(paths[0], 64)
+        if proposal is None and arrays.recognises(paths[0], head):
+            said = str(error).removeprefix(f"{paths[0]}: ")
+            raise CfbError(f"{paths[0]}: {arrays.kind(head)} has arrays {', '.join(tables[0])}: {said}") from None
+        if proposal is None:
+            raise
+        raise UnknownNames(
+            f"{paths[0]}: its columns have names of their own, which look like {', '.join(proposal.fields)}; cfb "
+            "import writes a mapping to check, to be given with --mapping FILE.",
+            proposal.text,
+        ) from error
+
+
+def _table(path: Path) -> tabular.Table:
+    head = read_bytes(path, 64)
+    return arrays.read_arrays(path) if arrays.recognises(path, head) else tabular.read_table(path)
+
+
+_OWN_LAYOUT = 13  # of its columns that make a table one of the tabular layout
 _MCAP_MAGIC = b"\x89MCAP"
 
 
@@ -119,12 +155,13 @@ def _detect(paths: list[Path], options: dict[str, Any], tables: dict[Path, tabul
         return "usd_card"
     if head.startswith(_MCAP_MAGIC):
         return "crazyswarm" if ros_bag.recognises(path) else "mcap"
-    if (foreign := containers.name_of(path, head)) is not None:
+    by_name = arrays.recognises(path, head)
+    if not by_name and (foreign := containers.name_of(path, head)) is not None:
         raise CfbError(f"{path}: this is {foreign[0]}, which this library does not read; {foreign[1]}.")
     if path.suffix == ".mcap":
         return "mcap"
     for one in paths:
-        tables[one] = tabular.read_table(one)
+        tables[one] = _table(one)
     table = tables[path]
     if idsia.recognises(table):
         return "idsia"

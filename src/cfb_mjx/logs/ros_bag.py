@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, scratch
+from cfb_mjx.logs.mcap_schema import refuse_bombs
 
 SQLITE, ROS1 = b"SQLite format 3\0", b"#ROSBAG V2.0"
 _LOG_DATA = "std_msgs/Header header\nuint32 timestamp\nfloat{}[] values\n"
@@ -63,10 +64,17 @@ def recognises(path: str | os.PathLike) -> bool:
             file.seek(min(int.from_bytes(footer[:8], "little"), end))
             summary = file.read()
     if not footer.endswith(MAGIC):
-        return head[21 : 21 + int.from_bytes(head[17:21], "little")] == b"ros2"
+        return _profile(head) == b"ros2"
     # An IMU alone is anybody's.
-    kinds = [kind for kind in VARIABLES if kind != IMU]
-    return b"ros2" in summary and any(kind.replace("/", "/msg/").encode() in summary for kind in kinds)
+    kinds = [kind.replace("/", "/msg/").encode() for kind in VARIABLES if kind != IMU]
+    if b"ros2" in summary and any(kind in summary for kind in kinds):
+        return True
+    # A file that lost a part has its summary elsewhere than it says.
+    return _profile(head) == b"ros2" and any(kind in data for data in [read_bytes(path)] for kind in kinds)
+
+
+def _profile(head: bytes) -> bytes:
+    return head[21 : 21 + int.from_bytes(head[17:21], "little")]
 
 
 def read_messages(data: bytes, path: Path, warnings: list[str]) -> list[BagMessage]:
@@ -76,18 +84,27 @@ def read_messages(data: bytes, path: Path, warnings: list[str]) -> list[BagMessa
         CfbError: nothing could be read, or a message is encoded otherwise. What is lost after something could be read
             goes into ``warnings``.
     """
-    from mcap.records import Channel, Message, Schema
+    from mcap.records import Channel, Message, Schema, Statistics
     from mcap.stream_reader import StreamReader
     from mcap_ros2.decoder import DecoderFactory
 
     factory, schemas, channels, out, foreign = DecoderFactory(), {}, {}, [], set()
+    seen = 0
+    refuse_bombs(data, path)
     try:
         for item in StreamReader(io.BytesIO(data), validate_crcs=True, record_size_limit=len(data)).records:
             if isinstance(item, Schema):
                 schemas[item.id] = item
             elif isinstance(item, Channel):
                 channels[item.id] = item
+            elif isinstance(item, Statistics):
+                if item.message_count > seen:
+                    warnings.append(
+                        f"{item.message_count - seen} of the {item.message_count} messages that the bag's own "
+                        "statistics count are missing: a part of it was lost."
+                    )
             elif isinstance(item, Message):
+                seen += 1
                 channel = channels[item.channel_id]
                 schema = schemas[channel.schema_id]
                 kind = schema.name.replace("/msg/", "/")

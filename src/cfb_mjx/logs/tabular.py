@@ -12,6 +12,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, replacing
 from cfb_mjx.logs.flight_log import FlightLog, quantise_time
 from cfb_mjx.logs.text_table import read_text_table
+from cfb_mjx.logs.variables import MissingNames
 
 COLUMNS = {
     "time": ("t",),
@@ -27,6 +28,9 @@ LAYOUT = (
     "t, px py pz, vx vy vz, qw qx qy qz, wx wy wz, ax ay az, u1..u4 and optionally omega1..omega4, vbat "
     "(see docs/logs.md)"
 )
+
+
+_MOST_CELLS = 1 << 28  # a flight of an hour at 1 kHz in 40 columns is half of that
 
 
 class Text(NamedTuple):
@@ -70,7 +74,7 @@ def read_table(path: str | os.PathLike) -> Table:
     is_parquet = head == b"PAR1"
     notes: list[str] = []
     try:
-        table = _to_arrays(_parquet(path) if is_parquet else read_text_table(path, read_bytes(path), notes))
+        table = _to_arrays(_parquet(path, notes) if is_parquet else read_text_table(path, read_bytes(path), notes))
     except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError, MemoryError, RuntimeError) as error:
         kind = "parquet" if is_parquet else "csv"
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -93,12 +97,61 @@ def require_numbers(table: Table, columns: list[str], path: Path) -> None:
             )
 
 
-def _parquet(path: Path):
+def _parquet(path: Path, notes: list[str]):
     import pyarrow.parquet as pq
 
     # ParquetFile rather than read_table: the latter guesses partitions from folder names.
     with pq.ParquetFile(path, memory_map=False, page_checksum_verification=True) as file:
-        return file.read()
+        footer = file.metadata
+        if footer.num_rows * max(footer.num_columns, 1) > _MOST_CELLS:
+            raise CfbError(
+                f"{path}: the table has {footer.num_rows} rows and {footer.num_columns} columns, more than a flight "
+                "has; export the flight alone."
+            )
+        table = file.read()
+        if not _has_checksums(path, footer):
+            _compare_with_footer(path, footer, table)
+            notes.append("the parquet file has no checksums, so damage to values in it would go unnoticed.")
+    return table
+
+
+def _has_checksums(path: Path, footer) -> bool:
+    """Whether the first page of every column carries a CRC: the fourth field of its header (Thrift, compact)."""
+    with open(path, "rb") as file:
+        for group in range(footer.num_row_groups):
+            for index in range(footer.num_columns):
+                column = footer.row_group(group).column(index)
+                file.seek(column.dictionary_page_offset or column.data_page_offset)
+                head, at = file.read(40), 0
+                for _ in range(3):  # type of page, its size, its compressed size
+                    if at >= len(head) or head[at] & 0x0F != 5:
+                        return False
+                    at += 1
+                    while at < len(head) and head[at] & 0x80:
+                        at += 1
+                    at += 1
+                if at >= len(head) or head[at] != 0x15:
+                    return False
+    return True
+
+
+def _compare_with_footer(path: Path, footer, table) -> None:
+    """Refuse values beyond the least and greatest that the writer noted."""
+    import pyarrow.compute as pcm
+
+    for index in range(footer.num_columns):
+        groups = [footer.row_group(g).column(index) for g in range(footer.num_row_groups)]
+        noted = [c.statistics for c in groups if c.statistics is not None and c.statistics.has_min_max]
+        name = groups[0].path_in_schema if groups else ""
+        if len(noted) < len(groups) or table.column_names.count(name) != 1:
+            continue
+        found = pcm.min_max(table[name]).as_py()
+        low, high = min(s.min for s in noted), max(s.max for s in noted)
+        if found["min"] is not None and (found["min"] < low or found["max"] > high):
+            raise CfbError(
+                f"{path}: column {name} holds values beyond {low} to {high}, which is what its writer noted, so the "
+                "file is damaged; copy it again."
+            )
 
 
 def _to_arrays(table) -> dict[str, np.ndarray | Text]:
@@ -147,7 +200,7 @@ def from_columns(table: Table, path: Path) -> FlightLog:
         c for names in OPTIONAL_COLUMNS.values() if any(c in table for c in names) for c in names if c not in table
     ]
     if missing or partial:
-        raise CfbError(
+        raise MissingNames(
             f"{path}: missing column{'s' * (len(missing + partial) > 1)} {', '.join(missing + partial)}; "
             f"the tabular layout is {LAYOUT}."
         )

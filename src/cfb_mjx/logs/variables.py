@@ -42,6 +42,10 @@ _CHOICE_KEYS = {"variables", "unit", "sign", "frame", "form", "invalid"}
 _FIRMWARE_KEYS = ("version", "battery_compensation", "thrust_limit")
 
 
+class MissingNames(CfbError):
+    """Columns or variables that a log must have are missing: it has others, or the same under other names."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Choice:
     """One way to fill a field.
@@ -101,7 +105,7 @@ class VariableMap:
         if missing:
             wanted = "; ".join(f"{f} ({self._wanted(f, available)})" for f in missing)
             listed = ", ".join(sorted(available)) or "none"
-            raise CfbError(
+            raise MissingNames(
                 f"{path}: no logged variables for {wanted}. Found: {listed}. Log the missing ones too, or say under "
                 "which names and units they are with --mapping FILE, a changed copy of "
                 "configs/logs/crazyflie.yaml (see "

@@ -1,0 +1,160 @@
+"""A mapping proposed for a table with names of its own, from those names and the size of the values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import yaml
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import rotation
+from cfb_mjx.logs.radio_csv import clock_of
+from cfb_mjx.logs.tabular import Text
+from cfb_mjx.logs.variables import FORMAT
+
+_AXES = {"x": 0, "y": 1, "z": 2}
+_MEMBERS = {**_AXES, "w": 3, **{str(i): i for i in range(5)}}
+# What is left of a name without its axis or number, and what that is. Longer ones stand first.
+_STEMS: tuple[tuple[str, str], ...] = (
+    ("body_rate", r"gyro(scope)?|ang(ular)?vel(ocity)?|angvelb?|bodyrates?|omegab?|rates?|w"),
+    ("specific_force", r"acc(el|elerometer|eleration)?|linearacceleration|specificforce|imuacc|a"),
+    ("velocity", r"(lin(ear)?)?vel(ocity)?|v|dot|speed"),
+    ("quaternion", r"q(uat(ernion)?)?|orientation|rot(ation)?|att(itude)?|poseorientation"),
+    ("position", r"|p(os(ition)?)?|translation|loc(ation)?|poseposition"),
+    ("command", r"u|m(otor)?s?|pwm|cmds?|commands?|duty|throttle|action|motorpwm|motorcmd|thrustpwm|mpwm"),
+    ("rotor_speed", r"rpms?|rotor(speed)?s?|motor(rpm|speed)s?|omegam|erpm|mrpm"),
+)
+_ANGLES = re.compile(r"(.*?)(roll|pitch|yaw|phi|theta|psi)", re.IGNORECASE)
+_BATTERY = re.compile(r"(pm)?v?bat(tery)?(_?(voltage|v|mv))?|voltage|vbat.*", re.IGNORECASE)
+_GROUPS = re.compile(
+    r"^(state_?estimate|state|pose|odom(etry)?|imu|sensors?|drone|cf\d*|data|log)[._/ ]+(?=.)", re.IGNORECASE
+)
+
+
+class UnknownNames(CfbError):
+    """A table whose columns have names of their own.
+
+    Attributes:
+        mapping: text of the mapping file that was proposed for it.
+    """
+
+    def __init__(self, message: str, mapping: str):
+        super().__init__(message)
+        self.mapping = mapping
+
+
+class Proposal(NamedTuple):
+    """A mapping file as text, and the fields it fills."""
+
+    text: str
+    fields: tuple[str, ...]
+
+
+def propose(table: Mapping[str, np.ndarray | Text]) -> Proposal | None:
+    """A mapping for a table's columns; None where they do not hold a flight by any reading of their names."""
+    numbers = {name: np.asarray(v, float) for name, v in table.items() if not isinstance(v, Text)}
+    if clock_of(numbers) is None or min((len(v) for v in numbers.values()), default=0) < 2:
+        return None
+    found = _families(numbers)
+    if "quaternion" not in found:
+        angles = {m[2].lower(): n for n in numbers if (m := _ANGLES.fullmatch(_plain(n))) and not m[1].endswith("rate")}
+        names = [angles.get(a) or angles.get(b) for a, b in (("roll", "phi"), ("pitch", "theta"), ("yaw", "psi"))]
+        if None not in names:
+            found["angles"] = names
+    if not {"position", "command"} <= set(found) or not {"quaternion", "angles"} & set(found):
+        return None
+    battery = next((n for n in numbers if _BATTERY.fullmatch(_plain(n))), None)
+    if battery is not None:
+        found["battery_voltage"] = [battery]
+    return _document(found, numbers)
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[\s._/\[\]()-]", "", _GROUPS.sub("", name.strip())).lower()
+
+
+def _families(numbers: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
+    """Field to its columns in order: names that differ in an axis or a number only."""
+    groups: dict[str, dict[str, str]] = {}
+    for name in numbers:
+        bare = re.sub(r"\[[^\]]*\]|\([^)]*\)", "", name)
+        plain = _plain(bare)
+        match = re.fullmatch(r"(?:(?P<stem>.*?)(?P<last>[xyzw0-4])|(?P<first>[xyz])(?P<rest>dot|vel|acc))", plain)
+        if match is None:
+            continue
+        stem, member = (match["stem"], match["last"]) if match["last"] else (match["rest"], match["first"])
+        groups.setdefault(stem, {}).setdefault(member, name)
+    found: dict[str, list[str]] = {}
+    for stem, members in groups.items():
+        kinds = [field for field, pattern in _STEMS if re.fullmatch(pattern, stem)]
+        if set("wxyz") <= set(members) and "quaternion" in kinds:
+            found.setdefault("quaternion", [members[a] for a in "wxyz"])
+        elif (
+            set("xyz") <= set(members) and kinds and kinds[0] in ("body_rate", "specific_force", "velocity", "position")
+        ):
+            found.setdefault(kinds[0], [members[a] for a in "xyz"])
+        four = next((d for d in ("1234", "0123") if set(d) <= set(members)), None)
+        motors = [k for k in kinds if k in ("command", "rotor_speed")] or (["rotor_speed"] if stem == "omega" else [])
+        if four and motors:
+            found.setdefault(motors[0], [members[d] for d in four])
+    return found
+
+
+def _document(found: dict[str, list[str]], numbers: Mapping[str, np.ndarray]) -> Proposal:
+    values = {field: np.stack([numbers[n] for n in names], axis=1) for field, names in found.items()}
+    fields: dict[str, list[dict]] = {}
+    for field, names in found.items():
+        entry: dict = {"variables": names}
+        unit = _unit(field, values)
+        if field == "angles":
+            entry |= {"form": "euler", "unit": unit}
+        elif field != "quaternion":
+            entry["unit"] = unit
+        fields["quaternion" if field == "angles" else field] = [entry]
+    for field, source in (("velocity", "position"), ("body_rate", "quaternion"), ("specific_force", "velocity")):
+        if field not in fields:
+            fields[field] = [{"derived": source}]
+    body = yaml.safe_dump(
+        {"format": FORMAT, "name": "proposed", "fields": fields}, sort_keys=False, default_flow_style=None
+    )
+    head = (
+        "# Proposed from the columns' names and the size of their values: check every line, units and signs first.\n"
+        "# configs/logs/crazyflie.yaml explains the keys; a Crazyflie logs pitch with the opposite sign ([1, -1, 1]).\n"
+    )
+    return Proposal(head + body, tuple(fields))
+
+
+def _unit(field: str, values: Mapping[str, np.ndarray]) -> str:
+    """As the size of the values says."""
+    known = values[field][np.isfinite(values[field]).all(axis=1)]
+    size = float(np.median(np.linalg.norm(known, axis=1))) if len(known) else 0.0
+    top = float(np.abs(known).max(initial=0.0))
+    if field == "specific_force":
+        return "g" if size < 3 else "m/s^2" if size < 100 else "mm/s^2"
+    if field == "command":
+        return "1" if top <= 1.01 else "percent" if top <= 100.5 else "pwm16"
+    if field == "rotor_speed":
+        return "rpm" if size / 2 > 3500 else "rad/s"
+    if field == "battery_voltage":
+        return "mV" if size > 100 else "V"
+    if field == "angles":
+        return "deg" if top > 3.2 else "rad"
+    if field == "body_rate":
+        return _rate_unit(known, values)
+    return {"position": "m", "velocity": "m/s"}.get(field, "1")
+
+
+def _rate_unit(rate: np.ndarray, values: Mapping[str, np.ndarray]) -> str:
+    """By how much the attitude turns from row to row, beside how much the gyro changes over the same rows."""
+    if "quaternion" in values and len(values["quaternion"]) == len(rate):
+        q = rotation.tidy(values["quaternion"])
+        turned = np.linalg.norm(rotation.rotation_vector(rotation.multiply(rotation.conjugate(q[:-1]), q[1:])), axis=1)
+        spread = float(np.sum(turned)) / max(len(turned), 1)
+        # Rows of 1 to 20 ms: in rad/s a row turns by 1/1000 to 1/50 of the rate, in deg/s by a 57th of that.
+        ratio = spread / max(float(np.mean(np.linalg.norm(rate, axis=1))), 1e-9)
+        if spread > 1e-5:
+            return "deg/s" if ratio < 7e-4 else "rad/s"
+    return "deg/s" if float(np.abs(rate).max(initial=0.0)) > 40.0 else "rad/s"
