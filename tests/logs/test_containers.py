@@ -36,7 +36,6 @@ KINDS = {
     "a.zip": (zipped("flight.csv"), "zip archive", "unpack"),
     "a.pkl": (pickle.dumps({"t": [0.0]}), "Python pickle", "can run any code"),
     "b.pkl": (pickle.dumps(np.zeros(3)), "NumPy pickle", "can run any code"),
-    "a.ulg": (b"ULog\x01\x12\x35\x01" + bytes(50), "PX4 ULog", "parquet"),
     "a.json": (b'{"t": [0.0]}\n', "JSON", "parquet"),
     "a.html": (b"<!DOCTYPE html><html></html>", "HTML page", "login"),
     "a.npy": (saved(np.save, np.zeros(3)), "NumPy array", "parquet"),

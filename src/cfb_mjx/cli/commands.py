@@ -22,7 +22,7 @@ from cfb_mjx.errors import CfbError
 def import_log(
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")] = (),
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
-    format: Literal["auto", "tabular", "idsia", "mcap", "usd_card", "crazyswarm", "radio_csv"] = "auto",
+    format: Literal["auto", "tabular", "idsia", "mcap", "usd_card", "crazyswarm", "radio_csv", "ulog"] = "auto",
     motor_shift: float | None = None,
     mapping: File = None,
     topics_yaml: File = None,
@@ -37,8 +37,8 @@ def import_log(
     Checks units, frames and time stamps on the way, and says what it changed.
 
     Args:
-        sources: log to read: parquet, csv, MCAP, Crazyflie micro SD card binary, Crazyswarm2 bag, radio csv; several
-            tables, as cfclient writes one per log block, are one flight.
+        sources: log to read: parquet, csv, MCAP, Crazyflie micro SD card binary, ROS bag or its folder, radio csv,
+            .npz, .mat, PX4's ULog; several tables, as cfclient writes one per log block, are one flight.
         output: MCAP file to write.
         format: layout of the source; auto looks at its content.
         motor_shift: s by which to delay the motor columns of an IDSIA log instead of the estimated shift.

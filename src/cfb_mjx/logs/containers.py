@@ -12,7 +12,6 @@ _UNPACK = "unpack it and import what is inside"
 _MARKS: tuple[tuple[bytes, str, str], ...] = (
     (b"version https://git-lfs.github.com", "a Git LFS pointer, not the file itself", "fetch it with: git lfs pull"),
     (b"#ROSBAG V1", "a ROS 1 bag of an old version", "migrate it with: rosbag fix"),
-    (b"ULog\x01\x12\x35", "a PX4 ULog", f"convert it with ulog2csv and {_TO_TABLE}"),
     (b"\x93NUMPY", "a NumPy array (.npy)", f"save several arrays under their names with numpy.savez, or {_TO_TABLE}"),
     (b"\x89HDF\r\n\x1a\n", "an HDF5 file (or a MATLAB file of version 7.3)", f"load it with h5py and {_TO_TABLE}"),
     (b"RRF", "a rerun recording", f"export it with: rerun rrd, or {_TO_TABLE}"),

@@ -9,7 +9,7 @@ from typing import Any
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
-from cfb_mjx.logs import arrays, containers, crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, usd_card
+from cfb_mjx.logs import arrays, containers, crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, ulog, usd_card
 from cfb_mjx.logs.fixes import fix_of
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.flown import flown_part
@@ -17,12 +17,13 @@ from cfb_mjx.logs.proposal import UnknownNames, propose
 from cfb_mjx.logs.validation import validate
 from cfb_mjx.logs.variables import MissingNames, load_mapping
 
-FORMATS = ("mcap", "tabular", "idsia", "usd_card", "crazyswarm", "radio_csv")
+FORMATS = ("mcap", "tabular", "idsia", "usd_card", "crazyswarm", "radio_csv", "ulog")
 _OPTIONS = {
     "idsia": ("motor_shift",),
     "usd_card": ("mapping",),
     "crazyswarm": ("mapping", "topics_yaml", "robot"),
     "radio_csv": ("mapping", "time_unit"),
+    "ulog": ("mapping",),
 }
 _FLAGS = {
     name: "--" + name.replace("_", "-") for name in ("motor_shift", "mapping", "topics_yaml", "robot", "time_unit")
@@ -44,14 +45,14 @@ def read_log(
         block.
         format: one of `FORMATS`; None detects it from the file's content. ``mcap`` is this library's own, ``tabular``
             and ``idsia`` are parquet or csv, ``usd_card`` is the Crazyflie's micro SD card binary, ``crazyswarm`` a
-            ROS bag (MCAP, sqlite3 or ROS 1), ``radio_csv`` a table with firmware variable names as headers. Arrays by
-            name (.npz, .mat) are tables.
+            ROS bag (MCAP, sqlite3 or ROS 1), ``radio_csv`` a table with firmware variable names as headers, ``ulog`` a
+            log of PX4. Arrays by name (.npz, .mat) are tables.
         keep_ground: leave in what is not flight: standing, take-off, landing, being carried. This library's own files
             are never cut.
         fix: changes of convention to make, in this order, as a refusal names them: ``velocity-frame=body``
             (`cfb_mjx.logs.fixes`). Nothing of the kind is done unasked.
         **options: ``motor_shift`` for ``idsia`` (`cfb_mjx.logs.read_idsia`); ``mapping`` for ``usd_card``,
-            ``crazyswarm`` and ``radio_csv``; ``topics_yaml`` and ``robot`` for ``crazyswarm``
+            ``crazyswarm``, ``radio_csv`` and ``ulog``; ``topics_yaml`` and ``robot`` for ``crazyswarm``
             (`cfb_mjx.logs.read_crazyswarm`); ``time_unit`` for ``radio_csv`` (`cfb_mjx.logs.read_radio_csv`). An
             option that is None counts as not given.
 
@@ -95,6 +96,8 @@ def _read(paths: list[Path], format: str, options: dict[str, Any], tables: dict[
         return mcap_reader.read_mcap(path)
     if format == "usd_card":
         return usd_card.read_usd_card(path, **options)
+    if format == "ulog":
+        return ulog.read_ulog(path, **options)
     if format == "crazyswarm":
         return crazyswarm.read_crazyswarm(path, **options)
     found = [tables.get(p) or _table(p) for p in paths]
@@ -149,6 +152,8 @@ def _detect(paths: list[Path], options: dict[str, Any], tables: dict[Path, tabul
             return "crazyswarm"
         raise CfbError(f"{path}: this is a folder and not one of a ROS 2 bag; give the log itself.")
     head = read_bytes(path, 64)
+    if head.startswith(ulog.MAGIC):
+        return "ulog"
     if head.startswith((ros_bag.SQLITE, ros_bag.ROS1)):
         return "crazyswarm"
     if head.startswith(usd_card.MAGIC):

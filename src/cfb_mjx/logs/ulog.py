@@ -1,0 +1,56 @@
+"""Reader of PX4's ULog, by the library `pyulog <https://github.com/PX4/pyulog>`_."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import shipped
+from cfb_mjx.logs.assembly import Import, assemble
+from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.streams import Stream, ordered
+from cfb_mjx.logs.variables import VariableMap, load_mapping
+
+MAGIC = b"ULog\x01\x12\x35"
+
+
+def read_ulog(path: str | os.PathLike, mapping: str | os.PathLike | VariableMap | None = None) -> FlightLog:
+    """Read a PX4 log. `read_log` also validates the content.
+
+    Args:
+        path: the ``.ulg``.
+        mapping: which topic is which column; a mapping file, or None for ``configs/logs/px4.yaml``.
+
+    Raises:
+        CfbError: unreadable or damaged file, topics of a flight that were not logged, fewer than two rows.
+    """
+    from pyulog import ULog
+
+    path = Path(path)
+    if not isinstance(mapping, VariableMap):
+        mapping = load_mapping(shipped("configs", "logs", "px4.yaml") if mapping is None else mapping)
+    wanted = {v for choices in mapping.choices.values() for c in choices for v in c.variables}
+    try:
+        log = ULog(str(path), sorted({name.split(".")[0] for name in wanted}))
+    except Exception as error:  # of damaged bytes come errors of struct, lookups and text
+        reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
+        raise CfbError(f"{path}: the PX4 ULog is damaged or cut short ({reason}); copy it again.") from None
+    notes: list[str] = []
+    warnings: list[str] = []
+    if log.file_corruption:
+        warnings.append("the PX4 ULog is damaged in places, which were left out.")
+    streams = []
+    for data in log.data_list:
+        names = {f"{data.name}.{field}": field for field in data.data if f"{data.name}.{field}" in wanted}
+        if data.multi_id == 0 and names:
+            time = data.data["timestamp"].astype(np.float64) * 1e-6
+            values = {name: np.asarray(data.data[field], np.float64) for name, field in names.items()}
+            streams.append(ordered(Stream(data.name, time, values), path, notes, overtaking=0.1))
+    try:
+        return assemble(Import("ulog", streams, None, notes, warnings), mapping, path)
+    except CfbError as error:
+        said = str(error).removeprefix(f"{path}: ")
+        raise CfbError(f"{path}: the PX4 ULog: {said}") from None
