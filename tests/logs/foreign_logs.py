@@ -272,3 +272,84 @@ def write_crazyflies_yaml(path, topics, robot="cf231"):
     robots = {robot: {"enabled": True, "type": "cf21bl", **blocks[0]}, "cf5": {"enabled": False, "type": "cf21bl"}}
     document = {"fileversion": 3, "robots": robots, "robot_types": {"cf21bl": blocks[1]}, "all": blocks[2]}
     path.write_text(yaml.safe_dump(document))
+
+
+def _filled(kind, content, store):
+    """A message of the bag library from nested mappings."""
+    from rosbags.interfaces import Nodetype
+
+    values = {}
+    for name, (node, detail) in store.get_msgdef(kind).fields:
+        given = content.get(name)
+        if node == Nodetype.NAME:
+            values[name] = _filled(detail, given or {}, store)
+        elif node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            values[name] = np.asarray(given, dtype=detail[0][1][0])
+        else:
+            values[name] = given if given is not None else ("" if detail[0] == "string" else 0)
+    return store.types[kind](**values)
+
+
+def write_sqlite(folder, messages, bits):
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    kind = "crazyflie_interfaces/msg/LogDataGeneric"
+    definition = f"std_msgs/Header header\nuint32 timestamp\nfloat{bits}[] values\n"
+    store.register(get_types_from_msg(definition, kind))
+    with Writer(folder, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        connections = {}
+        for stamp, topic, kind, content in messages:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], stamp, store.serialize_cdr(_filled(kind, content, store), kind))
+
+
+def write_ros1(path, messages):
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    kind = "crazyflie_driver/msg/GenericLogData"
+    store.register(get_types_from_msg("std_msgs/Header header\nfloat64[] values\n", kind))
+    with Writer(path) as writer:
+        connections = {}
+        for stamp, topic, name, content in messages:
+            name = kind if "LogData" in name else name
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, name, typestore=store)
+            writer.write(connections[topic], stamp, store.serialize_ros1(_filled(name, content, store), name))
+
+
+ULOG_TOPICS = {
+    "vehicle_local_position": "uint64_t timestamp;float x;float y;float z;float vx;float vy;float vz;",
+    "vehicle_attitude": "uint64_t timestamp;float[4] q;",
+    "sensor_combined": "uint64_t timestamp;float[3] gyro_rad;float[3] accelerometer_m_s2;",
+    "actuator_motors": "uint64_t timestamp;float[4] control;",
+    "battery_status": "uint64_t timestamp;float voltage_v;",
+}
+_DOWN = np.array([1.0, -1.0, -1.0])
+
+
+def _ulog_message(kind, body):
+    return struct.pack("<HB", len(body), ord(kind)) + body
+
+
+def ulog(log, topics=tuple(ULOG_TOPICS)):
+    """The flight as PX4 writes it: north east down, forward right down, its own motor order."""
+    values = {
+        "vehicle_local_position": np.concatenate([log.position * _DOWN, log.velocity * _DOWN], axis=1),
+        "vehicle_attitude": log.quaternion * [1, 1, -1, -1],
+        "sensor_combined": np.concatenate([log.body_rate * _DOWN, log.specific_force * _DOWN], axis=1),
+        "actuator_motors": log.command[:, [0, 2, 3, 1]],
+        "battery_status": log.battery_voltage[:, None],
+    }
+    data = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0) + _ulog_message("B", bytes(40))
+    data += b"".join(_ulog_message("F", f"{name}:{ULOG_TOPICS[name]}".encode()) for name in topics)
+    data += b"".join(_ulog_message("A", struct.pack("<BH", 0, i) + name.encode()) for i, name in enumerate(topics))
+    for row, time in enumerate(log.time):
+        for i, name in enumerate(topics):
+            numbers = values[name][row].astype("<f4").tobytes()
+            data += _ulog_message("D", struct.pack("<HQ", i, round(1e6 * (5 + time))) + numbers)
+    return data

@@ -81,58 +81,10 @@ def topics(tmp_path_factory):
     return path
 
 
-def filled(kind, content, store):
-    """A message of the bag library from nested mappings."""
-    from rosbags.interfaces import Nodetype
-
-    values = {}
-    for name, (node, detail) in store.get_msgdef(kind).fields:
-        given = content.get(name)
-        if node == Nodetype.NAME:
-            values[name] = filled(detail, given or {}, store)
-        elif node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            values[name] = np.asarray(given, dtype=detail[0][1][0])
-        else:
-            values[name] = given if given is not None else ("" if detail[0] == "string" else 0)
-    return store.types[kind](**values)
-
-
-def write_sqlite(folder, messages, bits):
-    from rosbags.rosbag2 import StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    kind = "crazyflie_interfaces/msg/LogDataGeneric"
-    definition = f"std_msgs/Header header\nuint32 timestamp\nfloat{bits}[] values\n"
-    store.register(get_types_from_msg(definition, kind))
-    with Writer(folder, version=8, storage_plugin=StoragePlugin.SQLITE3) as writer:
-        connections = {}
-        for stamp, topic, kind, content in messages:
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=store)
-            writer.write(connections[topic], stamp, store.serialize_cdr(filled(kind, content, store), kind))
-
-
-def write_ros1(path, messages):
-    from rosbags.rosbag1 import Writer
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.ROS1_NOETIC)
-    kind = "crazyflie_driver/msg/GenericLogData"
-    store.register(get_types_from_msg("std_msgs/Header header\nfloat64[] values\n", kind))
-    with Writer(path) as writer:
-        connections = {}
-        for stamp, topic, name, content in messages:
-            name = kind if "LogData" in name else name
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, name, typestore=store)
-            writer.write(connections[topic], stamp, store.serialize_ros1(filled(name, content, store), name))
-
-
 @pytest.mark.parametrize("bits", [32, 64])
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_bag_in_sqlite_is_read(flight, messages, topics, tmp_path, bits, whole):
-    write_sqlite(tmp_path / "bag", messages, bits)
+    foreign.write_sqlite(tmp_path / "bag", messages, bits)
     (database,) = (tmp_path / "bag").glob("*.db3")
     log = read_log(tmp_path / "bag" if whole else database, topics_yaml=topics)
     for field in ("position", "velocity", "body_rate", "specific_force"):
@@ -144,7 +96,7 @@ def test_a_bag_in_sqlite_is_read(flight, messages, topics, tmp_path, bits, whole
 
 def test_a_bag_of_ros_1_is_read(flight, messages, tmp_path):
     path = tmp_path / "flight.bag"
-    write_ros1(path, messages)
+    foreign.write_ros1(path, messages)
     names = tmp_path / "launch.yaml"
     names.write_text(
         f"genericLogTopics: [imu, state]\ngenericLogTopic_imu_Variables: {IMU + MOTOR}\n"

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import rotation
 from cfb_mjx.logs.flight_log import FlightLog, quantise_time
 
 _CARRIES = 0.5  # of the command in hover: with less for longer than a flip lasts nothing flies
@@ -20,6 +21,8 @@ _SHORTEST = 0.2  # s: a stretch of flight shorter than this tells nothing
 _LEAP = 0.3  # m by which a position leaps against what the velocity says: no estimate of a flight does
 _BACK = 1.0  # s within which an excursion of the motion capture comes back
 _FROZEN = 0.15  # s that an estimate may stay the same to the last bit
+_FAR = 60.0  # usual bends of a signal from which a single value sticks out, if it is at least so far off:
+_STICKS_OUT = {"position": 0.05, "velocity": 0.3, "quaternion": 0.05, "body_rate": 2.0, "specific_force": 15.0}
 _RARELY = 0.2  # a fault in more than this share of the rows is no fault but what such a file is like
 _UNDER_COMMAND = 0.15  # of full: a brushless rotor turns at a third of its speed
 _SPIN_UP = 0.1  # s after which a motor under command has left standstill
@@ -46,6 +49,7 @@ def flown_part(log: FlightLog, path: Path, keep_ground: bool = False) -> FlightL
     if not all(np.isfinite(getattr(log, f)).all() for f in ("position", "velocity", "quaternion")):
         return log
     log = _without(log, _leaps(log), "the position leaps by more than the velocity allows", warnings)
+    log = _without(log, _spikes(log), "single rows stick out of both their neighbours", warnings)
     log = _without(log, _frozen(log), "position, velocity and attitude stay the same to the last bit", warnings)
     if not notes and not warnings:
         return log
@@ -135,6 +139,27 @@ def _leaps(log: FlightLog) -> np.ndarray:
         bad[max(first - 1, 0) : last + 2] = True
         at += 1
     return bad
+
+
+def _spikes(log: FlightLog) -> np.ndarray:
+    """Rows in which one value is far from the two beside it, which agree: a bad packet, a changed digit."""
+    bad = np.zeros(len(log), dtype=bool)
+    if len(log) < 20:
+        return bad
+    for field, least in _STICKS_OUT.items():
+        values = getattr(log, field)
+        if not np.isfinite(values).all():
+            continue
+        if field == "quaternion":  # whose sign may jump
+            if np.linalg.norm(values, axis=1).min() < 0.5:
+                continue
+            values = rotation.tidy(values)
+        bend = values[1:-1] - (values[:-2] + values[2:]) / 2
+        across = np.abs(values[2:] - values[:-2])
+        usual = 1.4826 * np.median(np.abs(bend), axis=0)
+        out = np.abs(bend) > np.maximum(_FAR * usual, least)
+        bad[1:-1] |= (out & (across < 0.2 * np.abs(bend))).any(axis=1)
+    return bad if bad.mean() < 0.02 else np.zeros(len(log), dtype=bool)
 
 
 def _frozen(log: FlightLog) -> np.ndarray:

@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
 from cfb_mjx.logs import arrays, containers, crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, ulog, usd_card
-from cfb_mjx.logs.fixes import fix_of
+from cfb_mjx.logs.fixes import Fix, fix_of
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.flown import flown_part
 from cfb_mjx.logs.proposal import UnknownNames, propose
@@ -79,6 +81,20 @@ def read_log(
         flags = ", ".join(_FLAGS.get(name, name) for name in unknown)
         raise CfbError(f"{first}: the {format} format has no option {flags}; leave it out.")
     changes = [fix_of(name) for name in fix]
+    # What damage or another unit makes of numbers may overflow; the checks find it.
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        return _checked(paths, format, options, tables, changes, keep_ground)
+
+
+def _checked(
+    paths: list[Path],
+    format: str,
+    options: dict[str, Any],
+    tables: dict[Path, tabular.Table],
+    changes: list[Fix],
+    keep_ground: bool,
+) -> FlightLog:
+    first = paths[0]
     log = _read(paths, format, options, tables)
     for change in changes:
         log = change.apply(log)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 from pathlib import Path
 
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import shipped
+from cfb_mjx.files import read_bytes, shipped
 from cfb_mjx.logs.assembly import Import, assemble
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.streams import Stream, ordered
@@ -33,14 +35,21 @@ def read_ulog(path: str | os.PathLike, mapping: str | os.PathLike | VariableMap 
     if not isinstance(mapping, VariableMap):
         mapping = load_mapping(shipped("configs", "logs", "px4.yaml") if mapping is None else mapping)
     wanted = {v for choices in mapping.choices.values() for c in choices for v in c.variables}
+    said = io.StringIO()
+    data = read_bytes(path)
+    whole = _framed(data)
     try:
-        log = ULog(str(path), sorted({name.split(".")[0] for name in wanted}))
+        if not any(data[at + 2] in b"AL" for at in whole[1]):
+            raise ValueError("it ends before its data")
+        # The library prints what it finds damaged.
+        with contextlib.redirect_stdout(said):
+            log = ULog(io.BytesIO(data[: whole[0]]), sorted({name.split(".")[0] for name in wanted}))
     except Exception as error:  # of damaged bytes come errors of struct, lookups and text
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise CfbError(f"{path}: the PX4 ULog is damaged or cut short ({reason}); copy it again.") from None
-    notes: list[str] = []
+    notes: list[str] = ["a PX4 ULog has no checksums, so damage to values in it would go unnoticed."]
     warnings: list[str] = []
-    if log.file_corruption:
+    if log.file_corruption or said.getvalue() or whole[0] < len(data):
         warnings.append("the PX4 ULog is damaged in places, which were left out.")
     streams = []
     for data in log.data_list:
@@ -52,5 +61,20 @@ def read_ulog(path: str | os.PathLike, mapping: str | os.PathLike | VariableMap 
     try:
         return assemble(Import("ulog", streams, None, notes, warnings), mapping, path)
     except CfbError as error:
-        said = str(error).removeprefix(f"{path}: ")
-        raise CfbError(f"{path}: the PX4 ULog: {said}") from None
+        raise CfbError(f"{path}: the PX4 ULog: {str(error).removeprefix(f'{path}: ')}") from None
+
+
+_HEADER = 16
+_DEFINITIONS, _DATA = frozenset(b"BFIMPQ"), frozenset(b"ARDLCSO")
+
+
+def _framed(data: bytes) -> tuple[int, list[int]]:
+    """How far messages follow each other as they must, and where they begin: the library looks for more for ever."""
+    at, starts = _HEADER, []
+    while at + 3 <= len(data):
+        size = int.from_bytes(data[at : at + 2], "little")
+        if data[at + 2] not in _DEFINITIONS | _DATA or at + 3 + size > len(data):
+            break
+        starts.append(at)
+        at += 3 + size
+    return at, starts
