@@ -165,3 +165,50 @@ def test_archives_that_are_not_read(tmp_path, data, said):
     with pytest.raises(CfbError, match=said) as error:
         read_log(path)
     assert "\n" not in str(error.value)
+
+
+def test_a_log_of_gym_pybullet_drones(flight, tmp_path):
+    """States (drones, 16, steps): Euler angles, angular velocity in the world, rpm; no commands."""
+    from cfb_mjx.logs import rotation
+
+    world = rotation.to_world(flight.quaternion, flight.body_rate)
+    angles = np.radians(roll_pitch_yaw(flight.quaternion))
+    rpm = flight.rotor_speed.T * 30 / np.pi
+    states = np.concatenate([flight.position.T, flight.velocity.T, angles, world.T, rpm])[None]
+    path = tmp_path / "flight.npz"
+    np.savez(path, timestamps=flight.time[None], states=states, controls=np.zeros((1, 12, len(flight))))
+    with pytest.raises(UnknownNames) as error:
+        read_log(path)
+    mapping = tmp_path / "mine.yaml"
+    mapping.write_text(error.value.mapping)
+    log = read_log(path, mapping=mapping)
+    assert np.abs(log.body_rate - flight.body_rate).max() < 1e-9
+    assert np.abs(log.rotor_speed - flight.rotor_speed).max() < 1e-6
+    assert np.abs(log.command - flight.command)[5:-5].max() < 0.06
+    assert sum("not logged" in warning for warning in log.metadata["warnings"]) == 2
+    np.savez(path, timestamps=np.zeros((2, 5)), states=np.zeros((2, 16, 5)))
+    with pytest.raises(CfbError, match="the flights of 2 drones"):
+        read_log(path)
+
+
+def test_a_log_of_rotorpy(flight, tmp_path):
+    """RotorPy writes r1..r4 in rad/s and no accelerometer."""
+    columns = {"time": flight.time}
+    columns |= dict(zip("xyz", flight.position.T, strict=True))
+    columns |= {f"{a}dot": c for a, c in zip("xyz", flight.velocity.T, strict=True)}
+    columns |= {f"q{a}": c for a, c in zip("wxyz", flight.quaternion.T, strict=True)}
+    columns |= {f"w{a}": c for a, c in zip("xyz", flight.body_rate.T, strict=True)}
+    columns |= {f"wind{a}": 0 * flight.time for a in "xyz"} | {
+        f"r{i}": c for i, c in enumerate(flight.rotor_speed.T, 1)
+    }
+    path = tmp_path / "flight.csv"
+    rows = np.stack(list(columns.values()), axis=1)
+    path.write_text("\n".join([",".join(columns), *(",".join(repr(float(x)) for x in row) for row in rows), ""]))
+    with pytest.raises(UnknownNames) as error:
+        read_log(path)
+    mapping = tmp_path / "mine.yaml"
+    mapping.write_text(error.value.mapping)
+    log = read_log(path, mapping=mapping)
+    assert np.abs(log.velocity - flight.velocity).max() < 1e-9
+    assert np.abs(log.rotor_speed - flight.rotor_speed).max() < 1e-6
+    assert np.abs(log.specific_force - flight.specific_force)[3:-3].max() < 1.0

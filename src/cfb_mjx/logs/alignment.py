@@ -150,6 +150,12 @@ def nominal_speeds(log: FlightLog) -> np.ndarray:
     return speed
 
 
+def nominal_command(time: np.ndarray, rotor_speed: np.ndarray) -> np.ndarray:
+    """Commands (n, 4) in [0, 1] with which a first-order motor of 50 ms turns the rotors (rad/s) as they turned."""
+    slope = np.gradient(rotor_speed, time, axis=0) if len(time) > 1 else np.zeros_like(rotor_speed)
+    return np.clip((rotor_speed + _TIME_CONSTANT * slope) / _GAIN, 0.0, 1.0)
+
+
 def nominal_thrust(rotor_speed: np.ndarray) -> np.ndarray:
     """Thrust, N, of each rotor at a speed, rad/s, of the nominal drone."""
     return np.polyval(_THRUST, rotor_speed / _GAIN)

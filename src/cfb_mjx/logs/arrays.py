@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import rotation
+from cfb_mjx.logs.assembly import from_euler
 from cfb_mjx.logs.tabular import Table
 
 NPZ, MAT = b"PK\x03\x04", b"MATLAB 5.0"
@@ -43,6 +45,8 @@ def read_arrays(path: Path) -> Table:
     """
     with_head = path.read_bytes()[: len(MAT)]
     arrays = _mat(path) if with_head.startswith(MAT) else _npz(path)
+    if set(arrays) >= {"timestamps", "states"} and arrays["states"].ndim == 3 and arrays["states"].shape[1] == 16:
+        return _of_pybullet(path, arrays)
     arrays = {name: np.squeeze(values) for name, values in arrays.items() if values.dtype.kind in _NUMBERS}
     lengths = [max(v.shape) for v in arrays.values() if v.ndim and v.size > 1]
     if not lengths:
@@ -69,6 +73,23 @@ def read_arrays(path: Path) -> Table:
             table.notes.append(
                 f"array {name} has {columns.shape[1]} columns, which say nothing of themselves; left out."
             )
+    return table
+
+
+def _of_pybullet(path: Path, arrays: dict[str, np.ndarray]) -> Table:
+    """A log of gym-pybullet-drones: position, velocity, Euler angles, angular velocity in *world* axes, rpm."""
+    states, time = arrays["states"], np.atleast_2d(arrays["timestamps"])
+    if len(states) != 1:
+        raise CfbError(f"{path}: holds the flights of {len(states)} drones; save them one by one.")
+    position, velocity, angles, turning, rpm = np.split(states[0].T.astype(float), [3, 6, 9, 12], axis=1)
+    quaternion = from_euler(angles)
+    rate = rotation.to_body(quaternion, turning)
+    said = "a log of gym-pybullet-drones: its angular velocity was turned from world into body axes."
+    table = Table({"t": time[0].astype(float)}, [said])
+    for stem, values in (("pos_", position), ("vel_", velocity), ("gyro_", rate)):
+        table |= {f"{stem}{axis}": column for axis, column in zip("xyz", values.T, strict=True)}
+    table |= {f"quat_{axis}": column for axis, column in zip("wxyz", quaternion.T, strict=True)}
+    table |= {f"rpm{i}": column for i, column in enumerate(rpm.T, 1)}
     return table
 
 

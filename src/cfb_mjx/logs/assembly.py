@@ -10,18 +10,20 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
+from cfb_mjx.logs.alignment import nominal_command
 from cfb_mjx.logs.flight_log import REQUIRED, FlightLog, quantise_time
 from cfb_mjx.logs.streams import Stream, central_difference, fresh, hold, neighbours
 from cfb_mjx.logs.variables import Choice, VariableMap
 
 _DERIVED = {
-    "velocity": "velocity: not logged; central differences of the positions, which look one sample ahead and "
-    "carry their "
-    "noise. Log stateEstimate.vx vy vz.",
+    "velocity": "velocity: not logged; central differences of the positions, which look one sample ahead and carry "
+    "their noise. Log stateEstimate.vx vy vz.",
     "body_rate": "body rate: not logged; central differences of the attitude, as late and as smooth as that is. Log "
     "gyro.x y z.",
     "specific_force": "specific force: not logged; central differences of the velocity plus gravity, in body axes, as "
     "late and as smooth as that is. Log acc.x y z.",
+    "command": "command: not logged; what a nominal motor of the Crazyflie would have needed for these rotor "
+    "speeds. Log the duty.",
 }
 _GRAVITY = np.array([0.0, 0.0, 9.81])
 _LATE = 0.002  # s of average age of a held pose worth a note: a quarter of the observation delay assumed otherwise
@@ -174,6 +176,11 @@ class _Merger:
             rate = _turning_rate(source, rotation.tidy(unit))
             rate, self.usable[field] = self._place_all(source, rate)
             return rate
+        if field == "command":
+            # Readings are of one time, whatever field asks for them.
+            speed, known = fields["rotor_speed"], np.isfinite(fields["rotor_speed"]).all(axis=1)
+            self.usable[field] = known
+            return nominal_command(self.reference.time, np.where(known[:, None], speed, 0.0))
         if field == "velocity":
             source, position = self._samples("position", fields)
             velocity, self.usable[field] = self._place_all(source, central_difference(source, position))

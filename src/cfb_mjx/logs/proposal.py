@@ -13,7 +13,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
 from cfb_mjx.logs.radio_csv import clock_of
 from cfb_mjx.logs.tabular import Text
-from cfb_mjx.logs.variables import FORMAT
+from cfb_mjx.logs.variables import DERIVED_FROM, FORMAT
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 _MEMBERS = {**_AXES, "w": 3, **{str(i): i for i in range(5)}}
@@ -25,7 +25,7 @@ _STEMS: tuple[tuple[str, str], ...] = (
     ("quaternion", r"q(uat(ernion)?)?|orientation|rot(ation)?|att(itude)?|poseorientation"),
     ("position", r"|p(os(ition)?)?|translation|loc(ation)?|poseposition"),
     ("command", r"u|m(otor)?s?|pwm|cmds?|commands?|duty|throttle|action|motorpwm|motorcmd|thrustpwm|mpwm"),
-    ("rotor_speed", r"rpms?|rotor(speed)?s?|motor(rpm|speed)s?|omegam|erpm|mrpm"),
+    ("rotor_speed", r"r|rpms?|rotor(speed)?s?|motor(rpm|speed)s?|omegam|erpm|mrpm"),
 )
 _ANGLES = re.compile(r"(.*?)(roll|pitch|yaw|phi|theta|psi)", re.IGNORECASE)
 _BATTERY = re.compile(r"(pm)?v?bat(tery)?(_?(voltage|v|mv))?|voltage|vbat.*", re.IGNORECASE)
@@ -64,7 +64,11 @@ def propose(table: Mapping[str, np.ndarray | Text]) -> Proposal | None:
         names = [angles.get(a) or angles.get(b) for a, b in (("roll", "phi"), ("pitch", "theta"), ("yaw", "psi"))]
         if None not in names:
             found["angles"] = names
-    if not {"position", "command"} <= set(found) or not {"quaternion", "angles"} & set(found):
+    if (
+        "position" not in found
+        or not {"quaternion", "angles"} & set(found)
+        or not {"command", "rotor_speed"} & set(found)
+    ):
         return None
     battery = next((n for n in numbers if _BATTERY.fullmatch(_plain(n))), None)
     if battery is not None:
@@ -114,7 +118,7 @@ def _document(found: dict[str, list[str]], numbers: Mapping[str, np.ndarray]) ->
         elif field != "quaternion":
             entry["unit"] = unit
         fields["quaternion" if field == "angles" else field] = [entry]
-    for field, source in (("velocity", "position"), ("body_rate", "quaternion"), ("specific_force", "velocity")):
+    for field, source in DERIVED_FROM.items():
         if field not in fields:
             fields[field] = [{"derived": source}]
     body = yaml.safe_dump(

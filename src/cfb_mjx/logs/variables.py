@@ -36,7 +36,12 @@ FIELDS = tuple(f for f in (*REQUIRED, *OPTIONAL) if f != "time")
 _WIDTH = {"quaternion": 4, "command": 4, "rotor_speed": 4, "battery_voltage": 1}
 _FORM_WIDTH = {"components": 4, "compressed": 1, "euler": 3}
 _FRAMES = {"velocity": "world", "specific_force": "body"}  # the only fields with a choice, and its default
-DERIVED_FROM = {"velocity": "position", "body_rate": "quaternion", "specific_force": "velocity"}
+DERIVED_FROM = {
+    "velocity": "position",
+    "body_rate": "quaternion",
+    "specific_force": "velocity",
+    "command": "rotor_speed",
+}
 """What a field can be derived from where it was not logged: its derivative is it, or holds it."""
 _CHOICE_KEYS = {"variables", "unit", "sign", "frame", "form", "invalid"}
 _FIRMWARE_KEYS = ("version", "battery_compensation", "thrust_limit")
@@ -95,7 +100,8 @@ class VariableMap:
             CfbError: a required field has none; the message lists what is missing and what was found.
         """
         found = {}
-        for field in FIELDS:
+        # What others are derived from comes first.
+        for field in sorted(FIELDS, key=lambda f: (f == "command", FIELDS.index(f))):
             for choice in self.choices.get(field, ()):
                 usable = choice.derived in found if choice.derived else all(v in available for v in choice.variables)
                 if usable:
