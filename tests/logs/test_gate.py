@@ -71,6 +71,13 @@ def test_what_no_change_mends_is_a_warning_with_its_time(flown):
     assert validate(log, "x").metadata["warnings"] == log.metadata["warnings"]  # not said twice
 
 
+@pytest.mark.parametrize("scale", [0.6, 1.6])
+def test_a_sensor_that_is_off_by_some_factor_is_a_fault_to_find(flown, scale):
+    """Not a unit: identification names it, so the log is read."""
+    log = validate(flown.replace(velocity=scale * flown.velocity), "x")
+    assert any("contradict" in w and "no change of unit" in w for w in log.metadata["warnings"])
+
+
 def test_a_derived_signal_is_not_compared_with_its_source(flown):
     log = flown.replace(metadata={"variables": {"body_rate": {"derived": "quaternion"}}})
     assert {r.name for r in judge(log).relations} >= {"displacement", "velocity"}

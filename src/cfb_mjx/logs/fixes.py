@@ -78,7 +78,7 @@ _QUATERNIONS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     ),
     "zxyw": ("reading the quaternion as [z, x, y, w]", lambda q: q[:, [3, 1, 2, 0]]),
 }
-_COMMANDS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+COMMAND_UNITS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "percent": ("look like percent; divide the commands by 100", lambda u: u / 100.0),
     "pwm16": ("look like raw PWM in 0..65535; divide the commands by 65535", lambda u: u / 65535.0),
     "dshot": (
@@ -93,6 +93,9 @@ _COMMANDS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "0-1000": ("look like per mille; divide the commands by 1000", lambda u: u / 1000.0),
     "1023": ("look like 10-bit values in 0..1023; divide the commands by 1023", lambda u: u / 1023.0),
 }
+
+
+"""What commands that are no duty look like, with the remedy, and the duty they stand for."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +173,7 @@ def command_fixes() -> list[Fix]:
     """Units of commands that are not duty."""
     return [
         Fix(f"command-unit={unit}", words, lambda log, f=f: log.replace(command=f(log.command)))
-        for unit, (words, f) in _COMMANDS.items()
+        for unit, (words, f) in COMMAND_UNITS.items()
     ]
 
 

@@ -9,13 +9,14 @@ import numpy as np
 from cfb_mjx.logs import consistency
 from cfb_mjx.logs.alignment import nominal_speeds, nominal_thrust
 from cfb_mjx.logs.consistency import ORDER, Relation
-from cfb_mjx.logs.fixes import Fix, candidates, command_fixes, motor_fix
+from cfb_mjx.logs.fixes import COMMAND_UNITS, Fix, candidates, motor_fix
 from cfb_mjx.logs.flight_log import FlightLog
 
 _ROWS = 6000  # of a long log that decide: the liveliest stretch
 _UNTOLD, _GONE = 0.5, 2.0  # cost of an axis that moved before a change and does not after it, or cannot be compared
 _DISORDER = 0.2  # share of rows whose position leaps
 _GAIN = (1100.0, 6500.0)  # rad/s of a rotor for a command of one, brushed and brushless
+_UNIT = 0.13  # by which a slope may be off after a change of unit: estimators stretch velocities by a tenth
 _MUCH = 1.5  # of the cost that a change takes off without mending all
 _ALIKE = 0.1  # changes that leave about as little are told as alternatives
 _PAIRS = 3  # of the best single changes are tried with a second one
@@ -178,10 +179,19 @@ def _tried(log: FlightLog, moved: frozenset) -> list[tuple[float, int, Fix, int]
     found = []
     for rank, fix in enumerate(candidates()):
         if not fix.name.startswith("command"):
-            cost, bad = _cost(consistency.kinematics(fix.apply(log)), moved)
-            if np.isfinite(cost):
+            relations = consistency.kinematics(fix.apply(log))
+            cost, bad = _cost(relations, moved)
+            if np.isfinite(cost) and _exact(fix, relations):
                 found.append((cost, bad, fix, rank))
     return found
+
+
+def _exact(fix: Fix, relations: list[Relation]) -> bool:
+    """Whether a change of scale brings slopes to one: a sensor that is 40 % off is a fault to find, not knots."""
+    if "unit" not in fix.name and "scale" not in fix.name:
+        return True
+    compared = [r for r in relations if r.moves and r.name in ("displacement", "attitude", "velocity")]
+    return all(abs(r.slope / max(r.correlation, 0.1) - 1) < _UNIT for r in compared if r.correlation > 0.8)
 
 
 def _disorder(log: FlightLog) -> str | None:
@@ -355,13 +365,19 @@ def carried_mass(rotor_speed: np.ndarray, force: float) -> float:
 
 
 def command_unit(command: np.ndarray, force: float) -> str | None:
-    """What commands outside [0, 1] look like, with the remedy; None if like nothing known."""
+    """What commands outside [0, 1] look like, with the remedy; None if like nothing known.
+
+    Args:
+        command: (n, 4) as logged.
+        force: specific force in flight, m/s^2.
+    """
     low, high = _MASSES
-    for fix in _by_range(command):
-        duty = fix.apply(FlightOnly(command)).command
-        typical = np.median(duty, axis=0)
-        if duty.min() > -0.05 and duty.max() < 1.02 and low < carried_mass(2900.0 * typical, force) < high:
-            return f"{fix.words} (--fix {fix.name})"
+    for unit in _by_range(command):
+        words, to_duty = COMMAND_UNITS[unit]
+        duty = to_duty(command)
+        mass = carried_mass(2900.0 * np.median(duty, axis=0), force)
+        if duty.min() > -0.05 and duty.max() < 1.02 and low < mass < high:
+            return f"{words} (--fix command-unit={unit})"
     total = float(np.sum(np.median(command, axis=0)))
     for unit, newton in (("grams", 9.81e-3), ("millinewtons", 1e-3)):
         if low < total * newton / force < high:
@@ -369,33 +385,20 @@ def command_unit(command: np.ndarray, force: float) -> str | None:
     return None
 
 
-def _by_range(command: np.ndarray) -> list[Fix]:
+_TOPS = {
+    "percent": 100.5,
+    "0-255": 255.5,
+    "0-1000": 1000.5,
+    "1023": 1023.5,
+    "us": 2100.0,
+    "dshot": 2047.5,
+    "pwm16": 65535.5,
+}
+
+
+def _by_range(command: np.ndarray) -> list[str]:
     """Units in the order in which their range fits: the narrowest that holds all values first."""
-    tops = {
-        "percent": 100.5,
-        "0-255": 255.5,
-        "0-1000": 1000.5,
-        "1023": 1023.5,
-        "us": 2100.0,
-        "dshot": 2047.5,
-        "pwm16": 65535.5,
-    }
     top, bottom = float(command.max()), float(command[command > 0].min(initial=np.inf))
-    fixes = {fix.name.split("=")[1]: fix for fix in command_fixes()}
-    order = [u for u, limit in sorted(tops.items(), key=lambda t: t[1]) if top <= limit]
-    if bottom >= 900.0 and top <= 2100.0:
-        order = ["us", *[u for u in order if u != "us"]]
-    elif top <= 2047.5 and top > 255.5:
-        order = ["dshot", *[u for u in order if u != "dshot"]]
-    return [fixes[u] for u in order]
-
-
-@dataclasses.dataclass(frozen=True)
-class FlightOnly:
-    """Stands for a log where only its commands matter."""
-
-    command: np.ndarray
-
-    def replace(self, command: np.ndarray) -> FlightOnly:
-        """With other commands."""
-        return FlightOnly(command)
+    order = [unit for unit, limit in sorted(_TOPS.items(), key=lambda t: t[1]) if top <= limit]
+    likely = "us" if bottom >= 900.0 and top <= 2100.0 else "dshot" if 255.5 < top <= 2047.5 else ""
+    return sorted(order, key=lambda unit: unit != likely)
