@@ -114,7 +114,19 @@ def test_the_flag_that_breaks_derivatives_of_the_mjx_body_is_taken_back(monkeypa
     from cfb_mjx.cli import runtime
 
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+    monkeypatch.setattr(runtime.metadata, "version", lambda name: {"jaxlib": "0.10.1"}[name])
     runtime.set_up_xla()
     assert runtime.XLA_CPU_FLAGS in os.environ["XLA_FLAGS"]
     runtime.differentiate_mjx()
     assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=2"
+
+
+@pytest.mark.parametrize("version", ["0.11.0", "0.12.0.1", "1.0.0"])
+def test_an_option_that_slows_newer_jaxlibs_down_is_not_set_for_them(monkeypatch, version):
+    """With jaxlib 0.12 a rollout that keeps its states ran 150 times slower with it."""
+    from cfb_mjx.cli import runtime
+
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    monkeypatch.setattr(runtime.metadata, "version", lambda name: {"jaxlib": version}[name])
+    runtime.set_up_xla()
+    assert "xla_backend_extra_options" not in os.environ.get("XLA_FLAGS", "")

@@ -99,7 +99,11 @@ MOVING = tuple((name, axis) for name in ("displacement", "velocity") for axis in
 TURNING = (("attitude", X), ("attitude", Y))
 SHOVED = (("velocity", X), ("velocity", Y))
 CONTRADICTIONS: dict[str, Contradiction] = {
-    "velocity negated": Contradiction(axes("velocity", signs=(-1, -1, -1)), ("velocity-axes=-x,-y",), MOVING),
+    "velocity negated": Contradiction(
+        axes("velocity", signs=(-1, -1, -1)),
+        ("velocity-axes=-x,-y", "velocity-axes=x,-y", "velocity-axes=-x,y"),
+        MOVING,
+    ),
     "velocity y negated": Contradiction(
         axes("velocity", signs=(1, -1, 1)), ("velocity-axes=x,-y,z",), (("displacement", Y), ("velocity", Y))
     ),

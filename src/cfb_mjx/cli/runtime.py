@@ -17,7 +17,9 @@ XLA_CPU_FLAGS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=tru
 """On CPU a time step then becomes a few kernels that share what they compute, instead of some thirty that repeat it:
 up to 4 times faster; nothing changes elsewhere. XLA reads it when jax starts its first backend, so the commands set it
 for themselves; scripts put it into XLA_FLAGS (docs/model.md). Not for derivatives of the MJX body: jaxlib 0.10.1 aborts
-while compiling some of them with it (`differentiate_mjx`)."""
+while compiling some of them with it (`differentiate_mjx`). Not from jaxlib 0.11 on: with 0.12 a rollout that keeps its
+states ran 150 times slower with it, whatever its value, and fits 15 times."""
+_OPTION_UNTIL = (0, 11)
 
 _CPU_DEVICES = "xla_force_host_platform_device_count"
 
@@ -52,13 +54,19 @@ def configure_jax(x64: bool, devices: int = 1) -> None:
 def set_up_xla() -> None:
     """Set for this process what jaxlib reads when it loads; afterwards it changes nothing.
 
-    `XLA_CPU_FLAGS` go into ``XLA_FLAGS`` unless that speaks of extra options already.
+    `XLA_CPU_FLAGS` go into ``XLA_FLAGS`` where they help, unless that speaks of extra options already.
     """
     # Programs from the compile cache make XLA log an error about tuning hints it takes for processor features; real
     # errors reach Python as exceptions.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-    if "xla_backend_extra_options" not in os.environ.get("XLA_FLAGS", ""):
+    if _option_helps() and "xla_backend_extra_options" not in os.environ.get("XLA_FLAGS", ""):
         os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} {XLA_CPU_FLAGS}".strip()
+
+
+def _option_helps() -> bool:
+    """Whether this jaxlib is one that `XLA_CPU_FLAGS` make faster."""
+    numbers = metadata.version("jaxlib").split(".")[:2]
+    return tuple(int(n) for n in numbers if n.isdigit()) < _OPTION_UNTIL
 
 
 def differentiate_mjx() -> None:

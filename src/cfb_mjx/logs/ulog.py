@@ -54,7 +54,7 @@ def read_ulog(path: str | os.PathLike, mapping: str | os.PathLike | VariableMap 
     streams = []
     for data in log.data_list:
         names = {f"{data.name}.{field}": field for field in data.data if f"{data.name}.{field}" in wanted}
-        if data.multi_id == 0 and names:
+        if data.multi_id == 0 and names and "timestamp" in data.data:
             time = data.data["timestamp"].astype(np.float64) * 1e-6
             values = {name: np.asarray(data.data[field], np.float64) for name, field in names.items()}
             streams.append(ordered(Stream(data.name, time, values), path, notes, overtaking=0.1))
