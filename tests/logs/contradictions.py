@@ -147,7 +147,9 @@ CONTRADICTIONS: dict[str, Contradiction] = {
     "gyro x and y swapped": Contradiction(axes("body_rate", (1, 0, 2)), ("gyro-axes=y,x,z",), TURNING, "body_rate"),
     "gyro z negated": Contradiction(axes("body_rate", signs=(1, 1, -1)), ("gyro-axes=x,y,-z",), (("attitude", Z),)),
     "accelerometer in g": Contradiction(vector("specific_force", lambda f: f / 9.81), ("accelerometer-unit=g",)),
-    "accelerometer negated": Contradiction(vector("specific_force", lambda f: -f), ("accelerometer-axes=-x,-y,-z",)),
+    "accelerometer negated": Contradiction(
+        vector("specific_force", lambda f: -f), ("accelerometer-axes=-x,-y,-z", "accelerometer-axes=x,y,-z")
+    ),
     "accelerometer z negated": Contradiction(
         axes("specific_force", signs=(1, 1, -1)), ("accelerometer-axes=x,y,-z", "accelerometer-axes=-x,-y,-z")
     ),
