@@ -33,8 +33,9 @@ def configure_jax(x64: bool, devices: int = 1) -> None:
     it. Where jax has not been loaded yet, XLA's CPU kernels are told to share results (`XLA_CPU_FLAGS`).
     """
     set_up_xla()
-    if devices > 1 and _CPU_DEVICES not in os.environ["XLA_FLAGS"]:
-        os.environ["XLA_FLAGS"] += f" --{_CPU_DEVICES}={devices}"
+    flags = os.environ.get("XLA_FLAGS", "")
+    if devices > 1 and _CPU_DEVICES not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --{_CPU_DEVICES}={devices}".strip()
     with held_back():
         import jax
 
