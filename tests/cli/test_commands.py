@@ -134,7 +134,8 @@ def test_an_option_that_slows_newer_jaxlibs_down_is_not_set_for_them(monkeypatch
 
 def test_several_devices_without_any_flags_of_xla():
     code = (
-        "import os; os.environ.pop('XLA_FLAGS', None); import cfb_mjx.cli.runtime as r; r._option_helps = lambda: False; "
-        "r.configure_jax(x64=False, devices=2); import jax; print(jax.device_count())"
+        "import os; os.environ.pop('XLA_FLAGS', None); import cfb_mjx.cli.runtime as r; "
+        "r._option_helps = lambda: False; r.configure_jax(x64=False, devices=2); "
+        "import jax; print(jax.device_count())"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "2"
