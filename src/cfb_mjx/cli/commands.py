@@ -48,9 +48,8 @@ def import_log(
         time_unit: unit of the time column of a radio csv: s, ms, us or ns.
         keep_ground: leave in what was recorded on the ground and in the hand.
         fix: a change of unit, axes or order, as a refusal names it, for instance velocity-frame=body.
-        print_config: print what to log, and read nothing: the config.txt of the micro SD card deck, or the log blocks
-            of
-            the radio for cfclient.
+        print_config: print what to log, and read nothing: the config.txt of the micro SD card deck, or the log
+            blocks of the radio for cfclient.
     """
     from cfb_mjx.cli.importing import print_logging, run_import
 

@@ -44,7 +44,7 @@ def read_log(
 
     Args:
         path: the file; the folder of a ROS 2 bag; or several tables of one flight, as cfclient writes one per log
-        block.
+            block.
         format: one of `FORMATS`; None detects it from the file's content. ``mcap`` is this library's own, ``tabular``
             and ``idsia`` are parquet or csv, ``usd_card`` is the Crazyflie's micro SD card binary, ``crazyswarm`` a
             ROS bag (MCAP, sqlite3 or ROS 1), ``radio_csv`` a table with firmware variable names as headers, ``ulog`` a
