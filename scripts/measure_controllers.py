@@ -150,7 +150,7 @@ def page(results: dict, facts: dict, plants: int, described, change: list[str]) 
     lines = [
         "# Controllers, measured",
         "",
-        f"Written by `{' '.join(['python', *map(str, ['scripts/measure_controllers.py', *sys.argv[1:]])])}` on "
+        f"Written by `python scripts/measure_controllers.py {' '.join(Path(a).name for a in sys.argv[1:])}` on "
         f"{facts['date']}, {facts['processor']}, Python {facts['python']}, jax {facts['jax']}, cfb_mjx "
         f"{facts['cfb_mjx']}. In simulation: model `{described.name}`, estimates 8 ms late and noisy, the gyro too "
         "but for the firmware's controllers, which read it on the drone; noise of the state as in the paper. The "
