@@ -10,7 +10,7 @@ from synthetic_logs import make_flight, same_data
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
 from cfb_mjx.logs import read_log, validate, write_tabular
-from cfb_mjx.logs.fixes import candidates, command_fixes, fix_of
+from cfb_mjx.logs.fixes import candidates, command_fixes, fix_of, motor_fixes
 from cfb_mjx.logs.gate import judge
 
 
@@ -116,3 +116,13 @@ def test_impossible_magnitudes_are_refused(flown):
     spike[77, 1] = 400.0
     with pytest.raises(CfbError, match=r"velocity reaches 400 m/s in row 77 .*which no flight has \(1 rows in all\)"):
         validate(flown.replace(velocity=spike), "x")
+
+
+def test_an_order_under_inverted_commands_is_two_changes(flown):
+    """Both are named, and both are made: the flag for the order alone would leave the commands inverted."""
+    mixed = flown.replace(command=1.0 - flown.command[:, [2, 1, 0, 3]])
+    mended, fixes = mixed, motor_fixes((2, 1, 0, 3), -1, "command-order")
+    for fix in fixes:
+        mended = fix_of(fix.name).apply(mended)
+    assert [fix.name for fix in fixes] == ["command-order=3,2,1,4", "motors=inverted"]
+    assert np.abs(mended.command - flown.command).max() < 1e-12

@@ -191,9 +191,8 @@ def _write_page(output: Path, found: list[Checked]) -> Path:
                 tables = [("What the signals say about each other; unexplained from 0.2 on contradicts.", header, rows)]
             sections.append(Section(one.path.name, [line.strip() for line in _lines(one)], tables, figures))
         lead = (
-            f"{len(found)} recordings, {sum(c.refusal is not None for c in found)} refused. Each pair of "
-            "signals that should "
-            "be one another's derivative is compared over short windows."
+            f"{len(found)} recordings, {sum(c.refusal is not None for c in found)} refused. Each pair of signals that "
+            "should be one another's derivative is compared over short windows."
         )
         page = output / "index.html"
         write_text(page, html_page("Recordings, checked", lead, sections, environment()))

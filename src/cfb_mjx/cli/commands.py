@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from cfb_mjx.cli.argument_types import Changes, File, Model, Output, Pairs, flat, with_plugins
+from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat, with_plugins
 from cfb_mjx.cli.deploying_commands import export
 from cfb_mjx.cli.learning_commands import fly, train
 from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce, view
@@ -29,7 +29,7 @@ def import_log(
     robot: str | None = None,
     time_unit: str | None = None,
     keep_ground: bool = False,
-    fix: Changes = (),
+    fix: Pairs = (),
     print_config: Literal["sd", "radio"] | None = None,
 ) -> None:
     """Convert a flight log to MCAP.
@@ -72,7 +72,7 @@ def check(
     robot: str | None = None,
     time_unit: str | None = None,
     keep_ground: bool = False,
-    fix: Changes = (),
+    fix: Pairs = (),
 ) -> None:
     """Say what recordings hold, whether their signals agree, what they are good for and what to log next time.
 

@@ -135,16 +135,14 @@ def _bench(path: Path, rotors: int | None) -> Bench | None:
 def _require_one_rotor(tables: list[MapTable], base: ModelFile) -> None:
     """Refuse thrust that is plainly that of four rotors, or a quarter of one's: no propeller this drone carries differs
     that much from another."""
-    if not any(t.force is not None for t in tables):
-        return
+    from cfb_mjx.sysid.rotors.rotor_maps import powers
+
     sigma = float(base.entries["reference_rotor_speed"].value)
-    curve = np.asarray(base.entries["thrust_polynomial"].value, float)
-    scale = float(np.mean(base.entries["thrust_scale"].value))
+    curve = np.asarray(base.entries["thrust_polynomial"].value, float) * np.mean(base.entries["thrust_scale"].value)
     for table in tables:
         if table.force is None:
             continue
-        s = table.rotor_speed / sigma
-        usual = (curve[0] * s**3 + curve[1] * s**2 + curve[2] * s) * scale
+        usual = powers(table.rotor_speed, sigma) @ curve
         fast = table.rotor_speed > 0.6 * float(table.rotor_speed.max())
         if not (fast & (usual > 0)).any():
             continue
@@ -153,15 +151,13 @@ def _require_one_rotor(tables: list[MapTable], base: ModelFile) -> None:
         point = f"{table.force[top]:.3g} N at {table.rotor_speed[top]:.0f} rad/s"
         if ratio > _FOUR_LEAST:
             raise CfbError(
-                f"{table.name}: {point} is {ratio:.1f} times what one rotor of {base.name} pulls, so it is the "
-                "thrust of "
-                "four; give --rotors 4."
+                f"{table.name}: {point} is {ratio:.1f} times what one rotor of {base.name} pulls, so it is the thrust "
+                "of four; give --rotors 4."
             )
         if ratio < 1 / _FOUR_LEAST:
             raise CfbError(
-                f"{table.name}: {point} is {ratio:.2f} of what a rotor of {base.name} pulls, as if the thrust "
-                "of one had "
-                "been divided by four; give --rotors 1, or correct its unit."
+                f"{table.name}: {point} is {ratio:.2f} of what a rotor of {base.name} pulls, as if the thrust of one "
+                "had been divided by four; give --rotors 1, or correct its unit."
             )
 
 
@@ -331,11 +327,9 @@ def _print(
         print(f"steady speed: {steady.points} points about a line, spread {steady.spread:.1f} rad/s{out}")
         if steady.per_volt is not None:
             print(
-                f"steady speed follows command times voltage, omega = {steady.offset:.0f} + "
-                f"{steady.per_volt:.0f} u V; a "
-                f"line in u alone leaves {steady.spread_without_voltage:.1f} rad/s. The gain is that at 3.7 V; "
-                "the effect "
-                f"battery_sag with slope {steady.sag_slope:.2f} makes a model follow the voltage."
+                f"steady speed follows command times voltage, omega = {steady.offset:.0f} + {steady.per_volt:.0f} u "
+                f"V; a line in u alone leaves {steady.spread_without_voltage:.1f} rad/s. The gain is that at 3.7 V; "
+                f"the effect battery_sag with slope {steady.sag_slope:.2f} makes a model follow the voltage."
             )
     for suffix, group in groups.items():
         for reason in dict.fromkeys(group.unidentifiable.values()):

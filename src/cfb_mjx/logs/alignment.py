@@ -21,9 +21,11 @@ _BLOCK = 2.0  # s
 _RESAMPLES = 200
 # Nominal rotor model of the Crazyflie 2.1 Brushless; only its phase in the band matters. A motor time constant wrong by
 # 10 ms moves the lag by 1 ms.
-_TIME_CONSTANT, _GAIN = 0.050, 2900.0
+_TIME_CONSTANT, GAIN = 0.050, 2900.0
 _THRUST = (-0.23, 0.562, -0.043, 0.0)
-_ROLL_PITCH = np.array([[-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, 1.0, -1.0]]) * (0.0707 / 2) / np.array([[3.3e-5], [3.6e-5]])
+ROLL_PITCH = np.array([[-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, 1.0, -1.0]])
+"""Signs of the torque about x and y of the thrust of M1 to M4."""
+_ROLL_PITCH = ROLL_PITCH * (0.0707 / 2) / np.array([[3.3e-5], [3.6e-5]])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +92,7 @@ def estimate_command_shift(
         times, speeds, gyro = log.time, nominal_speeds(log), log.body_rate
     else:
         raise ValueError(f"method must be 'rotor_speed' or 'command', not {method!r}")
-    s = speeds / _GAIN
+    s = speeds / GAIN
     predicted = np.polyval(_THRUST, s) @ _ROLL_PITCH.T
     blocks = _spectra(times, predicted, gyro[:, :2], log, band_hz)
     if blocks is None:
@@ -143,7 +145,7 @@ def delay_by_samples(log: FlightLog, samples: int) -> FlightLog:
 def nominal_speeds(log: FlightLog) -> np.ndarray:
     """Rotor speeds (n, 4) that the commands, held between rows, give through the first-order motor."""
     decay = np.exp(-np.diff(log.time) / _TIME_CONSTANT)
-    target = _GAIN * log.command
+    target = GAIN * log.command
     speed = target.copy()
     for k, keep in enumerate(decay):
         speed[k + 1] = target[k] + (speed[k] - target[k]) * keep
@@ -153,12 +155,12 @@ def nominal_speeds(log: FlightLog) -> np.ndarray:
 def nominal_command(time: np.ndarray, rotor_speed: np.ndarray) -> np.ndarray:
     """Commands (n, 4) in [0, 1] with which a first-order motor of 50 ms turns the rotors (rad/s) as they turned."""
     slope = np.gradient(rotor_speed, time, axis=0) if len(time) > 1 else np.zeros_like(rotor_speed)
-    return np.clip((rotor_speed + _TIME_CONSTANT * slope) / _GAIN, 0.0, 1.0)
+    return np.clip((rotor_speed + _TIME_CONSTANT * slope) / GAIN, 0.0, 1.0)
 
 
 def nominal_thrust(rotor_speed: np.ndarray) -> np.ndarray:
     """Thrust, N, of each rotor at a speed, rad/s, of the nominal drone."""
-    return np.polyval(_THRUST, rotor_speed / _GAIN)
+    return np.polyval(_THRUST, rotor_speed / GAIN)
 
 
 def _spectra(t, predicted, gyro, log, band_hz):
@@ -228,7 +230,7 @@ def motor_spectra(log: FlightLog, source: str) -> tuple[np.ndarray, np.ndarray, 
         time, speed, gyro = log.time[known], log.rotor_speed[known], log.body_rate[known, :2]
     else:
         time, speed, gyro = log.time, nominal_speeds(log), log.body_rate[:, :2]
-    thrust = np.polyval(_THRUST, speed / _GAIN)
+    thrust = np.polyval(_THRUST, speed / GAIN)
     size = max(8, round(_BLOCK / 2 / step))
     window = np.hanning(size)[:, None]
     frequency = np.fft.rfftfreq(size, step)

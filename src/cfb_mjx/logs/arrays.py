@@ -9,7 +9,6 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
-from cfb_mjx.logs.assembly import from_euler
 from cfb_mjx.logs.tabular import Table
 
 NPZ, MAT = b"PK\x03\x04", b"MATLAB 5.0"
@@ -82,7 +81,7 @@ def _of_pybullet(path: Path, arrays: dict[str, np.ndarray]) -> Table:
     if len(states) != 1:
         raise CfbError(f"{path}: holds the flights of {len(states)} drones; save them one by one.")
     position, velocity, angles, turning, rpm = np.split(states[0].T.astype(float), [3, 6, 9, 12], axis=1)
-    quaternion = from_euler(angles)
+    quaternion = rotation.from_euler(angles)
     rate = rotation.to_body(quaternion, turning)
     said = "a log of gym-pybullet-drones: its angular velocity was turned from world into body axes."
     table = Table({"t": time[0].astype(float)}, [said])

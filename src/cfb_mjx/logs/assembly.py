@@ -251,7 +251,7 @@ def _in_si(raw: np.ndarray, choice: Choice) -> np.ndarray:
     if choice.form == "compressed":
         return decompress_quaternion(raw[:, 0])
     values = raw * choice.factors
-    return from_euler(values) if choice.form == "euler" else values
+    return rotation.from_euler(values) if choice.form == "euler" else values
 
 
 def _turning_rate(source: Stream, quaternion: np.ndarray) -> np.ndarray:
@@ -310,9 +310,3 @@ def decompress_quaternion(packed: np.ndarray) -> np.ndarray:
         xyzw[np.ix_(mine, others)] = small[mine]
         xyzw[mine, k] = rest[mine]
     return np.where(valid[:, None], xyzw[:, [3, 0, 1, 2]], np.nan)
-
-
-def from_euler(angles: np.ndarray) -> np.ndarray:
-    """Quaternions (n, 4) of roll, pitch, yaw (n, 3), rad: the rotation R_z(yaw) R_y(pitch) R_x(roll)."""
-    roll, pitch, yaw = (rotation.exponential(angles[:, [i]] * np.eye(3)[i]) for i in range(3))
-    return rotation.multiply(yaw, rotation.multiply(pitch, roll))

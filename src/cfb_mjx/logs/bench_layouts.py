@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs.bench_tables import SPEED_LIMIT, MapTable, MotorRecord, from_columns
+from cfb_mjx.logs.bench_tables import SPEED_LIMIT, MapTable, MotorRecord, check_command, from_columns
 from cfb_mjx.logs.bench_tables import recognises as standard
 from cfb_mjx.logs.tabular import Table, require_numbers
 
@@ -120,8 +120,7 @@ def read_bench_table(table: Table, path: Path, rotors: int | None = None) -> Ben
     if not speeds:
         raise CfbError(
             f"{path}: has no rotor speed (a column rpm1..rpm4 or omega), and thrust against command alone tells "
-            "neither "
-            "the motors nor the rotors; measure the speed too."
+            "neither the motors nor the rotors; measure the speed too."
         )
     command = {key: si[key] for key in si if re.fullmatch(r"u[1-4]?", key)}
     _refuse_commands_as_speed(speeds, names, path)
@@ -280,9 +279,8 @@ def _command_before(record: MotorRecord, notes: list[str]) -> MotorRecord:
     if len(moved) < _STEPS or not np.nanmedian(moved) > _ANSWERED:
         return record
     notes.append(
-        f"{record.name}: the speed answers in the very row of a new command, so each row's command is the one "
-        "that led to "
-        "it; it was moved to the row before."
+        f"{record.name}: the speed answers in the very row of a new command, so each row's command is the one that "
+        "led to it; it was moved to the row before."
     )
     return MotorRecord(record.name, record.time[:-1], record.command[1:], record.rotor_speed[:-1], record.motors)
 
@@ -307,7 +305,6 @@ def _steady_points(speeds, command, voltage, path: Path) -> SteadyPoints:
     if voltage is not None:
         good &= np.isfinite(voltage) & (voltage > 0)
     u, omega = u[good], omega[good]
-    if len(u) and (u.min() < 0 or u.max() > 1.001):
-        unit, factor = ("percent", 100) if u.max() <= 100.5 else ("raw PWM in 0..65535", 65535)
-        raise CfbError(f"{path}: the command reaches {u.max():.4g}, which looks like {unit}; divide it by {factor}.")
+    if len(u):
+        check_command(u, list(command), path)
     return SteadyPoints(path.stem, u, omega, None if voltage is None else voltage[good])

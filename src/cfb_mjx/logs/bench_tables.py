@@ -113,7 +113,7 @@ def _steps(table: Table, path: Path) -> MotorRecord:
     if np.median(step) >= 0.5:
         raise CfbError(f"{path}: rows are {np.median(step):g} s apart, so t is probably in ms or us; convert it to s.")
     command = np.stack([table[c] for c in commands], axis=1)
-    _command(command, commands, path)
+    check_command(command, commands, path)
     speed = np.stack([table[c] for c in speeds], axis=1)
     _speed(speed, path)
     return MotorRecord(path.stem, time, np.clip(command, 0, 1), speed, motors)
@@ -162,7 +162,7 @@ def _finite(table: Table, columns: list[str], path: Path) -> None:
             )
 
 
-def _command(command: np.ndarray, names: list[str], path: Path) -> None:
+def check_command(command: np.ndarray, names: list[str], path: Path) -> None:
     low, high = float(command.min()), float(command.max())
     if low < -1e-3:
         raise CfbError(f"{path}: {names[0]} is negative ({low:.3g}); commands lie in [0, 1].")

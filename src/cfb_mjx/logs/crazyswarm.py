@@ -212,8 +212,7 @@ def _generic(topic: str, group: list[BagMessage], names: list[str], path: Path) 
         if len(message.content.values) != len(names):
             raise CfbError(
                 f"{path}: message {row} of {topic} has {len(message.content.values)} values, but the file of "
-                "--topics-yaml names "
-                f"{len(names)} ({', '.join(names)}); give the crazyflies.yaml that was in use."
+                f"--topics-yaml names {len(names)} ({', '.join(names)}); give the crazyflies.yaml that was in use."
             )
     rows = np.array([m.content.values for m in group], dtype=np.float64)
     return dict(zip(names, rows.T, strict=True))

@@ -93,8 +93,6 @@ COMMAND_UNITS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "0-1000": ("look like per mille; divide the commands by 1000", lambda u: u / 1000.0),
     "1023": ("look like 10-bit values in 0..1023; divide the commands by 1023", lambda u: u / 1023.0),
 }
-
-
 """What commands that are no duty look like, with the remedy, and the duty they stand for."""
 
 
@@ -155,18 +153,16 @@ def candidates() -> Iterable[Fix]:
                     yield _axes(part, spec)
 
 
-def motor_fix(order: tuple[int, ...], sign: int = 1, key: str = "motors") -> Fix:
-    """The change of the motor columns to an order (columns counted from 0) and sign.
+def motor_fixes(order: tuple[int, ...], sign: int = 1, key: str = "motors") -> tuple[Fix, ...]:
+    """The changes that bring motor columns into an order, and invert the commands if need be.
 
     Args:
-        order: the column each of M1 to M4 stands in.
-        sign: -1 inverts the commands as well.
-        key: ``motors`` for both, ``command-order`` or ``rotor-order`` for one of the two.
+        order: the column each of M1 to M4 stands in, counted from 0.
+        sign: -1 where the commands are one minus the duty.
+        key: ``motors`` for commands and rotor speeds, ``command-order`` or ``rotor-order`` for one of the two.
     """
-    if sign < 0 and order == (0, 1, 2, 3):
-        return _inverted()
-    fix = _order(",".join(str(column + 1) for column in order), key)
-    return fix if sign > 0 else Fix(fix.name, f"{fix.words}, and inverting the commands", fix.apply)
+    ordered = () if order == (0, 1, 2, 3) else (_order(",".join(str(column + 1) for column in order), key),)
+    return ordered if sign > 0 else (*ordered, _inverted())
 
 
 def command_fixes() -> list[Fix]:
@@ -344,5 +340,4 @@ def _repitched(q: np.ndarray) -> np.ndarray:
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-    parts = [rotation.exponential(a[:, None] * np.eye(3)[i]) for i, a in enumerate((roll, -pitch, yaw))]
-    return rotation.multiply(parts[2], rotation.multiply(parts[1], parts[0]))
+    return rotation.from_euler(np.stack([roll, -pitch, yaw], axis=1))

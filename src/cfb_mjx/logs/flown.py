@@ -12,6 +12,7 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
 from cfb_mjx.logs.flight_log import FlightLog, quantise_time
+from cfb_mjx.logs.gaps import changes, runs
 
 _CARRIES = 0.5  # of the command in hover: with less for longer than a flip lasts nothing flies
 _FLIP = 0.7  # s: a drone in the air may fall this long with its motors low
@@ -83,13 +84,13 @@ def _airborne(log: FlightLog, path: Path, notes: list[str]) -> FlightLog:
         raise CfbError(f"{path}: the motors are off throughout, so nothing of it is flight; --keep-ground reads it.")
     carries = command >= _CARRIES * float(np.median(command[command > 0.3 * top]))
     flies, stood = carries.copy(), []
-    for start, stop in _runs(~carries):
+    for start, stop in runs(~carries):
         long = log.time[stop - 1] - log.time[start] > _FLIP
         flies[start:stop] = not (long or start == 0 or stop == len(log))
         if long:
             stood.append((start, stop, float(np.median(z[start:stop]))))
     keep = np.zeros(len(log), dtype=bool)
-    for start, stop in _runs(flies):
+    for start, stop in runs(flies):
         before = next((floor for _, b, floor in stood if b == start), -np.inf)
         after = next((floor for a, _, floor in stood if a == stop), -np.inf)
         left = start + np.flatnonzero(z[start:stop] > before + _CLEAR)
@@ -109,7 +110,7 @@ def _airborne(log: FlightLog, path: Path, notes: list[str]) -> FlightLog:
             f"{path}: nothing of it is flight: the motors are low or the drone stays where it stood; --keep-ground "
             "reads it all the same."
         )
-    gone = log.duration - float(sum(log.time[b - 1] - log.time[a] for a, b in _runs(keep)))
+    gone = log.duration - float(sum(log.time[b - 1] - log.time[a] for a, b in runs(keep)))
     notes.append(
         f"{gone:.1f} s on the ground or in the hand (motors off, standing, take-off, landing) were cut; --keep-ground "
         "keeps them."
@@ -121,7 +122,7 @@ def _airborne(log: FlightLog, path: Path, notes: list[str]) -> FlightLog:
 def _leaps(log: FlightLog) -> np.ndarray:
     """Rows between a leap of the position and the leap back, or beside one that stays."""
     bad = np.zeros(len(log), dtype=bool)
-    new = np.flatnonzero(_changes(log.position))
+    new = np.flatnonzero(changes(log.position))
     if len(new) < 3:
         return bad
     step, moved = np.diff(log.time[new]), np.diff(log.position[new], axis=0)
@@ -165,12 +166,12 @@ def _spikes(log: FlightLog) -> np.ndarray:
 def _frozen(log: FlightLog) -> np.ndarray:
     """Rows in which a whole estimate repeats for far longer than it usually does."""
     estimate = np.concatenate([log.position, log.velocity, log.quaternion], axis=1)
-    same = ~_changes(estimate)
+    same = ~changes(estimate)
     bad = np.zeros(len(log), dtype=bool)
-    runs = [(a, b, log.time[b - 1] - log.time[a - 1]) for a, b in _runs(same) if a > 0]
+    held = [(a, b, log.time[b - 1] - log.time[a - 1]) for a, b in runs(same) if a > 0]
     # Where it is held between packets of its own, most rows repeat.
-    usual = float(np.median([length for *_, length in runs])) if same.mean() > _RARELY else 0.0
-    for start, stop, length in runs:
+    usual = float(np.median([length for *_, length in held])) if same.mean() > _RARELY else 0.0
+    for start, stop, length in held:
         bad[start:stop] = length > max(_FROZEN, 5 * usual)
     return bad if bad.mean() < _RARELY else np.zeros(len(log), dtype=bool)
 
@@ -178,19 +179,8 @@ def _frozen(log: FlightLog) -> np.ndarray:
 def _without(log: FlightLog, bad: np.ndarray, what: str, warnings: list[str]) -> FlightLog:
     if not bad.any() or (~bad).sum() < 2:
         return log
-    times = ", ".join(f"{log.time[a]:.2f}" for a, _ in _runs(bad)[:5])
-    count = len(_runs(bad))
+    found = runs(bad)
+    times, count = ", ".join(f"{log.time[a]:.2f}" for a, _ in found[:5]), len(found)
     more = f" and {count - 5} more" if count > 5 else ""
     warnings.append(f"{what}: {int(bad.sum())} rows at {times}{more} s were left out.")
     return log.rows(~bad)
-
-
-def _changes(values: np.ndarray) -> np.ndarray:
-    """Which rows of (n, columns) differ from the one before; the first does."""
-    return np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
-
-
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """First row of every run of true values, and the row behind its last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

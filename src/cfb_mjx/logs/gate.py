@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 
 from cfb_mjx.logs import consistency
-from cfb_mjx.logs.alignment import nominal_speeds, nominal_thrust
+from cfb_mjx.logs.alignment import GAIN, nominal_speeds, nominal_thrust
 from cfb_mjx.logs.consistency import ORDER, Relation
-from cfb_mjx.logs.fixes import COMMAND_UNITS, Fix, candidates, motor_fix
+from cfb_mjx.logs.fixes import COMMAND_UNITS, Fix, candidates, motor_fixes
 from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.gaps import changes
 
 _ROWS = 6000  # of a long log that decide: the liveliest stretch
 _UNTOLD, _GONE = 0.5, 2.0  # cost of an axis that moved before a change and does not after it, or cannot be compared
@@ -214,8 +215,7 @@ def _disorder(log: FlightLog) -> str | None:
 def _repeated(log: FlightLog) -> str | None:
     """Rows that come again, to the last bit: a copy pasted behind the original, or rows out of order."""
     rows = np.concatenate([log.position, log.velocity, log.quaternion, log.body_rate, log.specific_force], axis=1)
-    new = np.concatenate([[True], (np.diff(rows, axis=0) != 0).any(axis=1)])
-    kept = np.flatnonzero(new)
+    kept = np.flatnonzero(changes(rows))
     # Only rows in which something moves: a simulated hover repeats itself.
     kept = kept[np.abs(log.body_rate[kept]).max(axis=1) > 1e-3]
     if len(kept) < 20:
@@ -226,18 +226,17 @@ def _repeated(log: FlightLog) -> str | None:
         return None
     row = kept[again[0]]
     return (
-        f"{len(again)} rows from {log.time[row]:.2f} s on repeat earlier rows to the last bit, so a part of the "
-        "log was "
-        "copied; delete the copy"
+        f"{len(again)} rows from {log.time[row]:.2f} s on repeat earlier rows to the last bit, so a part of the log "
+        "was copied; delete the copy"
     )
 
 
 def _judge_motors(log: FlightLog, relations: list[Relation]) -> Verdict:
     if (found := _command_against_speed(log)) is not None:
-        return Verdict(relations, {}, found[0], (found[1],))
+        return Verdict(relations, {}, *found)
     agreement, moving = {}, {}
     for source in ("rotor_speed", "command"):
-        found = consistency.agreement(log, source).agreement
+        found = consistency.agreement(log, source)
         if found:
             agreement[source] = found[ORDER, 1]
             # Inverted commands turn the drone as another order does; only its thrust tells them apart.
@@ -248,11 +247,10 @@ def _judge_motors(log: FlightLog, relations: list[Relation]) -> Verdict:
     for source, ((order, sign), value) in moving.items():
         what = "rotor speeds" if source == "rotor_speed" else "commands"
         problem = (
-            f"roll and pitch do not follow from the {what} as they stand (correlation {agreement[source]:.2f}; "
-            "in another "
-            f"order {value:.2f})"
+            f"roll and pitch do not follow from the {what} as they stand (correlation {agreement[source]:.2f}; in "
+            f"another order {value:.2f})"
         )
-        return Verdict(relations, agreement, problem, (motor_fix(order, sign),))
+        return Verdict(relations, agreement, problem, motor_fixes(order, sign))
     problem = _gain(log) or _carried(log)
     return Verdict(relations, agreement, problem, certain=problem is not None)
 
@@ -265,7 +263,7 @@ def _heave(log: FlightLog, source: str) -> float:
     return float(np.mean(both[:, 0] * both[:, 1])) / size if size > 0 else 0.0
 
 
-def _command_against_speed(log: FlightLog) -> tuple[str, Fix] | None:
+def _command_against_speed(log: FlightLog) -> tuple[str, tuple[Fix, ...]] | None:
     """Each rotor must follow its own command; of two orders the one by which the drone turns is right."""
     if log.rotor_speed is None or log.duration < 1.0:
         return None
@@ -279,16 +277,16 @@ def _command_against_speed(log: FlightLog) -> tuple[str, Fix] | None:
     matrix = expected.T @ speed / len(speed) / np.outer(size_e, size_s)
     own = np.diag(matrix)
     if (own < -_FOLLOWS).all():
-        return "every rotor slows down when its command rises", motor_fix(ORDER, -1)
+        return "every rotor slows down when its command rises", motor_fixes(ORDER, -1)
     order = np.argmax(matrix, axis=1)
     best = matrix[np.arange(4), order]
     if sorted(order) == [0, 1, 2, 3] and (best > _FOLLOWS).all() and np.max(best - own) > _MOTORS_BETTER:
         follow = tuple(int(i) for i in order)  # command i drives the rotor in this column
         problem = "rotor speeds do not follow the commands of their own motors but those of others"
-        turns = {s: consistency.agreement(log, s).agreement.get((ORDER, 1), 0.0) for s in ("rotor_speed", "command")}
+        turns = {s: consistency.agreement(log, s).get((ORDER, 1), 0.0) for s in ("rotor_speed", "command")}
         if turns["command"] > turns["rotor_speed"]:
-            return problem, motor_fix(follow, key="rotor-order")
-        return problem, motor_fix(tuple(follow.index(i) for i in range(4)), key="command-order")
+            return problem, motor_fixes(follow, key="rotor-order")
+        return problem, motor_fixes(tuple(follow.index(i) for i in range(4)), key="command-order")
     return None
 
 
@@ -334,8 +332,7 @@ def _carried(log: FlightLog) -> str | None:
             )
             return (
                 f"rotors at {np.nanmedian(log.rotor_speed):.0f} rad/s carry {mass * 1e3:.3g} g, which is no "
-                f"Crazyflie{hint}; "
-                "give omega1..omega4 in rad/s"
+                f"Crazyflie{hint}; give omega1..omega4 in rad/s"
             )
         return None
     return carried_by_commands(log.command, force)
@@ -345,14 +342,13 @@ def carried_by_commands(command: np.ndarray, force: float) -> str | None:
     """What is wrong with commands within [0, 1] that carry no Crazyflie; None where they do."""
     low, high = _MASSES
     typical = np.median(command, axis=0)
-    mass = carried_mass(2900.0 * typical, force)
+    mass = carried_mass(GAIN * typical, force)
     if low < mass < high:
         return None
     if low < float(np.sum(typical)) / force < high:
         return (
-            f"the commands (median {np.median(command):.3g}) look like thrust in newtons; give the duty, "
-            "motor.m1..m4 over "
-            "65535"
+            f"the commands (median {np.median(command):.3g}) look like thrust in newtons; give the duty, motor.m1..m4 "
+            "over 65535"
         )
     return (
         f"commands of {np.median(command):.3g} carry {mass * 1e3:.3g} g, which is no Crazyflie; give the duty in [0, 1]"
@@ -375,7 +371,7 @@ def command_unit(command: np.ndarray, force: float) -> str | None:
     for unit in _by_range(command):
         words, to_duty = COMMAND_UNITS[unit]
         duty = to_duty(command)
-        mass = carried_mass(2900.0 * np.median(duty, axis=0), force)
+        mass = carried_mass(GAIN * np.median(duty, axis=0), force)
         if duty.min() > -0.05 and duty.max() < 1.02 and low < mass < high:
             return f"{words} (--fix command-unit={unit})"
     total = float(np.sum(np.median(command, axis=0)))

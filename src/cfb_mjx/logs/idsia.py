@@ -16,6 +16,7 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import alignment, rotation
 from cfb_mjx.logs.flight_log import FlightLog, quantise_time
+from cfb_mjx.logs.gaps import runs
 from cfb_mjx.logs.tabular import Table, read_table, require_numbers
 
 POSITION, VELOCITY = ("x", "y", "z"), ("vx", "vy", "vz")
@@ -190,8 +191,7 @@ def _glitches(log: FlightLog, state_held: np.ndarray) -> np.ndarray:
 
 def _runs(mask: np.ndarray, length: int) -> np.ndarray:
     """The part of ``mask`` that lies in runs of at least ``length`` true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     out = np.zeros_like(mask)
-    for start, stop in edges.reshape(-1, 2):
+    for start, stop in runs(mask):
         out[start:stop] = stop - start >= length
     return out

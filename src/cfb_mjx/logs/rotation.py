@@ -59,3 +59,9 @@ def exponential(vector: np.ndarray) -> np.ndarray:
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     # sinc keeps the axis well defined at zero angle
     return np.concatenate([np.cos(angle / 2.0), 0.5 * np.sinc(angle / (2.0 * np.pi)) * vector], axis=-1)
+
+
+def from_euler(angles: np.ndarray) -> np.ndarray:
+    """Quaternions (n, 4) of roll, pitch, yaw (n, 3), rad: the rotation R_z(yaw) R_y(pitch) R_x(roll)."""
+    roll, pitch, yaw = (exponential(angles[:, [i]] * np.eye(3)[i]) for i in range(3))
+    return multiply(yaw, multiply(pitch, roll))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs.gaps import longest_step
+from cfb_mjx.logs.gaps import changes, longest_step
 
 _MOSTLY_NEW = 0.7
 RADIO_WRAP_MS = 1 << 24  # a log packet carries its time stamp in three bytes of milliseconds: it wraps after 4.7 h
@@ -120,5 +120,5 @@ def fresh(values: np.ndarray) -> np.ndarray:
 
     A value that the firmware updates at 100 Hz and logs at 500 Hz has steps, whose differences mean nothing.
     """
-    new = np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
+    new = changes(values)
     return new if new.mean() < _MOSTLY_NEW and new.sum() > 2 else np.ones(len(values), dtype=bool)

@@ -29,8 +29,8 @@ def validate(log: FlightLog, path: str | os.PathLike) -> FlightLog:
         path: the file to name in messages.
 
     Returns:
-        The log. Metadata adds ``checks``, what its signals say about each other; where they contradict each other and
-        no change is known that makes them agree, a warning says so.
+        The log. Where its signals contradict each other and no change is known that makes them agree, a warning in its
+        metadata says so.
 
     Raises:
         CfbError: fewer than two rows; time that does not increase; NaN or infinity in a required column; quaternions
@@ -167,7 +167,6 @@ def _magnitudes(log: FlightLog, fail) -> None:
             row = int(np.argmax(values.max(axis=1)))
             rows = int((values > limit).any(axis=1).sum())
             fail(
-                f"{field.replace('_', ' ')} reaches {values.max():.4g} {_UNITS[field]} in {_at(log, row)}, "
-                "which no flight "
-                f"has ({rows} rows in all); drop those rows, or give the right unit"
+                f"{field.replace('_', ' ')} reaches {values.max():.4g} {_UNITS[field]} in {_at(log, row)}, which no "
+                f"flight has ({rows} rows in all); drop those rows, or give the right unit"
             )
