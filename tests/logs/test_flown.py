@@ -53,10 +53,11 @@ def test_the_ground_is_cut_with_a_word_and_kept_when_asked(log, tmp_path):
     write_tabular(with_ground(log), path)
     cut = read_log(path)
     assert log.duration - 1.0 < cut.duration < log.duration
-    assert cut.time[0] == 0.0
+    assert 1.5 < cut.time[0] < 2.5  # times stay those of the recording
     assert cut.command.min() > 0.2
     (note,) = [n for n in cut.metadata["notes"] if "--keep-ground" in n]
     assert "on the ground" in note
+    assert f"begins at {cut.time[0]:.2f} s" in note
     whole = read_log(path, keep_ground=True)
     assert len(whole) >= len(with_ground(log)) - 3  # rows beside the leap onto the flight
 
@@ -139,3 +140,48 @@ def test_logs_of_ones_own_are_not_cut(log, tmp_path):
     ground = with_ground(log)
     write_mcap(ground, tmp_path / "a.mcap")
     assert len(read_log(tmp_path / "a.mcap")) == len(ground)
+
+
+@pytest.mark.parametrize(
+    ("spans", "kept"),
+    [
+        (["1:1.5"], lambda t: (t < 1.0) | (t > 1.5)),
+        ([":0.5", "3.2:"], lambda t: (t > 0.5) & (t < 3.2)),
+        (["1:2", "1.5:2.5"], lambda t: (t < 1.0) | (t > 2.5)),
+    ],
+)
+def test_stretches_are_cut_as_asked(log, tmp_path, spans, kept):
+    path = tmp_path / "flight.parquet"
+    write_tabular(log, path)
+    cut = read_log(path, cut=spans)
+    np.testing.assert_array_equal(cut.time, log.time[kept(log.time)])
+    assert any(note.startswith(f"--cut {' '.join(spans)}") for note in cut.metadata["notes"])
+
+
+def test_a_cut_takes_out_what_would_be_refused(log, tmp_path):
+    path = tmp_path / "flight.csv"
+    spoiled = (log.time > 1.0) & (log.time < 1.2)
+    write_tabular(log.replace(body_rate=np.where(spoiled[:, None], np.nan, log.body_rate)), path)
+    with pytest.raises(CfbError, match="no value"):
+        read_log(path)
+    assert len(read_log(path, cut=["1:1.2"]).gaps()) == 1
+
+
+@pytest.mark.parametrize(
+    ("span", "said"),
+    [
+        ("5", "A:B"),
+        (":", "A:B"),
+        ("a:b", "A:B"),
+        ("3:2", "A:B"),
+        ("nan:2", "A:B"),
+        ("", "A:B"),
+        ("90:95", "times are 0 to"),
+        ("0:100", "cut less"),
+    ],
+)
+def test_a_cut_that_cuts_nothing_or_all_is_refused(log, tmp_path, span, said):
+    path = tmp_path / "flight.parquet"
+    write_tabular(log, path)
+    with pytest.raises(CfbError, match=said):
+        read_log(path, cut=[span])

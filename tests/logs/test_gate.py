@@ -69,6 +69,8 @@ def test_what_no_change_mends_is_a_warning_with_its_time(flown):
     assert 4.4 < stop < 5.3
     assert same_data(log, wandering)
     assert validate(log, "x").metadata["warnings"] == log.metadata["warnings"]  # not said twice
+    # What contradicts does not agree as well, and the motors were not compared.
+    assert judge(wandering).summary() == "signals agree: displacement x y z, velocity x y z"
 
 
 @pytest.mark.parametrize("scale", [0.6, 1.6])

@@ -69,7 +69,7 @@ def test_a_last_line_that_was_cut_is_left_out_with_a_word(tmp_path):
         path.write_text(HABITS["plain"] + rest)
         table = read_table(path)
         assert len(table["t"]) == rows
-        assert bool(table.notes) == (rows == 3)
+        assert bool(table.warnings) == (rows == 3)
 
 
 @pytest.mark.parametrize(

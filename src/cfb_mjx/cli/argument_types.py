@@ -30,6 +30,9 @@ Pairs = Annotated[
     tyro.conf.arg(metavar="NAME=VALUE...", help_behavior_hint=""),
 ]
 """``--set A=1 B=2`` and ``--set A=1 --set B=2`` mean the same; the later of two of one name counts."""
+Spans = Annotated[
+    tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="A:B...", help_behavior_hint="")
+]
 
 
 def flat(pairs: tuple[tuple[str, ...], ...]) -> list[str]:

@@ -12,8 +12,9 @@ from cfb_mjx.cli.runtime import environment
 from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, scratch, together, write_json, write_text
-from cfb_mjx.logs import FlightLog, read_log
-from cfb_mjx.logs.gate import Verdict, judge
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.gate import Verdict
+from cfb_mjx.logs.reading import read_judged
 
 _FAST, _SLOW = 240.0, 95.0  # rows per s: of 250 Hz and 100 Hz, with jitter
 
@@ -49,10 +50,9 @@ def run_check(paths: list[Path], output: Path | None, json: Path | None, options
 
 def _checked(path: Path, options: dict[str, Any]) -> Checked:
     try:
-        log = read_log(path, **options)
+        return Checked(path, *read_judged(path, **options), None)
     except CfbError as error:
         return Checked(path, None, None, str(error))
-    return Checked(path, log, judge(log), None)
 
 
 def _lines(one: Checked) -> list[str]:
@@ -85,7 +85,7 @@ def _measured(log: FlightLog) -> list[str]:
 
 
 def _moving(verdict: Verdict, name: str) -> set[str]:
-    return {r.axis for r in verdict.relations if r.name == name and r.moves}
+    return {r.axis for r in verdict.relations if r.name == name and r.moves and not r.contradicts}
 
 
 def good_for(log: FlightLog, verdict: Verdict) -> list[str]:
@@ -125,7 +125,7 @@ def next_time(log: FlightLog, verdict: Verdict) -> list[str]:
         found.append(f"log at 250 Hz or more (now {rate:.0f}): a micro SD card does; see cfb import --print-config sd")
     if not {"x", "y"} <= turning:
         found.append("change the attitude quickly (steps, doublets): inertia and motors do not show in a gentle flight")
-    elif "z" not in turning:
+    elif "z" not in {r.axis for r in verdict.relations if r.name == "attitude" and r.moves}:
         found.append("yaw quickly in one flight: J_z and J_m do not show otherwise")
     return found
 
@@ -163,7 +163,7 @@ def _write_page(output: Path, found: list[Checked]) -> Path:
                 compared = comparisons(one.log)
                 if compared:
                     figure = Path(folder) / f"{number}.png"
-                    checked_figure(compared, figure)
+                    checked_figure(compared, one.verdict.relations, figure)
                     figures.append((figure, f"measured and integrated signals of {one.path.name}"))
                 rows = [
                     [

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, flat, with_plugins
+from cfb_mjx.cli.argument_types import File, Model, Output, Pairs, Spans, flat, with_plugins
 from cfb_mjx.cli.deploying_commands import export
 from cfb_mjx.cli.learning_commands import fly, train
 from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce, view
@@ -29,6 +29,7 @@ def import_log(
     robot: str | None = None,
     time_unit: str | None = None,
     keep_ground: bool = False,
+    cut: Spans = (),
     fix: Pairs = (),
     print_config: Literal["sd", "radio"] | None = None,
 ) -> None:
@@ -47,6 +48,7 @@ def import_log(
         robot: whose flight to read from a Crazyswarm2 bag of several.
         time_unit: unit of the time column of a radio csv: s, ms, us or ns.
         keep_ground: leave in what was recorded on the ground and in the hand.
+        cut: seconds of the recording to leave out, for instance 12.5:15, :3 (all up to 3 s) or 40: (all from then on).
         fix: a change of unit, axes or order, as a refusal names it, for instance velocity-frame=body.
         print_config: print what to log, and read nothing: the config.txt of the micro SD card deck, or the log
             blocks of the radio for cfclient.
@@ -59,7 +61,7 @@ def import_log(
     if not sources or output is None:
         raise CfbError("import needs a log and -o FILE.mcap; see 'cfb import --help'.")
     options = {"motor_shift": motor_shift, "mapping": mapping, "topics_yaml": topics_yaml, "robot": robot}
-    options |= {"time_unit": time_unit, "keep_ground": keep_ground, "fix": flat(fix)}
+    options |= {"time_unit": time_unit, "keep_ground": keep_ground, "cut": flat(cut), "fix": flat(fix)}
     run_import(list(sources), output, None if format == "auto" else format, options)
 
 
@@ -72,6 +74,7 @@ def check(
     robot: str | None = None,
     time_unit: str | None = None,
     keep_ground: bool = False,
+    cut: Spans = (),
     fix: Pairs = (),
 ) -> None:
     """Say what recordings hold, whether their signals agree, what they are good for and what to log next time.
@@ -87,6 +90,7 @@ def check(
         robot: as for import.
         time_unit: as for import.
         keep_ground: as for import.
+        cut: as for import.
         fix: as for import.
     """
     if not logs:
@@ -94,7 +98,7 @@ def check(
     from cfb_mjx.cli.checking import run_check
 
     options = {"mapping": mapping, "topics_yaml": topics_yaml, "robot": robot, "time_unit": time_unit}
-    options |= {"keep_ground": keep_ground, "fix": flat(fix)}
+    options |= {"keep_ground": keep_ground, "cut": flat(cut), "fix": flat(fix)}
     if refused := run_check(list(logs), output, json, options):
         raise CfbError(f"{refused} of {len(logs)} recordings were refused, for the reasons above.")
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped, write_text
-from cfb_mjx.logs import estimate_command_shift, read_log, write_mcap
-from cfb_mjx.logs.gate import judge
+from cfb_mjx.logs import estimate_command_shift, write_mcap
 from cfb_mjx.logs.proposal import UnknownNames
+from cfb_mjx.logs.reading import read_judged
 
 
 def run_import(sources: list[Path], output: Path, format: str | None, options: dict[str, Any]) -> None:
@@ -25,7 +25,7 @@ def run_import(sources: list[Path], output: Path, format: str | None, options: d
     if output.exists() and any(source.exists() and output.samefile(source) for source in sources):
         raise CfbError(f"{output}: is the source itself; choose another name.")
     try:
-        log = read_log(sources, format, **options)
+        log, verdict = read_judged(sources, format, **options)
     except UnknownNames as error:
         proposed = output.with_suffix(".mapping.yaml")
         write_text(proposed, error.mapping)
@@ -53,7 +53,7 @@ def run_import(sources: list[Path], output: Path, format: str | None, options: d
     for key, value in (log.metadata.get("cleaning") or {}).items():
         if value and (key.startswith("dropped") or key in ("held_rows_kept", "invalid_rotor_speeds")):
             print(f"  {key.replace('_', ' ')}: {value}")
-    print(f"  {judge(log).summary()}")
+    print(f"  {verdict.summary()}")
     print(f"  {describe_alignment(alignment)}")
     for line in [*(log.metadata.get("warnings") or ()), *(log.metadata.get("notes") or ())]:
         print(f"  {line}")

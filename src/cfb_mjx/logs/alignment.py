@@ -153,9 +153,12 @@ def nominal_speeds(log: FlightLog) -> np.ndarray:
 
 
 def nominal_command(time: np.ndarray, rotor_speed: np.ndarray) -> np.ndarray:
-    """Commands (n, 4) in [0, 1] with which a first-order motor of 50 ms turns the rotors (rad/s) as they turned."""
+    """Commands (n, 4) with which a first-order motor of 50 ms turns the rotors (rad/s) as they turned.
+
+    Noise of the readings may carry them beyond [0, 1], in which every command lies.
+    """
     slope = np.gradient(rotor_speed, time, axis=0) if len(time) > 1 else np.zeros_like(rotor_speed)
-    return np.clip((rotor_speed + _TIME_CONSTANT * slope) / GAIN, 0.0, 1.0)
+    return (rotor_speed + _TIME_CONSTANT * slope) / GAIN
 
 
 def nominal_thrust(rotor_speed: np.ndarray) -> np.ndarray:

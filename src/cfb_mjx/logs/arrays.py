@@ -58,7 +58,7 @@ def read_arrays(path: Path) -> Table:
     for name, values in arrays.items():
         if rows not in values.shape or values.ndim > 2:
             if values.size > 1:
-                table.notes.append(
+                table.warnings.append(
                     f"array {name} of shape {values.shape} has not the {rows} rows of the others; left out."
                 )
             continue
@@ -69,7 +69,7 @@ def read_arrays(path: Path) -> Table:
         elif labels:
             table |= {f"{name}.{label}": column.astype(float) for label, column in zip(labels, columns.T, strict=True)}
         else:
-            table.notes.append(
+            table.warnings.append(
                 f"array {name} has {columns.shape[1]} columns, which say nothing of themselves; left out."
             )
     return table

@@ -79,7 +79,8 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
             fields[field] = merger.derived(field, fields)
             parts = mapping.logged_parts(field, home)
             beside = f" ({', '.join(parts)} alone does not tell it.)" if parts else ""
-            read.warnings.append(_DERIVED[field] + beside)
+            held = f" {merger.beyond:.1%} of them lay beyond 0 to 1 and were held there." if merger.beyond else ""
+            read.warnings.append(_DERIVED[field] + beside + (held if field == "command" else ""))
     if "battery_voltage" in fields:
         fields["battery_voltage"] = _backfilled(fields["battery_voltage"][:, 0])
     keep = np.all([merger.usable[f] for f in chosen if f in REQUIRED], axis=0)
@@ -152,6 +153,7 @@ class _Merger:
     def __init__(self, reference: Stream, home: dict[str, Stream], chosen: dict[str, Choice]):
         self.reference, self.home, self.chosen = reference, home, chosen
         self.usable: dict[str, np.ndarray] = {}
+        self.beyond = 0.0  # share of derived commands that no motor is given, brought to 0 or 1
         self._held: dict[str, tuple[Stream, np.ndarray, np.ndarray]] = {}
 
     def field(self, field: str, choice: Choice) -> np.ndarray:
@@ -180,7 +182,10 @@ class _Merger:
             # Readings are of one time, whatever field asks for them.
             speed, known = fields["rotor_speed"], np.isfinite(fields["rotor_speed"]).all(axis=1)
             self.usable[field] = known
-            return nominal_command(self.reference.time, np.where(known[:, None], speed, 0.0))
+            needed = nominal_command(self.reference.time, np.where(known[:, None], speed, 0.0))
+            command = np.clip(needed, 0.0, 1.0)
+            self.beyond = float(np.mean((needed != command)[known])) if known.any() else 0.0
+            return command
         if field == "velocity":
             source, position = self._samples("position", fields)
             velocity, self.usable[field] = self._place_all(source, central_difference(source, position))

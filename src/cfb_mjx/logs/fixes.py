@@ -82,6 +82,7 @@ COMMAND_UNITS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "percent": ("look like percent; divide the commands by 100", lambda u: u / 100.0),
     "pwm16": ("look like raw PWM in 0..65535; divide the commands by 65535", lambda u: u / 65535.0),
     "dshot": (
+        # 0 to 47 are no throttle but orders to the ESC, under which a motor stands.
         "look like DSHOT values of 48 to 2047; subtract 47 and divide the commands by 2000",
         lambda u: np.clip((u - 47.0) / 2000.0, 0.0, None),
     ),

@@ -1,17 +1,19 @@
 """Which rows of a recording are measured flight: no standing, no carrying, no glitches, no frozen estimates.
 
-What is taken out is told in the log's notes; where it lay within the flight it becomes a gap.
+What is taken out is told in the log's notes; where it lay within the flight it becomes a gap. Times keep their values,
+so that those in messages are those of the recording.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
-from cfb_mjx.logs.flight_log import FlightLog, quantise_time
+from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.gaps import changes, runs
 
 _CARRIES = 0.5  # of the command in hover: with less for longer than a flip lasts nothing flies
@@ -56,6 +58,42 @@ def flown_part(log: FlightLog, path: Path, keep_ground: bool = False) -> FlightL
         return log
     said = {"notes": notes, "warnings": warnings}
     return log.replace(metadata={key: [*(log.metadata.get(key) or ()), *new] for key, new in said.items()})
+
+
+def without_spans(log: FlightLog, spans: Sequence[str], path: Path) -> FlightLog:
+    """The log without the rows that a user wants left out.
+
+    Args:
+        log: as read.
+        spans: ``A:B`` leaves out the rows from A to B, both included, in s as the log's times count; ``:B`` all up to
+            B, ``A:`` all from A on.
+        path: named in messages.
+
+    Raises:
+        CfbError: a span that is none, or in which the log has no rows; too little remains.
+    """
+    gone = np.zeros(len(log), dtype=bool)
+    for span in spans:
+        first, colon, last = span.partition(":")
+        try:
+            begin, end = float(first or "-inf"), float(last or "inf")
+        except ValueError:
+            begin, end = np.inf, -np.inf
+        if not (colon and (first or last) and begin <= end):
+            raise CfbError(f"--cut {span}: give seconds as A:B, :B or A:, for instance --cut 12.5:15.")
+        inside = (log.time >= begin) & (log.time <= end)
+        if not inside.any():
+            raise CfbError(
+                f"{path}: --cut {span}: the log has no rows there; its times are {log.time.min():.6g} to "
+                f"{log.time.max():.6g} s."
+            )
+        gone |= inside
+    if not gone.any():
+        return log
+    if (~gone).sum() < 2:
+        raise CfbError(f"{path}: --cut {' '.join(spans)} leaves {int((~gone).sum())} rows of {len(log)}; cut less.")
+    told = f"--cut {' '.join(spans)}: {int(gone.sum())} rows were left out, as asked."
+    return log.rows(~gone).replace(metadata={"notes": [*(log.metadata.get("notes") or ()), told]})
 
 
 def _without_lost_readings(log: FlightLog, warnings: list[str]) -> FlightLog:
@@ -112,11 +150,10 @@ def _airborne(log: FlightLog, path: Path, notes: list[str]) -> FlightLog:
         )
     gone = log.duration - float(sum(log.time[b - 1] - log.time[a] for a, b in runs(keep)))
     notes.append(
-        f"{gone:.1f} s on the ground or in the hand (motors off, standing, take-off, landing) were cut; --keep-ground "
-        "keeps them."
+        f"{gone:.1f} s on the ground or in the hand (motors off, standing, take-off, landing) were cut, so the log "
+        f"begins at {log.time[np.argmax(keep)]:.2f} s; --keep-ground keeps them."
     )
-    log = log.rows(keep)
-    return log.replace(time=quantise_time(log.time - log.time[0]))
+    return log.rows(keep)
 
 
 def _leaps(log: FlightLog) -> np.ndarray:

@@ -77,7 +77,7 @@ class Verdict:
         """One line: what agrees, and what moves too little to tell."""
         agree, gentle = {}, {}
         for r in self.relations:
-            if r.name not in ("gravity", "upright", "drag"):
+            if r.name not in ("gravity", "upright", "drag") and not r.contradicts:
                 (agree if r.moves else gentle).setdefault(r.name, []).append(r.axis)
         said = [f"{name} {' '.join(axes)}" for name, axes in agree.items()]
         motors = [name for name, value in self.agreement.items() if value > _MOTORS_TELL]
@@ -85,7 +85,7 @@ class Verdict:
             said.append("motors")
         text = f"signals agree: {', '.join(said)}" if said else "signals: nothing moves enough to compare them"
         rest = [f"{name} {' '.join(axes)}" for name, axes in gentle.items()]
-        rest += [] if motors else ["motors"]
+        rest += [] if motors or self.problem else ["motors"]
         return f"{text}; too gentle to tell: {', '.join(rest)}" if rest and said else text
 
 

@@ -102,9 +102,9 @@ def from_columns(
     warnings: list[str] = []
     streams: list[Stream] = []
     for table, path in tables:
-        said = [f"{path.name}: {note}" if len(tables) > 1 else note for note in getattr(table, "notes", ())]
-        warnings += [note for note in said if "left out" in note]
-        notes += [note for note in said if "left out" not in note]
+        whose = f"{path.name}: " if len(tables) > 1 else ""
+        notes += [f"{whose}{note}" for note in table.notes]
+        warnings += [f"{whose}{warning}" for warning in table.warnings]
         streams += _of_table(table, path, mapping, time_unit, notes)
     _require_one_flight(tables, streams)
     return assemble(Import("radio_csv", streams, None, notes, warnings), mapping, first)

@@ -14,9 +14,10 @@ from cfb_mjx.files import read_bytes
 from cfb_mjx.logs import arrays, containers, crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, ulog, usd_card
 from cfb_mjx.logs.fixes import Fix, fix_of
 from cfb_mjx.logs.flight_log import FlightLog
-from cfb_mjx.logs.flown import flown_part
+from cfb_mjx.logs.flown import flown_part, without_spans
+from cfb_mjx.logs.gate import Verdict
 from cfb_mjx.logs.proposal import UnknownNames, propose
-from cfb_mjx.logs.validation import validate
+from cfb_mjx.logs.validation import examine
 from cfb_mjx.logs.variables import MissingNames, load_mapping
 
 FORMATS = ("mcap", "tabular", "idsia", "usd_card", "crazyswarm", "radio_csv", "ulog")
@@ -37,6 +38,7 @@ def read_log(
     format: str | None = None,
     *,
     keep_ground: bool = False,
+    cut: Sequence[str] = (),
     fix: Sequence[str] = (),
     **options: Any,
 ) -> FlightLog:
@@ -51,6 +53,7 @@ def read_log(
             log of PX4. Arrays by name (.npz, .mat) are tables.
         keep_ground: leave in what is not flight: standing, take-off, landing, being carried. This library's own files
             are never cut.
+        cut: stretches to leave out, in s of the log's own time: ``12.5:15``, ``:3`` (all up to 3 s), ``40:``.
         fix: changes of convention to make, in this order, as a refusal names them: ``velocity-frame=body``
             (`cfb_mjx.logs.fixes`). Nothing of the kind is done unasked.
         **options: ``motor_shift`` for ``idsia`` (`cfb_mjx.logs.read_idsia`); ``mapping`` for ``usd_card``,
@@ -62,6 +65,19 @@ def read_log(
         UnknownNames: a table with names of its own, for which a mapping can be proposed.
         CfbError: one sentence naming the file, what is wrong with it and what to do.
     """
+    return read_judged(path, format, keep_ground=keep_ground, cut=cut, fix=fix, **options)[0]
+
+
+def read_judged(
+    path: str | os.PathLike | Sequence[str | os.PathLike],
+    format: str | None = None,
+    *,
+    keep_ground: bool = False,
+    cut: Sequence[str] = (),
+    fix: Sequence[str] = (),
+    **options: Any,
+) -> tuple[FlightLog, Verdict]:
+    """As `read_log`; returns beside the log what its signals say about each other."""
     several = not isinstance(path, str | os.PathLike)
     paths = [Path(p) for p in path] if several else [Path(path)]
     if not paths:
@@ -83,7 +99,7 @@ def read_log(
     changes = [fix_of(name) for name in fix]
     # What damage or another unit makes of numbers may overflow; the checks find it.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        return _checked(paths, format, options, tables, changes, keep_ground)
+        return _checked(paths, format, options, tables, changes, cut, keep_ground)
 
 
 def _checked(
@@ -92,8 +108,9 @@ def _checked(
     options: dict[str, Any],
     tables: dict[Path, tabular.Table],
     changes: list[Fix],
+    cut: Sequence[str],
     keep_ground: bool,
-) -> FlightLog:
+) -> tuple[FlightLog, Verdict]:
     first = paths[0]
     log = _read(paths, format, options, tables)
     for change in changes:
@@ -101,9 +118,10 @@ def _checked(
     if changes:
         told = [f"--fix {change.name}: {change.words}, as asked." for change in changes]
         log = log.replace(metadata={"notes": [*(log.metadata.get("notes") or ()), *told]})
+    log = without_spans(log, cut, first)
     if format in ("mcap", "idsia"):  # cut when it was imported; cut by its own rules
-        return validate(log, first)
-    return validate(flown_part(log, first, keep_ground), first)
+        return examine(log, first)
+    return examine(flown_part(log, first, keep_ground), first)
 
 
 def _read(paths: list[Path], format: str, options: dict[str, Any], tables: dict[Path, tabular.Table]) -> FlightLog:

@@ -46,11 +46,13 @@ class Table(dict[str, np.ndarray | Text]):
 
     Attributes:
         notes: what was done to read them.
+        warnings: what was left out of them.
     """
 
-    def __init__(self, columns=(), notes: list[str] | None = None):
+    def __init__(self, columns=(), notes: list[str] | None = None, warnings: list[str] | None = None):
         super().__init__(columns)
         self.notes = [] if notes is None else notes
+        self.warnings = [] if warnings is None else warnings
 
 
 def read_table(path: str | os.PathLike) -> Table:
@@ -72,9 +74,9 @@ def read_table(path: str | os.PathLike) -> Table:
     if not head:
         raise CfbError(f"{path}: the file is empty; export the log again.")
     is_parquet = head == b"PAR1"
-    notes: list[str] = []
+    said: tuple[list[str], list[str]] = [], []
     try:
-        table = _to_arrays(_parquet(path, notes) if is_parquet else read_text_table(path, read_bytes(path), notes))
+        table = _to_arrays(_parquet(path, said[0]) if is_parquet else read_text_table(path, read_bytes(path), *said))
     except (pa.ArrowException, OSError, ValueError, KeyError, OverflowError, MemoryError, RuntimeError) as error:
         kind = "parquet" if is_parquet else "csv"
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -83,7 +85,7 @@ def read_table(path: str | os.PathLike) -> Table:
         ) from None
     if not table:
         raise CfbError(f"{path}: the table has no columns; the layout is {LAYOUT}.")
-    return Table(table, notes)
+    return Table(table, *said)
 
 
 def require_numbers(table: Table, columns: list[str], path: Path) -> None:
@@ -215,18 +217,15 @@ def from_columns(table: Table, path: Path) -> FlightLog:
         values = stack(names) if names[0] in table else None
         # A column without a single value means "not measured", as does a missing one.
         fields[field] = None if values is None or np.isnan(values).all() else values
-    notes = list(getattr(table, "notes", ()))
+    notes = list(table.notes)
     if fields["battery_voltage"] is not None and np.isnan(fields["battery_voltage"]).any():
         fields["battery_voltage"] = _held(fields["battery_voltage"])
         notes.append("vbat has values in some rows only; each was held until the next.")
     if np.isfinite(fields["time"]).all() and np.abs(fields["time"]).max(initial=0.0) < 1e12:
         fields["time"] = quantise_time(fields["time"])
     metadata = {"name": path.stem, "source": path.name, "format": "tabular", "observation_delay": None}
-    if notes:
-        metadata |= {
-            "warnings": [n for n in notes if "left out" in n],
-            "notes": [n for n in notes if "left out" not in n],
-        }
+    if notes or table.warnings:
+        metadata |= {"warnings": list(table.warnings), "notes": notes}
     return FlightLog(**fields, metadata=metadata)
 
 

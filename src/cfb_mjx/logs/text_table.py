@@ -35,13 +35,14 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 _INDEX = re.compile(r"(Unnamed: ?0|index)?", re.IGNORECASE)
 
 
-def read_text_table(path: Path, data: bytes, notes: list[str]):
+def read_text_table(path: Path, data: bytes, notes: list[str], warnings: list[str]):
     """Read a table from text.
 
     Args:
         path: named in messages.
         data: content of the file.
-        notes: told what was left out, and what the file is written in where that is not plain csv.
+        notes: told what the file is written in where that is not plain csv.
+        warnings: told what was left out.
 
     Returns:
         A ``pyarrow.Table``; cells without a value, by any of the words in `NO_VALUE`, are null.
@@ -64,7 +65,7 @@ def read_text_table(path: Path, data: bytes, notes: list[str]):
             f"{path}: the first line holds numbers, so the table has no header; write the columns' names in its "
             "first line."
         )
-    rows = _whole_rows(path, lines, delimiter, len(header), ended, notes)
+    rows = _whole_rows(path, lines, delimiter, len(header), ended, warnings)
     comma = delimiter != "," and any(_DECIMAL_COMMA.fullmatch(c) for row in rows[:5] for c in _cells(row, delimiter))
     if comma:
         notes.append("numbers are written with a decimal comma.")
@@ -159,14 +160,16 @@ def _is_number(cell: str) -> bool:
     return _NUMBER.fullmatch(cell) is not None or _DECIMAL_COMMA.fullmatch(cell) is not None
 
 
-def _whole_rows(path: Path, lines: list[str], delimiter: str, width: int, ended: bool, notes: list[str]) -> list[str]:
+def _whole_rows(
+    path: Path, lines: list[str], delimiter: str, width: int, ended: bool, warnings: list[str]
+) -> list[str]:
     """The rows of the table; the last is left out where it was cut short."""
     rows = lines[1:]
     if rows and '"' not in rows[-1] and rows[-1].count(delimiter) < width - 1:
-        notes.append("the last line was cut short and was left out.")
+        warnings.append("the last line was cut short and was left out.")
         rows = rows[:-1]
     elif rows and not ended:
-        notes.append("the file does not end with a line break, so its last row may be cut short and was left out.")
+        warnings.append("the file does not end with a line break, so its last row may be cut short and was left out.")
         rows = rows[:-1]
     for number, row in enumerate(rows):
         if '"' not in row and row.count(delimiter) != width - 1:

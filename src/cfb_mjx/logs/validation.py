@@ -22,6 +22,11 @@ _UNITS = {"position": "m", "velocity": "m/s", "body_rate": "rad/s", "specific_fo
 
 
 def validate(log: FlightLog, path: str | os.PathLike) -> FlightLog:
+    """The log of `examine`, which also says what it takes and refuses."""
+    return examine(log, path)[0]
+
+
+def examine(log: FlightLog, path: str | os.PathLike) -> tuple[FlightLog, gate.Verdict]:
     """Check a log and return it with unit quaternions of continuous sign and commands within [0, 1].
 
     Args:
@@ -29,8 +34,8 @@ def validate(log: FlightLog, path: str | os.PathLike) -> FlightLog:
         path: the file to name in messages.
 
     Returns:
-        The log. Where its signals contradict each other and no change is known that makes them agree, a warning in its
-        metadata says so.
+        The log, and what its signals say about each other. Where they contradict each other and no change is known
+        that makes them agree, a warning in its metadata says so.
 
     Raises:
         CfbError: fewer than two rows; time that does not increase; NaN or infinity in a required column; quaternions
@@ -63,7 +68,7 @@ def validate(log: FlightLog, path: str | os.PathLike) -> FlightLog:
         said = f"signals contradict each other: {verdict.problem}; no change of unit, axes or order makes them agree."
         if said not in (log.metadata.get("warnings") or ()):
             log = log.replace(metadata={"warnings": [*(log.metadata.get("warnings") or ()), said]})
-    return log
+    return log, verdict
 
 
 def _at(log: FlightLog, row: int) -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cfb_mjx.logs.consistency import Comparison
+from cfb_mjx.logs.consistency import Comparison, Relation
 from cfb_mjx.view import style
 
 _WORDS = {
@@ -17,11 +17,14 @@ _WORDS = {
 }
 
 
-def checked_figure(compared: Mapping[str, Comparison], path: str | os.PathLike, title: str = "") -> None:
+def checked_figure(
+    compared: Mapping[str, Comparison], relations: Sequence[Relation], path: str | os.PathLike, title: str = ""
+) -> None:
     """Draw the comparisons of `cfb check`, a row each, a column per axis.
 
     Args:
         compared: by ``displacement``, ``attitude``, ``velocity``.
+        relations: what was found of them; panels that contradict are marked.
         path: file to write, ``.svg``, ``.png`` or ``.pdf``.
         title: heading.
 
@@ -29,6 +32,7 @@ def checked_figure(compared: Mapping[str, Comparison], path: str | os.PathLike, 
         CfbError: an unknown ending, or the file cannot be written.
     """
     path = style.check_path(path)
+    found = {(r.name, r.axis): r for r in relations}
     with style.context():
         figure = style.new_figure(11.0, 1.0 + 1.9 * len(compared))
         panels = figure.subplots(len(compared), 3, squeeze=False, sharex=True)
@@ -44,15 +48,20 @@ def checked_figure(compared: Mapping[str, Comparison], path: str | os.PathLike, 
                     panel.plot(
                         c.time, np.where(gap, np.nan, values[:, axis]), color=colour, linewidth=width, label=label
                     )
-                panel.set_title("xyz"[axis], fontsize=9)
+                said = found.get((name, "xyz"[axis]))
+                panel.set_title(
+                    "xyz"[axis] + (f": contradicts, slope {said.slope:.2f}" if said and said.contradicts else ""),
+                    fontsize=9,
+                    loc="right",
+                    color=style.COLOURS["rotor_speed_in"] if said and said.contradicts else "black",
+                )
             row[0].set_ylabel(f"{unit} in {c.width:.2g} s")
-            row[0].legend(fontsize=7, loc="upper right")
+            row[0].legend(fontsize=7, loc="lower left", bbox_to_anchor=(0.0, 0.98), ncols=2, borderaxespad=0)
         for panel in panels[-1]:
             panel.set_xlabel("s")
         height = figure.get_figheight()
-        figure.subplots_adjust(
-            left=0.07, right=0.99, top=1 - 0.65 / height, bottom=0.5 / height, wspace=0.18, hspace=0.3
-        )
+        top = 1 - (0.65 if title else 0.35) / height
+        figure.subplots_adjust(left=0.07, right=0.99, top=top, bottom=0.5 / height, wspace=0.18, hspace=0.3)
         if title:
             figure.suptitle(title, fontsize=11)
         style.save(figure, path)
