@@ -81,6 +81,39 @@ def test_motors_apart(folder, tmp_path):
     assert np.all(scale.std < 0.005)
 
 
+@pytest.mark.parametrize("follows", [True, False])
+def test_steps_under_a_supply_that_sags(tmp_path, capsys, follows):
+    """Speed follows command times voltage, unless the controller keeps it."""
+    rng = np.random.default_rng(1)
+    command = 0.8 * steps(rng, 6.0)
+    voltage = np.linspace(4.1, 3.4, len(command))
+    felt = command * voltage / 3.7 if follows else command
+    made = record(felt, rng, 0.045, 0.045, gain=2300.0, offset=300.0, wander=5.0)
+    path = save(
+        tmp_path / "steps.csv",
+        **{
+            "time[ms]": 1e3 * made.time,
+            "pwm": 65535 * command,
+            "vbat[V]": voltage,
+            "rpm": made.rotor_speed[:, 0] * 30 / np.pi,
+        },
+    )
+    run_fit_rotors([path], tmp_path / "m.yaml", "cfb-guards", [], json=tmp_path / "r.json")
+    told = json.loads((tmp_path / "r.json").read_text())["parameters"]
+    for name, truth in (("motor_gain", 2300.0), ("motor_speed_offset", 300.0), ("motor_time_constant", 0.045)):
+        assert abs(told[name]["value"] - truth) < 4 * told[name]["std"] + 0.01 * truth, name
+    said = "speed follows command times voltage" if follows else "speed does not follow the voltage of the supply"
+    assert said in capsys.readouterr().out
+
+
+def test_thrust_of_another_drone_names_its_model(tmp_path):
+    speed = np.linspace(800, 2600, 20)
+    path = save(tmp_path / "small.csv", omega=speed, force=1.5e-8 * speed**2)
+    with pytest.raises(CfbError, match=r"of what a rotor of cfb-guards pulls and .* of one of cf2x; give --model cf2x"):
+        run_fit_rotors([path], tmp_path / "m.yaml", "cfb-guards", [])
+    run_fit_rotors([path], tmp_path / "m.yaml", "cf2x", [])
+
+
 def test_refusals_leave_earlier_results(folder, tmp_path, files):
     kept = tmp_path / "kept.yaml"
     kept.write_text("mine")

@@ -46,12 +46,19 @@ def habits(log):
         "with units": {"Time (s)": log.time} | xyz("pos.{} [m]", p) | xyz("vel.{} [m/s]", v) | quat("quat.{}")
         | xyz("omega.{} [rad/s]", w) | xyz("accel.{} [m/s^2]", f) | four("cmd{}", u) | {"vbat": 3900 + 0 * log.time},
         "simulator": {"time": log.time} | xyz("{}", p) | xyz("{}dot", v) | quat("q{}") | xyz("w{}", w) | four("u{}", u),
+        "one prefix": {"timeTick": 4e5 + 1e3 * log.time} | xyz("state{}", p) | xyz("stateV{}", v)
+        | dict(zip(("roll", "pitch", "yaw"), roll_pitch_yaw(q), strict=True)) | four("motor{}", np.round(65535 * u))
+        | dict(zip(("roll rate", "pitch rate", "yaw rate"), w.T, strict=True)) | {"voltage": 4.0 + 0 * log.time},
+        "thrust beside duty": {"time[ms]": 1e3 * log.time} | xyz("{}[m]", p) | xyz("v{}[m/s]", v) | xyz("a{}[m/s^2]", f)
+        | quat("q{}") | four("u{}[N]", 0.2 * u) | four("u{}[PWM]", u) | xyz("w{}[rad/s]", w),
         "angles": {"timestamp_ms": 1e3 * log.time} | xyz("p{}", p)
         | dict(zip(("roll", "pitch", "yaw"), roll_pitch_yaw(q), strict=True)) | four("motor{}", u),
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["bare", "long", "with units", "simulator", "angles"])
+@pytest.mark.parametrize(
+    "name", ["bare", "long", "with units", "simulator", "one prefix", "thrust beside duty", "angles"]
+)
 def test_a_mapping_is_proposed_and_reads_the_flight(flight, tmp_path, name):
     columns = habits(flight)[name]
     path = tmp_path / "mine.csv"
@@ -112,6 +119,19 @@ def test_arrays_by_name(flight, tmp_path, ending):
     log = read_log(path, mapping=mapping)
     for field in ("position", "velocity", "quaternion", "body_rate", "specific_force", "command"):
         assert np.abs(getattr(log, field) - getattr(flight, field)).max() < 1e-9, field
+
+
+def test_a_quaternion_with_its_scalar_last(flight, tmp_path):
+    """As SciPy has it, and simulators after it."""
+    path = tmp_path / "flight.npz"
+    np.savez(path, **(arrays(flight) | {"quat": np.roll(flight.quaternion, -1, axis=1)}))
+    with pytest.raises(UnknownNames) as error:
+        read_log(path)
+    mapping = tmp_path / "mine.yaml"
+    mapping.write_text(error.value.mapping)
+    log = read_log(path, mapping=mapping)
+    assert np.abs(log.quaternion - flight.quaternion).max() < 1e-9
+    assert any("array quat was read as a quaternion x, y, z, w" in note for note in log.metadata["notes"])
 
 
 def test_arrays_in_the_tabular_layout_need_no_mapping(flight, tmp_path):

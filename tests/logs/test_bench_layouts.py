@@ -94,8 +94,8 @@ def test_commands_under_the_name_of_rpm(tmp_path):
 
 
 def test_a_unit_nobody_knows(tmp_path):
-    with pytest.raises(CfbError, match=r"column thrust\[lbf\] is in lbf"):
-        read(tmp_path, {"omega": SPEED, "thrust[lbf]": GRAMS})
+    with pytest.raises(CfbError, match=r"column thrust\[stone\] is in stone"):
+        read(tmp_path, {"omega": SPEED, "thrust[stone]": GRAMS})
 
 
 @pytest.mark.parametrize("late", [False, True])
@@ -137,3 +137,103 @@ def test_sensors_that_count_blades_twice(tmp_path):
     assert fit.per_volt == pytest.approx(613, abs=6)
     assert fit.outliers == pytest.approx(0.2, abs=0.02)
     assert abs(fit.offset - 350) < 4 * fit.offset_std
+
+
+RC = {
+    "ESC signal (µs)": 1000 + 1000 * U, "Torque (N·m)": -1e-3 * U, "Thrust (gf)": GRAMS / 4, "Voltage (V)": VOLT,
+    "Motor Electrical Speed (RPM)": SPEED * RPM, "Motor Optical Speed (RPM)": SPEED * RPM,
+    "Motor Efficiency (%)": 50 * U,
+}  # fmt: skip
+
+
+def points_and_map(parts):
+    (points,) = [p for p in parts if isinstance(p, SteadyPoints)]
+    (table,) = [p for p in parts if isinstance(p, MapTable)]
+    return points, table
+
+
+@pytest.mark.parametrize("dead", ["Motor Electrical Speed (RPM)", "Motor Optical Speed (RPM)"])
+def test_of_two_speed_sensors_the_one_that_reads(tmp_path, dead):
+    parts, _ = read(tmp_path, RC | {dead: 0 * U})
+    points, table = points_and_map(parts)
+    assert np.allclose(points.rotor_speed, SPEED)
+    assert np.allclose(table.force, KF * table.rotor_speed**2, rtol=1e-3)
+
+
+def test_speed_sensors_that_disagree_are_named(tmp_path):
+    parts, notes = read(tmp_path, RC | {"Motor Electrical Speed (RPM)": 6 / 7 * SPEED * RPM})
+    assert np.allclose(points_and_map(parts)[0].rotor_speed, SPEED)
+    assert any("Motor Electrical Speed (RPM) reads 0.857 times Motor Optical Speed (RPM)" in n for n in notes)
+
+
+def test_columns_named_after_a_powertrain_of_ones_own(tmp_path):
+    """Tyto's letters, explanations in brackets before the unit, a stand's name."""
+    names = {
+        "ESC throttle (μs)": 1000 + 1000 * U, "force Fz (thrust) (N)": GRAMS * 9.81e-3 / 4,
+        "torque MZ (torque) (N⋅m)": 1e-3 * U, "voltage (V)": VOLT, "rotation speed (rad/s)": SPEED,
+    }  # fmt: skip
+    one = {f"Left arm - {name}": values for name, values in names.items()}
+    parts, _ = read(tmp_path, one)
+    points, table = points_and_map(parts)
+    assert np.allclose(points.command, U)
+    assert np.allclose(table.force, KF * table.rotor_speed**2, rtol=1e-3)
+    assert table.torque is not None
+    with pytest.raises(CfbError, match=r"2 powertrains side by side \(left arm, right arm\)"):
+        read(tmp_path, one | {f"Right arm - {name}": values for name, values in names.items()})
+
+
+def test_a_stand_that_counts_a_pull_as_negative(tmp_path):
+    parts, notes = read(tmp_path, RC | {"Thrust (gf)": -GRAMS / 4})
+    table = points_and_map(parts)[1]
+    assert np.allclose(table.force, KF * table.rotor_speed**2, rtol=1e-3)
+    assert any("counts a pull as negative" in n for n in notes)
+
+
+def test_a_rotor_of_another_size_is_refused_for_its_size(tmp_path):
+    with pytest.raises(CfbError, match=r"Thrust \(N\) comes to 18 N a rotor, more than any of a Crazyflie"):
+        read(tmp_path, {k: v for k, v in RC.items() if "gf" not in k} | {"Thrust (N)": 18 * U / U.max()})
+
+
+def test_rows_far_apart_are_points_by_themselves(tmp_path):
+    parts, notes = read(tmp_path, {"Time (s)": 2.2 * np.arange(80)} | RC)
+    points, table = points_and_map(parts)
+    assert len(points.command) == len(table.rotor_speed) == 80
+    assert any("2.2 s apart" in n for n in notes)
+
+
+def test_a_clock_that_stands_at_first(tmp_path):
+    time = np.maximum(0.02 * (np.arange(80) - 2), 0.0)
+    time[5] = 0.01
+    parts, notes = read(tmp_path, {"Time (s)": time} | RC)
+    (record,) = [p for p in parts if isinstance(p, MotorRecord)]
+    assert len(record.time) in (76, 77)  # one more row where its command belongs to the row before
+    assert any("3 rows whose time does not go on" in n for n in notes)
+    assert any("in no row do speed and Thrust (gf) stand still together" in n for n in notes)
+    with pytest.raises(CfbError, match="t does not increase"):
+        read(tmp_path, {"Time (s)": 0.02 * (np.arange(80) % 20)} | RC)
+
+
+def test_sensors_that_are_read_in_turns(tmp_path):
+    slow = np.linspace(0.2, 0.9, 80)
+    speed = 350 + 613 * 3.7 * slow
+    force = KF * speed**2
+    turn = np.arange(80) % 3
+    parts, notes = read(
+        tmp_path,
+        {
+            "u": slow,
+            "rpm": np.where(turn == 0, speed * RPM, np.nan),
+            "Thrust (N)": np.where(turn == 1, force, np.nan),
+        },
+    )
+    table = points_and_map(parts)[1]
+    assert len(table.force) > 70
+    assert np.allclose(table.force, KF * table.rotor_speed**2, rtol=0.02)
+    assert any("read in turns" in n for n in notes)
+
+
+def test_a_controller_that_keeps_the_speed_does_not_follow_the_voltage():
+    kept = 350 + 2000 * U + RNG.normal(0, 5, 80)
+    fit = fit_steady([SteadyPoints("a", U, kept, VOLT)])
+    assert fit.per_volt is None
+    assert fit.gain == pytest.approx(2000, rel=0.01)

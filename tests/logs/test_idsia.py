@@ -220,3 +220,20 @@ def test_format_can_be_named(columns, tmp_path):
     assert same_data(read_log(path, format="idsia"), read_idsia(path))
     with pytest.raises(CfbError, match="missing columns"):
         read_log(path, format="tabular")
+
+
+def test_the_benchmarks_own_csv_files(columns, tmp_path):
+    """Other names for the packets' stamps, two indices of pandas, booleans and empty motion capture beside the rest."""
+    parquet = read(columns, tmp_path)
+    n = len(columns["t"])
+    names = {"ros_timestamp_x": "ros_timestamp", "ros_timestamp_y": "ros_timestamp_motors"}
+    names["ros_timestamp"] = "ros_timestamp_image_accel"
+    table = {"": np.arange(n), "Unnamed: 0": np.arange(n) + 4906}
+    table |= {names.get(name, name): values for name, values in columns.items()}
+    table |= {"is_flying": np.full(n, True), "qx_poses": [""] * n, "m1_rads2": columns["m1_erpm"] ** 2}
+    path = tmp_path / "square_20251017_run1.csv"
+    rows = zip(*table.values(), strict=True)
+    path.write_text("\n".join([",".join(table), *(",".join(map(str, row)) for row in rows), ""]))
+    log = read_log(path)
+    assert log.metadata["format"] == "idsia"
+    assert same_data(log, parquet)

@@ -165,3 +165,78 @@ def test_a_cut_file_gives_whole_rows_or_nothing(small, path, cut):
         log = read_log(path)
         assert np.array_equal(log.body_rate, truth.body_rate[: len(log)])
         assert log.metadata["warnings"] or len(log) == len(truth) - 1
+
+
+def table(path, columns, header=True):
+    rows = zip(*columns.values(), strict=True)
+    lines = [",".join(columns)] if header else []
+    path.write_text("\n".join([*lines, *(",".join(str(cell) for cell in row) for row in rows), ""]))
+
+
+def firmware(flight):
+    """The flight by names of the firmware."""
+    columns = {}
+    for names, values in (
+        (STATE, np.concatenate([flight.position, flight.velocity, flight.quaternion], axis=1)),
+        (IMU, np.concatenate([np.degrees(flight.body_rate), flight.specific_force / 9.81], axis=1)),
+        (MOTOR, np.round(65535 * flight.command)),
+    ):
+        columns |= dict(zip(names, values.T, strict=True))
+    return columns
+
+
+def same(log, flight, tolerance=1e-5):
+    for field in FIELDS:
+        assert np.abs(getattr(log, field) - getattr(flight, field)).max() < tolerance, field
+
+
+def test_names_with_something_before_them(flight, path):
+    """``cf3/gyro.x``, and ``est_stateEstimate_x`` as a merge of blocks names them; set-points are no measurement."""
+    ticks = {"Timestamp": np.round(1e3 * flight.time)}
+    for prefix, joined in (("cf3/", "."), ("est_", "_")):
+        named = {prefix + name.replace(".", joined): values for name, values in firmware(flight).items()}
+        wrong = {f"sp_{name.replace('.', '_')}": 0 * values for name, values in firmware(flight).items()}
+        table(path, ticks | wrong | named)
+        same(read_log(path), flight)
+
+
+def test_two_drones_in_one_table(flight, path):
+    columns = {"Timestamp": np.round(1e3 * flight.time)}
+    for drone, shift in (("cf1", 0.0), ("cf2", 1.0)):
+        columns |= {
+            f"{drone}/{name}": values + shift * (name == "stateEstimate.x") for name, values in firmware(flight).items()
+        }
+    table(path, columns)
+    with pytest.raises(CfbError, match=r"several drones \(cf1, cf2\); say whose with --robot cf1"):
+        read_log(path)
+    assert np.abs(read_log(path, robot="cf2").position - flight.position - [1.0, 0.0, 0.0]).max() < 1e-9
+    with pytest.raises(CfbError, match="has no columns of cf7; they are those of cf1, cf2"):
+        read_log(path, robot="cf7")
+
+
+def test_one_value_per_line_without_a_header(flight, path):
+    lines = [
+        f"{1e3 * t:.3f},{name},{values[row]!r}"
+        for row, t in enumerate(flight.time)
+        for name, values in ((n, v.tolist()) for n, v in firmware(flight).items())
+    ]
+    path.write_text("\n".join([*lines, ""]))
+    log = read_log(path)
+    same(log, flight)
+    assert any("no header" in note for note in log.metadata["notes"])
+
+
+def test_flights_of_nanobench(flight, path):
+    """Motion capture under the bare names, scalar last, and the drone's own sensors; the gyro in rad/s."""
+    vector = lambda stem, v: {stem.format(a): c for a, c in zip("xyz", v.T, strict=True)}  # noqa: E731
+    state = {f"est_{n.replace('.', '_')}": v + 0.3 for n, v in firmware(flight).items() if n.startswith("stateE")}
+    columns = {"t": [f"{1772419726.25 + t:.9f}" for t in flight.time]} | vector("p{}", flight.position)
+    columns |= {f"q{a}": flight.quaternion[:, i] for a, i in zip("xyzw", (1, 2, 3, 0), strict=True)}
+    columns |= vector("v{}", flight.velocity) | vector("w{}_vicon", flight.body_rate)
+    columns |= vector("imu_acc_{}", flight.specific_force / 9.81) | vector("imu_gyro_{}", flight.body_rate)
+    columns |= {f"motor_motor_m{i}": np.round(65535 * u) for i, u in enumerate(flight.command.T, 1)}
+    table(path, columns | state | {"pwr_pm_vbat": flight.battery_voltage})
+    log = read_log(path)
+    same(log, flight)
+    assert log.metadata["variables"]["mapping"] == "nanobench"
+    assert np.abs(log.battery_voltage - flight.battery_voltage).max() < 1e-9

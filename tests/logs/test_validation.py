@@ -23,6 +23,10 @@ BAD = {
     "one row": (lambda g: g.rows(slice(0, 1)), ["1 row,", "at least 2"]),
     "no row": (lambda g: g.rows(slice(0, 0)), ["0 rows", "at least 2"]),
     "duplicate time": (lambda g: g.replace(time=put(g.time, 7, g.time[6])), ["row 7", "repeats", "duplicates"]),
+    "time begins anew": (
+        lambda log: log.replace(time=np.where(np.arange(len(log)) < 300, log.time, log.time - log.time[300])),
+        ("several recordings", "split it there"),
+    ),
     "time goes back": (lambda g: g.replace(time=put(g.time, 7, 0.001)), ["row 7", "earlier", "sort"]),
     "time in ms": (scaled("time", 1e3), ["t looks like milliseconds", "divide it by 1e3"]),
     "time in us": (scaled("time", 1e6), ["t looks like microseconds", "divide it by 1e6"]),

@@ -45,7 +45,7 @@ def import_log(
         motor_shift: s by which to delay the motor columns of an IDSIA log instead of the estimated shift.
         mapping: YAML saying which logged variable is what (micro SD card, Crazyswarm2, radio csv).
         topics_yaml: crazyflies.yaml with the variable names of the custom topics of a Crazyswarm2 bag.
-        robot: whose flight to read from a Crazyswarm2 bag of several.
+        robot: whose flight to read from a Crazyswarm2 bag or a table of several.
         time_unit: unit of the time column of a radio csv: s, ms, us or ns.
         keep_ground: leave in what was recorded on the ground and in the hand.
         cut: seconds of the recording to leave out, for instance 12.5:15, :3 (all up to 3 s) or 40: (all from then on).

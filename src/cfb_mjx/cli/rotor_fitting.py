@@ -17,7 +17,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, require_folder, together, write_json
 from cfb_mjx.logs import read_log
 from cfb_mjx.logs.bench_layouts import Bench, SteadyPoints, read_bench_table, recognises
-from cfb_mjx.logs.bench_tables import MapTable
+from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
 from cfb_mjx.logs.tabular import read_table
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 _FILE_NAMES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
 _COLUMN = {"thrust": "force", "torque": "torque"}
 _FOUR_LEAST = 2.5
+_VARIES = 0.05  # V of spread from which a voltage can be told
 _LIMIT = "the model file has one time constant per motor and no dead time"
 
 
@@ -61,16 +62,13 @@ def run_fit_rotors(
     records, tables, points, notes = _read(paths, rotors)
     configure_jax(x64=True)
     from cfb_mjx.parameters import save_model_file
-    from cfb_mjx.sysid.rotors.motors import fit_motors
 
     base = changed_model(model, changes)
     _require_one_rotor(tables, base)
     motors = None
     extras = {"offset": offset, "asymmetric": asymmetric, "dead_time": dead_time}
     if records:
-        motors = fit_motors(
-            records, base.parameters(), **extras, per_motor=per_motor, progress=Progress("fitting motors")
-        )
+        motors = _fit_motors(records, base, extras, per_motor, notes)
     steady = None
     if points and not records:
         from cfb_mjx.sysid.rotors.steady import fit_steady
@@ -99,6 +97,33 @@ def run_fit_rotors(
     if motors and motors.common.extras - {"offset"}:
         print(f"spin-up and spin-down constants and dead time are reported only: {_LIMIT}.")
     print_paths(results=json, figure=figure)
+
+
+def _fit_motors(
+    records: list[MotorRecord], base: ModelFile, extras: dict[str, bool], per_motor: bool, notes: list[str]
+) -> MotorFit:
+    """Motors from commands, or from commands times voltage where a bench measured that and it is likelier."""
+    from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE
+    from cfb_mjx.sysid.rotors.motors import fit_motors
+
+    def fitted(used: list[MotorRecord], said: str) -> MotorFit:
+        return fit_motors(used, base.parameters(), **extras, per_motor=per_motor, progress=Progress(said))
+
+    plain = fitted(records, "fitting motors")
+    voltages = [r.battery_voltage for r in records]
+    if any(v is None or not np.isfinite(v).all() for v in voltages) or np.std(np.concatenate(voltages)) < _VARIES:
+        return plain
+    scaled = [replace(r, command=r.command * r.battery_voltage[:, None] / NOMINAL_VOLTAGE) for r in records]
+    followed = fitted(scaled, "fitting motors to command times voltage")
+    gained = plain.common.optimum.loss - followed.common.optimum.loss
+    if gained <= 0:
+        notes.append("speed does not follow the voltage of the supply: the command alone explains it better.")
+        return plain
+    notes.append(
+        f"speed follows command times voltage (log-likelihood +{gained:.0f} over the command alone): the gain is that "
+        f"at {NOMINAL_VOLTAGE} V; the effect battery_sag makes a model follow the voltage."
+    )
+    return followed
 
 
 def _read(paths: list[Path], rotors: int | None):
@@ -135,18 +160,12 @@ def _bench(path: Path, rotors: int | None) -> Bench | None:
 def _require_one_rotor(tables: list[MapTable], base: ModelFile) -> None:
     """Refuse thrust that is plainly that of four rotors, or a quarter of one's: no propeller this drone carries differs
     that much from another."""
-    from cfb_mjx.sysid.rotors.rotor_maps import powers
+    from cfb_mjx.parameters import load_model_file, preset_names
 
-    sigma = float(base.entries["reference_rotor_speed"].value)
-    curve = np.asarray(base.entries["thrust_polynomial"].value, float) * np.mean(base.entries["thrust_scale"].value)
     for table in tables:
-        if table.force is None:
+        ratio = _pull(table, base)
+        if ratio is None:
             continue
-        usual = powers(table.rotor_speed, sigma) @ curve
-        fast = table.rotor_speed > 0.6 * float(table.rotor_speed.max())
-        if not (fast & (usual > 0)).any():
-            continue
-        ratio = float(np.median(table.force[fast & (usual > 0)] / usual[fast & (usual > 0)]))
         top = int(np.argmax(table.rotor_speed))
         point = f"{table.force[top]:.3g} N at {table.rotor_speed[top]:.0f} rad/s"
         if ratio > _FOUR_LEAST:
@@ -154,11 +173,31 @@ def _require_one_rotor(tables: list[MapTable], base: ModelFile) -> None:
                 f"{table.name}: {point} is {ratio:.1f} times what one rotor of {base.name} pulls, so it is the thrust "
                 "of four; give --rotors 4."
             )
+        others = {name: _pull(table, load_model_file(name)) for name in preset_names() if ratio < 1 / _FOUR_LEAST}
+        like = min((n for n, r in others.items() if r), key=lambda n: abs(np.log(others[n])), default=None)
+        if like is not None and 1 / _FOUR_LEAST < others[like] < _FOUR_LEAST:
+            raise CfbError(
+                f"{table.name}: {point} is {ratio:.2f} of what a rotor of {base.name} pulls and {others[like]:.2f} of "
+                f"one of {like}; give --model {like}, or --rotors 1 if the thrust of one had been divided by four."
+            )
         if ratio < 1 / _FOUR_LEAST:
             raise CfbError(
                 f"{table.name}: {point} is {ratio:.2f} of what a rotor of {base.name} pulls, as if the thrust of one "
                 "had been divided by four; give --rotors 1, or correct its unit."
             )
+
+
+def _pull(table: MapTable, model: ModelFile) -> float | None:
+    """Thrust of fast points over what a model's rotor pulls at their speeds; None where it cannot be told."""
+    from cfb_mjx.sysid.rotors.rotor_maps import powers
+
+    if table.force is None:
+        return None
+    sigma = float(model.entries["reference_rotor_speed"].value)
+    curve = np.asarray(model.entries["thrust_polynomial"].value, float) * np.mean(model.entries["thrust_scale"].value)
+    usual = powers(table.rotor_speed, sigma) @ curve
+    fast = (table.rotor_speed > 0.6 * float(table.rotor_speed.max())) & (usual > 0)
+    return float(np.median(table.force[fast] / usual[fast])) if fast.any() else None
 
 
 def _fit_maps(tables: list[MapTable], base: ModelFile, per_motor: bool, robust: bool, tared: bool) -> dict[str, MapFit]:

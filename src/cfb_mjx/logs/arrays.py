@@ -14,6 +14,7 @@ from cfb_mjx.logs.tabular import Table
 NPZ, MAT = b"PK\x03\x04", b"MATLAB 5.0"
 _LARGEST = 1 << 28  # bytes of one array: a flight of an hour at 1 kHz is a tenth of that
 _NUMBERS = "biuf"
+_LARGE = 0.25  # mean square of a component of a unit quaternion
 
 
 def kind(head: bytes) -> str:
@@ -67,6 +68,10 @@ def read_arrays(path: Path) -> Table:
         if columns.shape[1] == 1:
             table[name] = columns[:, 0].astype(float)
         elif labels:
+            if labels == "xyzw":
+                table.notes.append(
+                    f"array {name} was read as a quaternion x, y, z, w: its first column is small throughout."
+                )
             table |= {f"{name}.{label}": column.astype(float) for label, column in zip(labels, columns.T, strict=True)}
         else:
             table.warnings.append(
@@ -95,7 +100,11 @@ def _of_pybullet(path: Path, arrays: dict[str, np.ndarray]) -> Table:
 def _labels(columns: np.ndarray) -> str:
     if columns.shape[1] == 4:
         norm = np.linalg.norm(columns.astype(float), axis=1)
-        return "wxyz" if np.nanmax(np.abs(norm - 1.0), initial=0.0) < 0.05 else "1234"
+        if np.nanmax(np.abs(norm - 1.0), initial=0.0) >= 0.05:
+            return "1234"
+        # A drone mostly flies level, so x is never the large one: a large first column is w. A first column that stays
+        # small is x, or the w of a drone that faces backwards throughout, which the checks of the log find out.
+        return "wxyz" if np.nanmean(columns[:, 0].astype(float) ** 2) > _LARGE else "xyzw"
     return "xyz" if columns.shape[1] == 3 else ""
 
 

@@ -7,6 +7,7 @@ RCbenchmark's and Tyto's exports (``Thrust (N)``, ``Motor Optical Speed (RPM)``,
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,49 +16,16 @@ from typing import NamedTuple
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs.bench_tables import SPEED_LIMIT, MapTable, MotorRecord, check_command, from_columns
+from cfb_mjx.logs.bench_columns import RPM, Columns, in_si, keys_of
+from cfb_mjx.logs.bench_tables import FORCE_LIMIT, SPEED_LIMIT, MapTable, MotorRecord, check_command, from_columns
 from cfb_mjx.logs.bench_tables import recognises as standard
-from cfb_mjx.logs.tabular import Table, require_numbers
+from cfb_mjx.logs.tabular import Table
 
-_GRAVITY = 9.81
-_RPM = 2 * np.pi / 60
-_UNITS: dict[str, dict[str, tuple[float, float]]] = {
-    # To SI: factor, and what is taken off before.
-    "t": {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "us": (1e-6, 0.0)},
-    "u": {"1": (1.0, 0.0), "%": (1e-2, 0.0), "pwm": (1 / 65535, 0.0), "us": (1e-3, 1000.0)},
-    "omega": {"rad/s": (1.0, 0.0), "rpm": (_RPM, 0.0)},
-    "force": {
-        "n": (1.0, 0.0),
-        "mn": (1e-3, 0.0),
-        "g": (1e-3 * _GRAVITY, 0.0),
-        "gf": (1e-3 * _GRAVITY, 0.0),
-        "kg": (_GRAVITY, 0.0),
-        "kgf": (_GRAVITY, 0.0),
-    },
-    "torque": {"nm": (1.0, 0.0), "mnm": (1e-3, 0.0), "nmm": (1e-3, 0.0)},
-    "vbat": {"v": (1.0, 0.0), "mv": (1e-3, 0.0)},
-}
-# Names without blanks, in the order in which they are preferred, and the unit where the header gives none.
-_NAMES: dict[str, tuple[tuple[str, str], ...]] = {
-    "t": (("t", "s"), ("time", "s"), ("timestamp", "s")),
-    "u": (("u", "1"), ("command", "1"), ("duty", "1"), ("pwm", "pwm"), ("throttle", "%"), ("escsignal", "us")),
-    "omega": (
-        ("omega", "rad/s"),
-        ("rpm", "rpm"),
-        ("motoropticalspeed", "rpm"),
-        ("rotationalspeed", "rpm"),
-        ("rotationspeed", "rpm"),
-        ("motorspeed", "rpm"),
-        ("motorelectricalspeed", "rpm"),
-    ),
-    "force": (("force", "n"), ("thrust", "n"), ("weight", "g"), ("load", "g"), ("lift", "g")),
-    "torque": (("torque", "nm"),),
-    "vbat": (("vbat", "v"), ("voltage", "v"), ("v", "v"), ("battery", "v")),
-}
-_MOTOR = re.compile(r"(?P<name>[a-z]+?)_?(?P<motor>[1-4])?")
 _LEAST_COMMAND = 0.05
 _DEAD = 0.5  # of the rows under command: with more zeros than that a sensor tells nothing
 _STEP, _STEPS, _AFTER, _ANSWERED = 0.05, 3, 5, 0.05
+_APART = 0.1  # s: rows further apart than this are no recording of a motor, which answers in 0.05
+_BACK_ROWS = 5
 _SETTLED = 0.01  # of the speed over 0.1 s: faster changes are not steady
 
 
@@ -89,7 +57,7 @@ def recognises(table: Table) -> bool:
     """Whether the columns are a bench table's rather than a flight's, under any of the known names."""
     if any(c in table for c in ("px", "qw", "wx", "ax", "ros_timestamp_x")):
         return False
-    found = {key for key, _ in _columns(table)}
+    found = set(keys_of(table))
     return standard(table) or bool({"force", "omega"} <= found or {"force", "u"} <= found or {"omega", "u"} <= found)
 
 
@@ -105,9 +73,9 @@ def read_bench_table(table: Table, path: Path, rotors: int | None = None) -> Ben
     Raises:
         CfbError: as `bench_tables.read_bench`; or nothing can be told from the columns.
     """
-    found = _columns(table)
+    known = [column for columns in keys_of(table).values() for column in columns]
     steady = "t" not in table and {"u", "omega"} <= set(table) and not {"force", "torque"} & set(table)
-    if standard(table) and not steady and not any(name not in _STANDARD for _, name in found if name in table):
+    if standard(table) and not steady and _STANDARD.issuperset(known):
         part, notes = from_columns(table, path), []
         if isinstance(part, MotorRecord):
             part = _command_before(part, notes)
@@ -115,17 +83,19 @@ def read_bench_table(table: Table, path: Path, rotors: int | None = None) -> Ben
             part = _of_one(part, rotors)
         return Bench([part], notes)
     notes: list[str] = []
-    si, names = _in_si(table, found, path)
-    speeds = {key: si[key] for key in si if re.fullmatch(r"omega[1-4]?", key)}
-    if not speeds:
+    columns = in_si(table, path, notes)
+    si, names = columns.values, columns.names
+    if not any(re.fullmatch(r"omega[1-4]?", key) for key in si):
         raise CfbError(
             f"{path}: has no rotor speed (a column rpm1..rpm4 or omega), and thrust against command alone tells "
             "neither the motors nor the rotors; measure the speed too."
         )
+    si = _in_time(columns, path, notes)
+    speeds = {key: si[key] for key in si if re.fullmatch(r"omega[1-4]?", key)}
     command = {key: si[key] for key in si if re.fullmatch(r"u[1-4]?", key)}
     _refuse_commands_as_speed(speeds, names, path)
     speeds = _living(speeds, command, names, path, notes)
-    return Bench(_parts(si, speeds, command, path, rotors, names, notes), notes)
+    return Bench(_parts(si, speeds, command, path, rotors, columns, notes), notes)
 
 
 _STANDARD = frozenset(
@@ -142,58 +112,11 @@ _STANDARD = frozenset(
 )
 
 
-def _columns(table: Table) -> list[tuple[str, str]]:
-    """What each column is, and its name; of two columns for one thing the preferred one."""
-    best: dict[str, tuple[int, str]] = {}
-    for column in table:
-        bare, _ = _bare(column)
-        match = _MOTOR.fullmatch(bare)
-        if match is None:
-            continue
-        for key, names in _NAMES.items():
-            rank = next((i for i, (name, _) in enumerate(names) if name == match["name"]), None)
-            if rank is None or (match["motor"] and key not in ("u", "omega")):
-                continue
-            full = key + (match["motor"] or "")
-            if full not in best or rank < best[full][0]:
-                best[full] = rank, column
-    return [(key, column) for key, (_, column) in best.items()]
-
-
-def _bare(column: str) -> tuple[str, str | None]:
-    """A header without its unit, and the unit."""
-    text = re.sub(r"^powertrain ?\d+ ?[-:] ?", "", column.strip().lower().replace("µ", "u").replace("μ", "u"))
-    match = re.fullmatch(r"(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]\s*", text)
-    name, unit = (match["name"], match["unit"]) if match else (text, None)
-    unit = None if unit is None else re.sub(r"[\s·⋅*.]", "", unit)
-    return re.sub(r"\s", "", name), unit
-
-
-def _in_si(table: Table, found: list[tuple[str, str]], path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    require_numbers(table, [column for _, column in found], path)
-    si, names = {}, {}
-    for key, column in found:
-        kind = key.rstrip("1234")
-        bare, unit = _bare(column)
-        default = dict(_NAMES[kind])[_MOTOR.fullmatch(bare)["name"]]
-        known = _UNITS[kind]
-        unit = default if unit is None else unit
-        if unit not in known:
-            raise CfbError(f"{path}: column {column} is in {unit}, which is none of {', '.join(known)}; convert it.")
-        factor, zero = known[unit]
-        values = np.asarray(table[column], float)
-        # Duty of 0 to 1 under the name pwm.
-        if unit == "pwm" and np.nanmax(np.abs(values), initial=0.0) <= 1.001:
-            factor = 1.0
-        si[key], names[key] = (values - zero) * factor, column
-    return si, names
-
-
 def _refuse_commands_as_speed(speeds: dict[str, np.ndarray], names: dict[str, str], path: Path) -> None:
     for key, values in speeds.items():
         known = values[np.isfinite(values)]
         if len(known) and np.median(known) > 0.8 * SPEED_LIMIT and known.max() > SPEED_LIMIT:
-            raw = known / _RPM
+            raw = known / RPM
             hint = "multiply it by 2 pi / 60" if not names[key].lower().startswith("rpm") else "it is in another unit"
             if names[key].lower().startswith("rpm") and raw.max() <= 65535.5:
                 hint = "these look like 16-bit commands; name the column pwm, and measure the speed too"
@@ -201,6 +124,37 @@ def _refuse_commands_as_speed(speeds: dict[str, np.ndarray], names: dict[str, st
                 f"{path}: column {names[key]} reaches {known.max():.0f} rad/s ({raw.max():.0f} rpm), which no rotor of "
                 f"this size turns; {hint}."
             )
+
+
+def _in_time(columns: Columns, path: Path, notes: list[str]) -> dict[str, np.ndarray]:
+    """Rows in order of time, each with all readings; without the time where rows are measurements by themselves."""
+    si = dict(columns.values)
+    if "t" in si:
+        latest = np.maximum.accumulate(np.concatenate([[-np.inf], si["t"][:-1]]))
+        forward = si["t"] > latest
+        late = int(len(forward) - forward.sum())
+        if 0 < late <= max(_BACK_ROWS, 0.02 * len(forward)):
+            notes.append(f"{path.name}: {late} rows whose time does not go on were left out.")
+            si = {key: values[forward] for key, values in si.items()}
+        step = float(np.median(np.diff(si["t"]))) if len(si["t"]) > 1 else 0.0
+        if step > _APART and "t" in columns.unit_said:
+            notes.append(f"{path.name}: rows are {step:.2g} s apart, so each is read as a point by itself.")
+            del si["t"]
+    return _filled(si, path, notes)
+
+
+def _filled(si: dict[str, np.ndarray], path: Path, notes: list[str]) -> dict[str, np.ndarray]:
+    """Sensors that are read in turns leave cells empty; between two readings lies a line."""
+    known = {key: np.isfinite(values) for key, values in si.items()}
+    fewest = min(int(k.sum()) for k in known.values())
+    together = int(np.all(list(known.values()), axis=0).sum())
+    if fewest < 2 or together > fewest / 2:
+        return si
+    at = si.get("t", np.arange(len(next(iter(si.values()))), dtype=float))
+    notes.append(f"{path.name}: sensors were read in turns; values between two readings were interpolated.")
+    return {
+        key: np.interp(at, at[known[key]], values[known[key]], left=np.nan, right=np.nan) for key, values in si.items()
+    }
 
 
 def _living(speeds, command, names, path: Path, notes: list[str]) -> dict[str, np.ndarray]:
@@ -224,17 +178,24 @@ def _living(speeds, command, names, path: Path, notes: list[str]) -> dict[str, n
 
 
 def _mean(columns: dict[str, np.ndarray]) -> np.ndarray:
-    return np.nanmean(np.stack(list(columns.values()), axis=1), axis=1)
+    """Of the readings in a row; NaN where there is none."""
+    values = np.stack(list(columns.values()), axis=1)
+    count = np.isfinite(values).sum(axis=1)
+    return np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
 
 
-def _parts(si, speeds, command, path: Path, rotors, names, notes) -> list[MotorRecord | MapTable | SteadyPoints]:
+def _parts(
+    si, speeds, command, path: Path, rotors, columns: Columns, notes
+) -> list[MotorRecord | MapTable | SteadyPoints]:
     parts: list[MotorRecord | MapTable | SteadyPoints] = []
+    names = columns.names
     steady = np.ones(len(next(iter(speeds.values()))), dtype=bool)
     numbers = {key: int(key[5:] or 0) for key in speeds}
     if command and "t" in si:
         table = {"t": si["t"]} | {f"omega{numbers[k] or ''}": v for k, v in speeds.items()}
         table |= {k: np.clip(v, 0, None) for k, v in command.items()}
-        parts.append(_command_before(from_columns(Table(table), path), notes))
+        record = dataclasses.replace(from_columns(Table(table), path), battery_voltage=si.get("vbat"))
+        parts.append(_command_before(record, notes))
         steady = _steady(si["t"], _mean(speeds))
     elif command:
         parts.append(_steady_points(speeds, command, si.get("vbat"), path))
@@ -246,12 +207,27 @@ def _parts(si, speeds, command, path: Path, rotors, names, notes) -> list[MotorR
         return parts
     count = rotors or (4 if len(si.keys() & {f"omega{i}" for i in range(1, 5)}) > 1 else 1)
     # With thrust as the square of the speed, the root of the mean square is what carries the mean thrust.
-    speed = np.sqrt(np.nanmean(np.stack(list(speeds.values()), axis=1) ** 2, axis=1))
+    speed = np.sqrt(_mean({key: values**2 for key, values in speeds.items()}))
     good = steady & np.isfinite(speed)
     for values in (force, torque):
         good &= np.isfinite(values) if values is not None else True
     if command:
         good &= _mean(command) > _LEAST_COMMAND
+    if not good.any():
+        said = f"in no row do speed and {names.get('force', names.get('torque'))} stand still together"
+        if not parts:
+            raise CfbError(f"{path}: {said}, so nothing can be told; hold every command for half a second.")
+        notes.append(f"{path.name}: {said}, so thrust and torque were left out.")
+        return parts
+    if force is not None and _pulls_down(force[good], speed[good]):
+        notes.append(f"{path.name}: {names['force']} falls with speed, so the stand counts a pull as negative; turned.")
+        force = -force
+    top = 0.0 if force is None else float(np.nanmax(np.abs(force), initial=0.0)) / count
+    if top > FORCE_LIMIT and "force" in columns.unit_said:
+        raise CfbError(
+            f"{path}: {names['force']} comes to {top:.3g} N a rotor, more than any of a Crazyflie pulls; give a table "
+            "of its own rotors, or correct the unit in the header."
+        )
     if count > 1:
         notes.append(f"{path.name}: {names.get('force', names.get('torque'))} is what {count} rotors give together.")
     table = {"omega": speed[good]}
@@ -260,6 +236,13 @@ def _parts(si, speeds, command, path: Path, rotors, names, notes) -> list[MotorR
     if torque is not None:
         table["torque"] = np.abs(torque[good]) / count
     return [*parts, from_columns(Table(table), path)]
+
+
+def _pulls_down(force: np.ndarray, speed: np.ndarray) -> bool:
+    if len(force) < 3 or not np.ptp(speed) > 0 or not np.ptp(force) > 0:
+        return False
+    fast = speed >= np.quantile(speed, 0.75)
+    return bool(np.median(force[fast]) < 0 and np.corrcoef(force, speed**2)[0, 1] < -0.9)
 
 
 def _command_before(record: MotorRecord, notes: list[str]) -> MotorRecord:
@@ -282,7 +265,14 @@ def _command_before(record: MotorRecord, notes: list[str]) -> MotorRecord:
         f"{record.name}: the speed answers in the very row of a new command, so each row's command is the one that "
         "led to it; it was moved to the row before."
     )
-    return MotorRecord(record.name, record.time[:-1], record.command[1:], record.rotor_speed[:-1], record.motors)
+    voltage = None if record.battery_voltage is None else record.battery_voltage[:-1]
+    return dataclasses.replace(
+        record,
+        time=record.time[:-1],
+        command=record.command[1:],
+        rotor_speed=record.rotor_speed[:-1],
+        battery_voltage=voltage,
+    )
 
 
 def _of_one(part: MapTable, rotors: int) -> MapTable:
@@ -299,7 +289,10 @@ def _steady(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
 
 def _steady_points(speeds, command, voltage, path: Path) -> SteadyPoints:
     """One point a row: the median of its rotors, which one that is counted double does not move."""
-    omega = np.nanmedian(np.stack(list(speeds.values()), axis=1), axis=1)
+    omega = np.full(len(next(iter(speeds.values()))), np.nan)
+    readings = np.stack(list(speeds.values()), axis=1)
+    read = np.isfinite(readings).any(axis=1)
+    omega[read] = np.nanmedian(readings[read], axis=1)
     u = _mean(command)
     good = np.isfinite(omega) & np.isfinite(u) & (u > _LEAST_COMMAND)
     if voltage is not None:

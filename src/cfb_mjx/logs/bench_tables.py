@@ -29,6 +29,7 @@ class MotorRecord:
         command: (n, k) in [0, 1]; a row holds until the next.
         rotor_speed: (n, k) rad/s, NaN where a reading is missing.
         motors: (k,) motor numbers 1..4; 0 where the recording does not say which.
+        battery_voltage: (n,) V of the supply of a bench; None where it was not measured, or for a flight.
     """
 
     name: str
@@ -36,6 +37,7 @@ class MotorRecord:
     command: np.ndarray
     rotor_speed: np.ndarray
     motors: tuple[int, ...]
+    battery_voltage: np.ndarray | None = None
 
     def segments(self) -> list[slice]:
         """Stretches of rows without a gap (a gap is longer than three nominal intervals + 0.5 ms)."""

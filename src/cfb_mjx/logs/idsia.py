@@ -23,6 +23,12 @@ POSITION, VELOCITY = ("x", "y", "z"), ("vx", "vy", "vz")
 QUATERNION = ("qw", "qx", "qy", "qz")  # stored scalar last; reading by name reorders
 GYRO, ACCELERATION = ("wx", "wy", "wz"), ("ax", "ay", "az")
 COMMAND = tuple(f"m{i}_thrust" for i in range(1, 5))
+# What the benchmark's own csv files call what its parquet files call STAMPS.
+_STAMPS_OF_CSV = {
+    "ros_timestamp": "ros_timestamp_x",
+    "ros_timestamp_motors": "ros_timestamp_y",
+    "ros_timestamp_image_accel": "ros_timestamp",
+}
 ERPM = tuple(f"m{i}_erpm" for i in range(1, 5))
 STAMPS = ("ros_timestamp_x", "ros_timestamp_y", "ros_timestamp")  # state, motor and accelerometer packets
 COLUMNS = ("t", *POSITION, *VELOCITY, *QUATERNION, *GYRO, *ACCELERATION, *COMMAND, *ERPM, *STAMPS, "Vbat")
@@ -44,7 +50,7 @@ HELD_RUN = 3  # held copies in a row that make a gap: dropping 3 of 100 Hz leave
 
 def recognises(table: Table) -> bool:
     """Whether the columns are those of the benchmark rather than of the tabular layout."""
-    return "m1_thrust" in table and "ros_timestamp_x" in table
+    return "m1_thrust" in table and ("ros_timestamp_x" in table or "ros_timestamp_motors" in table)
 
 
 def read_idsia(path: str | os.PathLike, motor_shift: float | None = None) -> FlightLog:
@@ -67,6 +73,10 @@ def read_idsia(path: str | os.PathLike, motor_shift: float | None = None) -> Fli
 
 def from_columns(table: Table, path: Path, motor_shift: float | None = None) -> FlightLog:
     """`read_idsia` on columns already in memory."""
+    if "ros_timestamp_motors" in table and "ros_timestamp_x" not in table:
+        table = Table(
+            {_STAMPS_OF_CSV.get(name, name): values for name, values in table.items()}, table.notes, table.warnings
+        )
     if missing := [c for c in COLUMNS if c not in table]:
         raise CfbError(
             f"{path}: missing column{'s' * (len(missing) > 1)} {', '.join(missing)}; the IDSIA layout is the "

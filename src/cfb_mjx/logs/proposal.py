@@ -13,7 +13,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
 from cfb_mjx.logs.radio_csv import clock_of
 from cfb_mjx.logs.tabular import Text
-from cfb_mjx.logs.variables import DERIVED_FROM, FORMAT
+from cfb_mjx.logs.variables import DERIVED_FROM, FORMAT, UNITS
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 _MEMBERS = {**_AXES, "w": 3, **{str(i): i for i in range(5)}}
@@ -25,9 +25,11 @@ _STEMS: tuple[tuple[str, str], ...] = (
     ("quaternion", r"q(uat(ernion)?)?|orientation|rot(ation)?|att(itude)?|poseorientation"),
     ("position", r"|p(os(ition)?)?|translation|loc(ation)?|poseposition"),
     ("command", r"u|m(otor)?s?|pwm|cmds?|commands?|duty|throttle|action|motorpwm|motorcmd|thrustpwm|mpwm"),
-    ("rotor_speed", r"r|rpms?|rotor(speed)?s?|motor(rpm|speed)s?|omegam|erpm|mrpm"),
+    ("rotor_speed", r"r|rpms?|rotor(speed|vel(ocity)?)?s?|motor(rpm|speed)s?|omegam|erpm|mrpm"),
 )
 _ANGLES = re.compile(r"(.*?)(roll|pitch|yaw|phi|theta|psi)", re.IGNORECASE)
+_THRUST = frozenset(["n", "mn", "g", "gf", "kgf"])
+_RATES = re.compile(r"(roll|pitch|yaw)(rate|dot|speed|vel)|(?:body)?rate(roll|pitch|yaw)", re.IGNORECASE)
 _BATTERY = re.compile(r"(pm)?v?bat(tery)?(_?(voltage|v|mv))?|voltage|vbat.*", re.IGNORECASE)
 _GROUPS = re.compile(
     r"^(state_?estimate|state|pose|odom(etry)?|imu|sensors?|drone|cf\d*|data|log)[._/ ]+(?=.)", re.IGNORECASE
@@ -64,6 +66,10 @@ def propose(table: Mapping[str, np.ndarray | Text]) -> Proposal | None:
         names = [angles.get(a) or angles.get(b) for a, b in (("roll", "phi"), ("pitch", "theta"), ("yaw", "psi"))]
         if None not in names:
             found["angles"] = names
+    if "body_rate" not in found:
+        rates = {(m[1] or m[3]).lower(): n for n in numbers if (m := _RATES.fullmatch(_plain(n)))}
+        if len(rates) == 3:
+            found["body_rate"] = [rates[a] for a in ("roll", "pitch", "yaw")]
     if (
         "position" not in found
         or not {"quaternion", "angles"} & set(found)
@@ -82,7 +88,7 @@ def _plain(name: str) -> str:
 
 def _families(numbers: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
     """Field to its columns in order: names that differ in an axis or a number only."""
-    groups: dict[str, dict[str, str]] = {}
+    groups: dict[tuple[str, str], dict[str, str]] = {}
     for name in numbers:
         bare = re.sub(r"\[[^\]]*\]|\([^)]*\)", "", name)
         plain = _plain(bare)
@@ -90,10 +96,10 @@ def _families(numbers: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
         if match is None:
             continue
         stem, member = (match["stem"], match["last"]) if match["last"] else (match["rest"], match["first"])
-        groups.setdefault(stem, {}).setdefault(member, name)
+        groups.setdefault((stem, _unit_of(name)), {}).setdefault(member, name)
     found: dict[str, list[str]] = {}
-    for stem, members in groups.items():
-        kinds = [field for field, pattern in _STEMS if re.fullmatch(pattern, stem)]
+    for (stem, unit), members in groups.items():
+        kinds = [field for field, pattern in _STEMS if re.fullmatch(f"(?:state|est|kalman)?(?:{pattern})", stem)]
         if set("wxyz") <= set(members) and "quaternion" in kinds:
             found.setdefault("quaternion", [members[a] for a in "wxyz"])
         elif (
@@ -102,9 +108,15 @@ def _families(numbers: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
             found.setdefault(kinds[0], [members[a] for a in "xyz"])
         four = next((d for d in ("1234", "0123") if set(d) <= set(members)), None)
         motors = [k for k in kinds if k in ("command", "rotor_speed")] or (["rotor_speed"] if stem == "omega" else [])
-        if four and motors:
+        if four and motors and unit not in _THRUST:
             found.setdefault(motors[0], [members[d] for d in four])
     return found
+
+
+def _unit_of(name: str) -> str:
+    """What stands in brackets at the end of a header, in small letters."""
+    match = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", name)
+    return match[1].strip().lower() if match else ""
 
 
 def _document(found: dict[str, list[str]], numbers: Mapping[str, np.ndarray]) -> Proposal:
@@ -112,7 +124,9 @@ def _document(found: dict[str, list[str]], numbers: Mapping[str, np.ndarray]) ->
     fields: dict[str, list[dict]] = {}
     for field, names in found.items():
         entry: dict = {"variables": names}
-        unit = _unit(field, values)
+        said = _unit_of(names[0])
+        known = UNITS["quaternion" if field == "angles" else field]
+        unit = said if said in known else _unit(field, values)
         if field == "angles":
             entry |= {"form": "euler", "unit": unit}
         elif field != "quaternion":

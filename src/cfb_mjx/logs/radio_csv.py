@@ -25,13 +25,15 @@ from cfb_mjx.logs.variables import VariableMap, load_mapping
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _SHORTEST, _LONGEST = 2e-4, 0.45  # s: no log block is faster or slower than this, so the unit must be another
 _CLOCK = re.compile(
-    r"(?P<name>timestamp|time[_ .]?stamp|tick|time|t|stamp|clock|elapsed)"
+    r"(?P<name>timestamp|time[_ .]?stamp|time[_ .]?tick|tick|time|t|stamp|clock|elapsed)"
     r"[_ .]*[\[(]?(?P<unit>s|sec|seconds|ms|us|ns)?[\])]?",
     re.IGNORECASE,
 )
-_CLOCKS = ("timestamp", "timestamp", "tick", "time", "t", "stamp", "clock", "elapsed")
+_CLOCKS = ("timestamp", "timetick", "tick", "time", "t", "stamp", "clock", "elapsed")
 _HOST = re.compile(r"(host|pc|ros|unix|wall|system|log)[_ .]?(time|stamp|timestamp)?.*", re.IGNORECASE)
 _LONG = ({"name", "variable", "var", "key", "topic"}, {"value", "val", "data"})
+_PREFIX = re.compile(r"(?P<head>[A-Za-z0-9]+)[._/ :](?P<rest>.+[._/ :].+)")
+_NOT_MEASURED = frozenset(["sp", "ref", "des", "cmd", "target", "goal", "setpoint", "desired", "reference"])
 _FEWEST = 3  # columns with names of the firmware that make a table one of this kind
 
 
@@ -67,6 +69,7 @@ def read_radio_csv(
     path: str | os.PathLike | Sequence[str | os.PathLike],
     mapping: str | os.PathLike | VariableMap | None = None,
     time_unit: str | None = None,
+    robot: str | None = None,
 ) -> FlightLog:
     """Read tables of named variables. `read_log` also validates the content.
 
@@ -79,19 +82,22 @@ def read_radio_csv(
         mapping: which variable is which column; a mapping file, or None for ``configs/logs/crazyflie.yaml``.
         time_unit: of the time column: ``s``, ``ms``, ``us`` or ``ns``. None takes what its name says, else ms for a
             ``Timestamp`` and for other columns the only unit in which rows follow each other as in a log.
+        robot: whose columns to read where the names of several drones stand before those of variables
+            (``cf3/gyro.x``).
 
     Raises:
         CfbError: unreadable file, no time column, cells that are not numbers, a time column in another unit or that
             goes back, required variables that were not logged, fewer than two rows.
     """
     paths = [Path(path)] if isinstance(path, str | os.PathLike) else [Path(p) for p in path]
-    return from_columns([(read_table(p), p) for p in paths], mapping, time_unit)
+    return from_columns([(read_table(p), p) for p in paths], mapping, time_unit, robot)
 
 
 def from_columns(
     tables: Sequence[tuple[Table, Path]],
     mapping: str | os.PathLike | VariableMap | None = None,
     time_unit: str | None = None,
+    robot: str | None = None,
 ) -> FlightLog:
     """`read_radio_csv` on columns already in memory."""
     first = tables[0][1]
@@ -105,19 +111,21 @@ def from_columns(
         whose = f"{path.name}: " if len(tables) > 1 else ""
         notes += [f"{whose}{note}" for note in table.notes]
         warnings += [f"{whose}{warning}" for warning in table.warnings]
-        streams += _of_table(table, path, mapping, time_unit, notes)
+        streams += _of_table(table, path, mapping, time_unit, robot, notes)
     _require_one_flight(tables, streams)
     return assemble(Import("radio_csv", streams, None, notes, warnings), mapping, first)
 
 
-def _of_table(table: Table, path: Path, mapping: VariableMap, time_unit: str | None, notes: list[str]) -> list[Stream]:
+def _of_table(
+    table: Table, path: Path, mapping: VariableMap, time_unit: str | None, robot: str | None, notes: list[str]
+) -> list[Stream]:
     long = _long_form(table)
     if long is not None:
-        return _of_long_form(table, *long, path, mapping, time_unit, notes)
+        return _of_long_form(table, *long, path, mapping, time_unit, robot, notes)
     clock = clock_of(table)
     if clock is None:
         raise CfbError(f"{path}: there is no time column; name it Timestamp (ms) or t (s).")
-    named = _variables(table, mapping)
+    named = _of_one_drone(table, mapping, path, robot)
     require_numbers(table, [clock.column, *named.values()], path)
     ticks = table[clock.column]
     if not np.isfinite(ticks).all():
@@ -136,14 +144,46 @@ def _of_table(table: Table, path: Path, mapping: VariableMap, time_unit: str | N
 
 
 def _variables(columns: Iterable[str], mapping: VariableMap) -> dict[str, str]:
-    """Logged name to column: the same name, or the same but for what joins its parts."""
+    """Logged name to column: the same name, or the same but for what joins its parts, or what stands before it."""
+    return {name: same[0] for name, same in _candidates(columns, mapping).items()}
+
+
+def _candidates(columns: Iterable[str], mapping: VariableMap) -> dict[str, list[str]]:
+    """Logged name to the columns that may be it: several where a table holds several drones."""
+    columns = list(columns)
     wanted = {_bare(v): v for choices in mapping.choices.values() for c in choices for v in c.variables}
     found: dict[str, str] = {}
     for column in columns:
         name = wanted.get(_bare(column))
         if name is not None and (name not in found or column == name):
             found[name] = column
-    return found
+    candidates = {name: [column] for name, column in found.items()}
+    for column in columns:
+        # "cf3/stateEstimate.x", "est_stateEstimate_x"
+        match = _PREFIX.fullmatch(column.strip())
+        name = None if match is None else wanted.get(_bare(match["rest"]))
+        if name is not None and name not in found and match["head"].lower() not in _NOT_MEASURED:
+            candidates.setdefault(name, []).append(column)
+    return candidates
+
+
+def _of_one_drone(columns: Iterable[str], mapping: VariableMap, path: Path, robot: str | None) -> dict[str, str]:
+    """Logged name to column, of the drone that was asked for where there are several."""
+    candidates = _candidates(columns, mapping)
+    heads = {c: _PREFIX.fullmatch(c.strip()) for same in candidates.values() for c in same}
+    drones = {m["head"] for same in candidates.values() if len(same) > 1 for c in same if (m := heads[c])}
+    if robot is not None:
+        mine = {n: [c for c in same if heads[c] and heads[c]["head"] == robot] for n, same in candidates.items()}
+        if not any(mine.values()):
+            there = f"those of {', '.join(sorted(drones))}" if drones else "of one drone only"
+            raise CfbError(f"{path}: has no columns of {robot}; they are {there}.")
+        return {name: same[0] for name, same in mine.items() if same}
+    if drones:
+        raise CfbError(
+            f"{path}: holds the flights of several drones ({', '.join(sorted(drones))}); say whose with --robot "
+            f"{min(drones)}."
+        )
+    return {name: same[0] for name, same in candidates.items()}
 
 
 def _bare(name: str) -> str:
@@ -157,7 +197,7 @@ def _long_form(columns: Iterable[str]) -> tuple[str, str] | None:
     return None if None in found or len(by_name) > 5 else tuple(found)
 
 
-def _of_long_form(table, name_column, value_column, path, mapping, time_unit, notes) -> list[Stream]:
+def _of_long_form(table, name_column, value_column, path, mapping, time_unit, robot, notes) -> list[Stream]:
     clock = clock_of([c for c in table if c not in (name_column, value_column)])
     if clock is None:
         raise CfbError(f"{path}: there is no time column; name it timestamp (ms) or t (s).")
@@ -166,7 +206,7 @@ def _of_long_form(table, name_column, value_column, path, mapping, time_unit, no
     if not isinstance(names, Text):
         raise CfbError(f"{path}: column {name_column} holds numbers instead of names of variables.")
     labels = np.array(names.cells, dtype=object)
-    wanted = _variables(dict.fromkeys(labels), mapping)
+    wanted = _of_one_drone(dict.fromkeys(labels), mapping, path, robot)
     time, unit = _seconds(table[clock.column], clock, time_unit, path, notes)
     values, streams, groups = table[value_column], [], {}
     for variable, label in wanted.items():
@@ -195,7 +235,7 @@ def _seconds(
 
 
 def _guessed_unit(ticks: np.ndarray, clock: Clock) -> str:
-    if _bare(clock.column) == "timestamp":
+    if _bare(clock.column) in ("timestamp", "timetick"):
         return "ms"
     steps = np.diff(np.unique(ticks))
     step = float(np.median(steps)) if len(steps) else 1.0

@@ -18,14 +18,14 @@ from cfb_mjx.logs.flown import flown_part, without_spans
 from cfb_mjx.logs.gate import Verdict
 from cfb_mjx.logs.proposal import UnknownNames, propose
 from cfb_mjx.logs.validation import examine
-from cfb_mjx.logs.variables import MissingNames, load_mapping
+from cfb_mjx.logs.variables import MissingNames, load_mapping, mapping_of
 
 FORMATS = ("mcap", "tabular", "idsia", "usd_card", "crazyswarm", "radio_csv", "ulog")
 _OPTIONS = {
     "idsia": ("motor_shift",),
     "usd_card": ("mapping",),
     "crazyswarm": ("mapping", "topics_yaml", "robot"),
-    "radio_csv": ("mapping", "time_unit"),
+    "radio_csv": ("mapping", "time_unit", "robot"),
     "ulog": ("mapping",),
 }
 _FLAGS = {
@@ -57,8 +57,9 @@ def read_log(
         fix: changes of convention to make, in this order, as a refusal names them: ``velocity-frame=body``
             (`cfb_mjx.logs.fixes`). Nothing of the kind is done unasked.
         **options: ``motor_shift`` for ``idsia`` (`cfb_mjx.logs.read_idsia`); ``mapping`` for ``usd_card``,
-            ``crazyswarm``, ``radio_csv`` and ``ulog``; ``topics_yaml`` and ``robot`` for ``crazyswarm``
-            (`cfb_mjx.logs.read_crazyswarm`); ``time_unit`` for ``radio_csv`` (`cfb_mjx.logs.read_radio_csv`). An
+            ``crazyswarm``, ``radio_csv`` and ``ulog``; ``topics_yaml`` for ``crazyswarm``
+            (`cfb_mjx.logs.read_crazyswarm`); ``time_unit`` for ``radio_csv`` (`cfb_mjx.logs.read_radio_csv`); ``robot``
+            for both. An
             option that is None counts as not given.
 
     Raises:
@@ -174,7 +175,7 @@ def _table(path: Path) -> tabular.Table:
     return arrays.read_arrays(path) if arrays.recognises(path, head) else tabular.read_table(path)
 
 
-_OWN_LAYOUT = 13  # of its columns that make a table one of the tabular layout
+_OWN_LAYOUT = 17  # of its columns that make a table one of the tabular layout
 _MCAP_MAGIC = b"\x89MCAP"
 
 
@@ -204,6 +205,8 @@ def _detect(paths: list[Path], options: dict[str, Any], tables: dict[Path, tabul
     table = tables[path]
     if idsia.recognises(table):
         return "idsia"
+    if "mapping" not in options and (known := mapping_of(table)) is not None:
+        options["mapping"] = known
     if "mapping" in options or radio_csv.recognises(table, load_mapping()):
         return "radio_csv"
     return "tabular"

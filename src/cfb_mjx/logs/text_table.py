@@ -32,6 +32,7 @@ _DELIMITERS = (",", ";", "\t", "|")
 _LOOKED_AT = 50  # lines that decide on the delimiter
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
+_VARIABLE = re.compile(r"[A-Za-z]\w*[./]\w+")
 _INDEX = re.compile(r"(Unnamed: ?0|index)?", re.IGNORECASE)
 
 
@@ -60,6 +61,10 @@ def read_text_table(path: Path, data: bytes, notes: list[str], warnings: list[st
     if delimiter is None:
         lines, delimiter = [" ".join(line.split()) for line in lines], " "
     header = _cells(lines[0], delimiter)
+    if _is_long_row(header):
+        notes.append("the table has no header; its columns were read as time, name and value.")
+        header = ["timestamp", "name", "value"]
+        lines.insert(0, delimiter.join(header))
     if len(header) > 1 and all(_is_number(cell) for cell in header):
         raise CfbError(
             f"{path}: the first line holds numbers, so the table has no header; write the columns' names in its "
@@ -154,6 +159,13 @@ def _cells(line: str, delimiter: str) -> list[str]:
 def _headerless(line: str) -> bool:
     cells = re.split(r"[,;\t| ]+", line.strip())
     return all(_is_number(cell) for cell in cells)
+
+
+def _is_long_row(cells: list[str]) -> bool:
+    """Time, name of a variable, value: one line of a table of one value per line, not of a header."""
+    return (
+        len(cells) == 3 and _is_number(cells[0]) and _is_number(cells[2]) and _VARIABLE.fullmatch(cells[1]) is not None
+    )
 
 
 def _is_number(cell: str) -> bool:

@@ -15,6 +15,7 @@ _NORM_TOLERANCE = 0.05
 _COMMAND_TOLERANCE = 1e-3
 # No Crazyflie rotor turns faster than about 2900 rad/s; twice that can only be another unit or a bad packet.
 _ROTOR_SPEED_LIMIT = 6000.0
+_BEHIND = 20  # rows that follow a step back before the time is where it was: more are no rows out of order
 _FASTEST = 1.5e-4  # s between rows: no sensor of a Crazyflie is read more than 4000 times a second
 # No flight of a Crazyflie has more: an arena of 10 km, twice the range of gyro and accelerometer.
 _LIMITS = {"position": 1e4, "velocity": 60.0, "body_rate": 70.0, "specific_force": 320.0}
@@ -98,6 +99,15 @@ def _time(log: FlightLog, fail) -> None:
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 1
         kind = "repeats the time of" if steps[row - 1] == 0 else "is earlier than"
+        back = np.flatnonzero(steps < 0)
+        behind = int((log.time < np.maximum.accumulate(log.time)).sum())
+        if len(back) and behind > _BEHIND * len(back):
+            # Sorted by time two recordings would be shuffled into each other.
+            ends = f"from {log.time[back[0]]:.6g} to {log.time[back[0] + 1]:.6g} s in row {back[0] + 1}"
+            fail(
+                f"t goes back {ends} (counted from 0; {len(back)} times in all), so the file holds several recordings "
+                "or its clock overflowed; split it there and import the parts one by one"
+            )
         fail(f"{_at(log, row)} {kind} the row before it; sort the rows by t and drop duplicates")
     median = float(np.median(steps))
     if median >= 0.5:

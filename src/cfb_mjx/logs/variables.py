@@ -20,6 +20,7 @@ from cfb_mjx.logs.flight_log import OPTIONAL, REQUIRED
 
 FORMAT = "cfb_mjx.variables/1"
 DEFAULT = "crazyflie"
+_DATA_SETS = ("nanobench",)
 _RPM = 2.0 * math.pi / 60.0
 # Factors to SI. g: the firmware scales its accelerometer so that rest reads 1, so 1 g is the model's gravity.
 UNITS: dict[str, dict[str, float]] = {
@@ -92,6 +93,8 @@ class VariableMap:
     choices: dict[str, tuple[Choice, ...]]
     firmware: dict[str, Any]
     observation_delay: float | None
+    recognised_by: tuple[str, ...] = ()
+    """Columns that tell a table of this kind; none for mappings that a user names."""
 
     def choose(self, available: Collection[str], path: Path) -> dict[str, Choice]:
         """The first choice of each field whose variables are all available; optional fields may be absent.
@@ -140,7 +143,7 @@ def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
     """
     path = shipped("configs", "logs", f"{DEFAULT}.yaml") if source is None else Path(source)
     document = load_yaml(path)
-    _only(document, {"format", "name", "fields", "firmware", "observation_delay"}, path, "the file")
+    _only(document, {"format", "name", "fields", "firmware", "observation_delay", "recognised_by"}, path, "the file")
     if document.get("format") != FORMAT:
         raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
     fields = document.get("fields")
@@ -159,12 +162,25 @@ def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
     delay = document.get("observation_delay")
     if delay is not None and not (_is_number(delay) and 0.0 <= delay < 1.0):
         raise CfbError(f"{path}: 'observation_delay' must be in seconds, from 0 to 1, or null; found {told(delay)}.")
+    marks = document.get("recognised_by", [])
+    if not isinstance(marks, list) or not all(isinstance(m, str) for m in marks):
+        raise CfbError(f"{path}: 'recognised_by' must be a list of columns; found {told(marks)}.")
     return VariableMap(
         name=str(document.get("name", path.stem)),
         choices=choices,
         firmware={k: firmware.get(k) for k in _FIRMWARE_KEYS},
         observation_delay=None if delay is None else float(delay),
+        recognised_by=tuple(marks),
     )
+
+
+def mapping_of(columns: Collection[str]) -> VariableMap | None:
+    """The shipped mapping of the data set that a table's columns tell; None for others."""
+    for name in _DATA_SETS:
+        mapping = load_mapping(shipped("configs", "logs", f"{name}.yaml"))
+        if set(mapping.recognised_by) <= set(columns):
+            return mapping
+    return None
 
 
 def _choice(field: str, raw: dict, path: Path) -> Choice:

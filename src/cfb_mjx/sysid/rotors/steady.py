@@ -27,7 +27,8 @@ class SteadyFit:
     Attributes:
         gain: rad/s of a command of one, at 3.7 V where the voltage was measured. ``gain_std``: its deviation.
         offset: rad/s, of the line at no command. ``offset_std``: its deviation.
-        per_volt: rad/s of a command of one and V; None where the voltage was not measured or did not change.
+        per_volt: rad/s of a command of one and V; None where the voltage was not measured, did not change or
+            explains nothing.
         spread: rad/s, of the points about the line. ``spread_without_voltage``: about a line in the command alone.
         outliers: share of points more than five spreads off, left out.
         points: number of points.
@@ -65,10 +66,11 @@ def fit_steady(tables: list[SteadyPoints]) -> SteadyFit:
     known = all(t.battery_voltage is not None for t in tables)
     voltage = np.concatenate([t.battery_voltage for t in tables]) if known else None
     plain = _line(u, omega, u)
-    if voltage is None or np.std(voltage) < _VARIES:
+    scaled = None if voltage is None or np.std(voltage) < _VARIES else _line(u * voltage, omega, u)
+    if scaled is None or scaled[2] > plain[2]:  # a controller that keeps the speed does not follow the voltage
         (offset, slope), std, spread, outliers = plain
         return SteadyFit(slope, std[1], offset, std[0], None, spread, spread, outliers, len(u))
-    (offset, slope), std, spread, outliers = _line(u * voltage, omega, u)
+    (offset, slope), std, spread, outliers = scaled
     return SteadyFit(
         slope * NOMINAL_VOLTAGE,
         std[1] * NOMINAL_VOLTAGE,
