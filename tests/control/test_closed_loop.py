@@ -103,6 +103,14 @@ def test_many_are_each_as_written_out(layout, way):
     assert np.std(flown[1]) > 0.01
 
 
+@pytest.mark.parametrize("count", [1, 4, 8])
+def test_a_wide_network_flies_few(count):
+    """jaxlib 0.12 cannot compile some sums over eight columns and fewer."""
+    pilot, states = NeuralController.random(jax.random.key(7), LAYOUTS[-1], (64, 64)), starts(count)
+    flown = quick(jax.vmap(lambda state: rollout_closed_loop(MODEL, pilot, state, 2)[:2]))(states)
+    equal(flown, quick(jax.vmap(lambda state: written_out(MODEL, pilot, state, 2)))(states))
+
+
 def drawn(count, model=MODEL):
     keys, ranges = jax.random.split(jax.random.key(5), count), load_randomisation()
     return jax.vmap(

@@ -47,11 +47,18 @@ class Network(eqx.Module):
         return layer(*last, x)
 
 
+_SUMS_FAIL = jax.__version_info__ >= (0, 11)
+"""Of jaxlib 0.12 such a sum over no more than `_FEW` columns does not compile ("Fusion kind not implemented on CPU")."""
+_FEW = 8
+
+
 class WrittenOut(Network):
     """The same with its products written as sums: for within one compiled function, where XLA has no matrix library."""
 
     def columns(self, x: Float[Array, "inputs drones"]) -> Float[Array, "outputs drones"]:
         def layer(weight, bias, x):
+            if _SUMS_FAIL and x.shape[1] <= _FEW:
+                return weight.T @ x + bias[:, None]
             return jnp.sum(weight[:, :, None] * x[:, None, :], axis=0) + bias[:, None]
 
         return self._through(layer, x)
