@@ -22,7 +22,9 @@ from cfb_mjx.errors import CfbError
 def import_log(
     sources: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")] = (),
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="PATH")] = None,
-    format: Literal["auto", "tabular", "idsia", "mcap", "usd_card", "crazyswarm", "radio_csv", "ulog"] = "auto",
+    format: Literal[
+        "auto", "tabular", "idsia", "mcap", "usd_card", "crazyswarm", "radio_csv", "ulog", "foxglove"
+    ] = "auto",
     motor_shift: float | None = None,
     mapping: File = None,
     topics_yaml: File = None,

@@ -24,15 +24,15 @@ _STEMS: tuple[tuple[str, str], ...] = (
     ("velocity", r"(lin(ear)?)?vel(ocity)?|v|dot|speed"),
     ("quaternion", r"q(uat(ernion)?)?|orientation|rot(ation)?|att(itude)?|poseorientation"),
     ("position", r"|p(os(ition)?)?|translation|loc(ation)?|poseposition"),
-    ("command", r"u|m(otor)?s?|pwm|cmds?|commands?|duty|throttle|action|motorpwm|motorcmd|thrustpwm|mpwm"),
-    ("rotor_speed", r"r|rpms?|rotor(speed|vel(ocity)?)?s?|motor(rpm|speed)s?|omegam|erpm|mrpm"),
+    ("command", r"u|m(otor)?s?m?|pwmm?|cmds?m?|commands?m?|duty|throttle|action|motorpwm|motorcmd|thrustpwm|mpwm"),
+    ("rotor_speed", r"r|rpms?m?|rotor(speed|vel(ocity)?)?s?|motor(rpm|speed)s?|omegam|erpm|mrpm"),
 )
 _ANGLES = re.compile(r"(.*?)(roll|pitch|yaw|phi|theta|psi)", re.IGNORECASE)
 _THRUST = frozenset(["n", "mn", "g", "gf", "kgf"])
 _RATES = re.compile(r"(roll|pitch|yaw)(rate|dot|speed|vel)|(?:body)?rate(roll|pitch|yaw)", re.IGNORECASE)
 _BATTERY = re.compile(r"(pm)?v?bat(tery)?(_?(voltage|v|mv))?|voltage|vbat.*", re.IGNORECASE)
 _GROUPS = re.compile(
-    r"^(state_?estimate|state|pose|odom(etry)?|imu|sensors?|drone|cf\d*|data|log)[._/ ]+(?=.)", re.IGNORECASE
+    r"^((state_?estimate|state|pose|odom(etry)?|imu|twist|sensors?|drone|cf\d*|data|log)[._/ ]+)+(?=.)", re.IGNORECASE
 )
 
 

@@ -167,6 +167,19 @@ def _candidates(columns: Iterable[str], mapping: VariableMap) -> dict[str, list[
     return candidates
 
 
+def logged_names(names: Iterable[str], mapping: VariableMap) -> dict[str, str]:
+    """Name to the logged variable it ends in: ``cf1.log.gyro.x`` to ``gyro.x``."""
+    wanted = {_bare(v): v for choices in mapping.choices.values() for c in choices for v in c.variables}
+    found = {}
+    for name in names:
+        parts = re.split(r"[._/ :]", name)
+        ends = ("".join(parts[k:]).lower() for k in range(len(parts) - 1))
+        told = next((wanted[end] for end in ends if end in wanted), None)
+        if told is not None:
+            found[name] = told
+    return found
+
+
 def _of_one_drone(columns: Iterable[str], mapping: VariableMap, path: Path, robot: str | None) -> dict[str, str]:
     """Logged name to column, of the drone that was asked for where there are several."""
     candidates = _candidates(columns, mapping)

@@ -11,7 +11,19 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
-from cfb_mjx.logs import arrays, containers, crazyswarm, idsia, mcap_reader, radio_csv, ros_bag, tabular, ulog, usd_card
+from cfb_mjx.logs import (
+    arrays,
+    containers,
+    crazyswarm,
+    foxglove,
+    idsia,
+    mcap_reader,
+    radio_csv,
+    ros_bag,
+    tabular,
+    ulog,
+    usd_card,
+)
 from cfb_mjx.logs.fixes import Fix, fix_of
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.flown import flown_part, without_spans
@@ -20,13 +32,14 @@ from cfb_mjx.logs.proposal import UnknownNames, propose
 from cfb_mjx.logs.validation import examine
 from cfb_mjx.logs.variables import MissingNames, load_mapping, mapping_of
 
-FORMATS = ("mcap", "tabular", "idsia", "usd_card", "crazyswarm", "radio_csv", "ulog")
+FORMATS = ("mcap", "tabular", "idsia", "usd_card", "crazyswarm", "radio_csv", "ulog", "foxglove")
 _OPTIONS = {
     "idsia": ("motor_shift",),
     "usd_card": ("mapping",),
     "crazyswarm": ("mapping", "topics_yaml", "robot"),
     "radio_csv": ("mapping", "time_unit", "robot"),
     "ulog": ("mapping",),
+    "foxglove": ("mapping",),
 }
 _FLAGS = {
     name: "--" + name.replace("_", "-") for name in ("motor_shift", "mapping", "topics_yaml", "robot", "time_unit")
@@ -50,14 +63,14 @@ def read_log(
         format: one of `FORMATS`; None detects it from the file's content. ``mcap`` is this library's own, ``tabular``
             and ``idsia`` are parquet or csv, ``usd_card`` is the Crazyflie's micro SD card binary, ``crazyswarm`` a
             ROS bag (MCAP, sqlite3 or ROS 1), ``radio_csv`` a table with firmware variable names as headers, ``ulog`` a
-            log of PX4. Arrays by name (.npz, .mat) are tables.
+            log of PX4, ``foxglove`` an MCAP of JSON or protobuf messages. Arrays by name (.npz, .mat) are tables.
         keep_ground: leave in what is not flight: standing, take-off, landing, being carried. This library's own files
             are never cut.
         cut: stretches to leave out, in s of the log's own time: ``12.5:15``, ``:3`` (all up to 3 s), ``40:``.
         fix: changes of convention to make, in this order, as a refusal names them: ``velocity-frame=body``
             (`cfb_mjx.logs.fixes`). Nothing of the kind is done unasked.
         **options: ``motor_shift`` for ``idsia`` (`cfb_mjx.logs.read_idsia`); ``mapping`` for ``usd_card``,
-            ``crazyswarm``, ``radio_csv`` and ``ulog``; ``topics_yaml`` for ``crazyswarm``
+            ``crazyswarm``, ``radio_csv``, ``ulog`` and ``foxglove``; ``topics_yaml`` for ``crazyswarm``
             (`cfb_mjx.logs.read_crazyswarm`); ``time_unit`` for ``radio_csv`` (`cfb_mjx.logs.read_radio_csv`); ``robot``
             for both. An
             option that is None counts as not given.
@@ -133,6 +146,8 @@ def _read(paths: list[Path], format: str, options: dict[str, Any], tables: dict[
         return usd_card.read_usd_card(path, **options)
     if format == "ulog":
         return ulog.read_ulog(path, **options)
+    if format == "foxglove":
+        return foxglove.read_foxglove(path, **options)
     if format == "crazyswarm":
         return crazyswarm.read_crazyswarm(path, **options)
     found = [tables.get(p) or _table(p) for p in paths]
@@ -194,7 +209,9 @@ def _detect(paths: list[Path], options: dict[str, Any], tables: dict[Path, tabul
     if head.startswith(usd_card.MAGIC):
         return "usd_card"
     if head.startswith(_MCAP_MAGIC):
-        return "crazyswarm" if ros_bag.recognises(path) else "mcap"
+        if ros_bag.recognises(path):
+            return "crazyswarm"
+        return "foxglove" if foxglove.recognises(path) else "mcap"
     by_name = arrays.recognises(path, head)
     if not by_name and (foreign := containers.name_of(path, head)) is not None:
         raise CfbError(f"{path}: this is {foreign[0]}, which this library does not read; {foreign[1]}.")

@@ -1,0 +1,222 @@
+"""Reader of MCAP files whose messages are JSON or protobuf, as Foxglove's tools and people's own recorders write them.
+
+Numbers of all messages are taken by name: ``/cf1/imu`` with ``{"angular_velocity": {"x": ..}}`` holds
+``cf1.imu.angular_velocity.x``. Poses, transforms, velocities and IMU readings in the usual fields are known by them,
+firmware variables by their names wherever these stand; for names of one's own a mapping is proposed, as for tables.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import read_bytes
+from cfb_mjx.logs import mcap_schema
+from cfb_mjx.logs.assembly import Import, assemble
+from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.proposal import UnknownNames, propose
+from cfb_mjx.logs.radio_csv import logged_names
+from cfb_mjx.logs.streams import Stream, ordered
+from cfb_mjx.logs.tabular import Table
+from cfb_mjx.logs.variables import MissingNames, VariableMap, load_mapping
+
+_MAGIC = b"\x89MCAP0\r\n"
+_STAMP = re.compile(r"(?:.*\.)?(?:timestamp|stamp|time)\.(?P<part>n(?:ano)?(?:sec|s)\w*|sec\w*|secs)")
+# Where fields of common messages end, and what they are called in `configs/logs/crazyflie.yaml`.
+_KNOWN = (
+    (re.compile(r"(?:.*\.)?(?:position|translation)\.([xyz])"), "pose.{}"),
+    (re.compile(r"(?:.*\.)?(?:orientation|rotation)\.([wxyz])"), "pose.q{}"),
+    (re.compile(r"(?:.*\.)?(?:linear_velocity|velocity|twist\.linear)\.([xyz])"), "twist.v{}"),
+    (re.compile(r"(?:.*\.)?(?:angular_velocity|body_rate)\.([xyz])"), "imu.w{}"),
+    (re.compile(r"(?:.*\.)?(?:linear_acceleration|specific_force)\.([xyz])"), "imu.a{}"),
+)
+_LONGEST = 64  # numbers of one array: longer ones are images and point clouds
+_OVERTAKING = 0.1  # s by which messages may overtake each other on their way into the file
+
+
+def recognises(path: str | os.PathLike) -> bool:
+    """Whether an MCAP holds JSON or protobuf messages of others; this library's own files are none."""
+    data = read_bytes(path)
+    known = data[-(1 << 16) :] if data.endswith(_MAGIC) else data[: 1 << 16]
+    return b"cfb_mjx." not in known and (b"json" in known or b"protobuf" in known)
+
+
+def read_foxglove(path: str | os.PathLike, mapping: str | os.PathLike | VariableMap | None = None) -> FlightLog:
+    """Read a flight from JSON or protobuf messages. `read_log` also validates the content.
+
+    Messages of one topic with the same fields form a stream; streams are merged onto the rows of the gyro. A message's
+    time is that of its own ``timestamp`` or ``header.stamp``, else that of its recording.
+
+    Args:
+        path: the MCAP file.
+        mapping: which number is which column; a mapping file, or None for ``configs/logs/crazyflie.yaml``.
+
+    Raises:
+        UnknownNames: names of its own, for which a mapping can be proposed.
+        CfbError: damaged file, messages that do not fit their description, several topics with a pose, time that goes
+            back, required signals that were not recorded.
+    """
+    path = Path(path)
+    asked = mapping
+    mapping = mapping if isinstance(mapping, VariableMap) else load_mapping(mapping)
+    notes: list[str] = []
+    warnings: list[str] = []
+    streams = [ordered(s, path, notes, _OVERTAKING) for s in _streams(path, notes, warnings)]
+    streams = _with_known_names(streams, mapping, path, guess=asked is None)
+    try:
+        return assemble(Import("foxglove", streams, None, notes, warnings), mapping, path)
+    except MissingNames as error:
+        table = _table(streams)
+        proposal = propose(table) if asked is None and table else None
+        if proposal is None:
+            raise
+        raise UnknownNames(
+            f"{path}: its messages have names of their own, which look like {', '.join(proposal.fields)}; cfb import "
+            "writes a mapping to check, to be given with --mapping FILE.",
+            proposal.text,
+        ) from error
+
+
+def _streams(path: Path, notes: list[str], warnings: list[str]) -> list[Stream]:
+    """One stream per topic and set of fields, in s since the first message."""
+    groups: dict[tuple[str, tuple[str, ...]], list[tuple[int, list[float]]]] = {}
+    unstamped: set[str] = set()
+    for topic, logged, numbers in _messages(path, warnings):
+        stamp = _stamp(numbers)
+        if stamp is None:
+            unstamped.add(topic)
+        values = {name: x for name, x in numbers.items() if _STAMP.fullmatch(name) is None}
+        if values:
+            group = groups.setdefault((topic, tuple(values)), [])
+            group.append((logged if stamp is None else stamp, list(values.values())))
+    if unstamped:
+        listed = ", ".join(sorted(unstamped))
+        notes.append(f"{listed}: messages without a time of their own; that of their recording was used.")
+    if not groups:
+        raise CfbError(
+            f"{path}: the MCAP file holds no JSON or protobuf messages with numbers; record the flight again."
+        )
+    origin = min(rows[0][0] for rows in groups.values())
+    streams = []
+    topics = [topic for topic, _ in groups]
+    for (topic, names), rows in groups.items():
+        prefix = topic.strip("/").replace("/", ".")
+        values = np.array([row for _, row in rows], dtype=np.float64).T
+        time = np.array([stamp - origin for stamp, _ in rows], dtype=np.int64) / 1e9
+        full = {f"{prefix}.{name}".strip("."): v for name, v in zip(names, values, strict=True)}
+        streams.append(Stream(f"{topic} ({names[0]})" if topics.count(topic) > 1 else topic, time, full))
+    return streams
+
+
+def _messages(path: Path, warnings: list[str]) -> Iterable[tuple[str, int, dict[str, float]]]:
+    """Topic, time of recording (ns) and numbers by name of every message that has any."""
+    from mcap.records import Channel, Message, Schema
+    from mcap.stream_reader import StreamReader
+
+    data = read_bytes(path)
+    mcap_schema.refuse_bombs(data, path)
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    decoders: dict[int, Callable[[bytes], Any] | None] = {}
+    read = 0
+    try:
+        for item in StreamReader(io.BytesIO(data), validate_crcs=True, record_size_limit=len(data)).records:
+            if isinstance(item, Schema):
+                schemas[item.id] = item
+            elif isinstance(item, Channel):
+                channels[item.id] = item
+                decoders[item.id] = _decoder(item, schemas.get(item.schema_id))
+            elif isinstance(item, Message) and (decode := decoders[item.channel_id]) is not None:
+                numbers: dict[str, float] = {}
+                _collect(decode(item.data), "", numbers)
+                read += 1
+                yield channels[item.channel_id].topic, item.log_time, numbers
+    except Exception as error:  # the MCAP library and decoders let errors of every kind of damaged bytes through
+        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
+        kind = "cut short" if not data.endswith(_MAGIC) else "damaged"
+        if not read:
+            raise CfbError(f"{path}: the MCAP file is {kind} ({reason}); copy or record it again.") from None
+        warnings.append(f"the MCAP file is {kind} ({reason}); what follows in it was left out.")
+
+
+def _decoder(channel: Any, schema: Any) -> Callable[[bytes], Any] | None:
+    if channel.message_encoding == "json":
+        return json.loads
+    if channel.message_encoding == "protobuf" and schema is not None:
+        return mcap_schema.message_class(schema.name, schema.data).FromString
+    return None
+
+
+def _collect(value: Any, name: str, out: dict[str, float]) -> None:
+    """Numbers of a message by the names of the fields that lead to them."""
+    if isinstance(value, bool | int | float):
+        out[name] = float(value)
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            _collect(inner, f"{name}.{key}" if name else str(key), out)
+    elif isinstance(value, list | tuple):
+        for index, inner in enumerate(value if len(value) <= _LONGEST else ()):
+            _collect(inner, f"{name}.{index}", out)
+    elif hasattr(value, "DESCRIPTOR"):
+        for field in value.DESCRIPTOR.fields:
+            inner = getattr(value, field.name)
+            repeated = hasattr(inner, "__len__") and not isinstance(inner, str | bytes)
+            _collect(list(inner) if repeated else inner, f"{name}.{field.name}" if name else field.name, out)
+
+
+def _stamp(numbers: dict[str, float]) -> int | None:
+    """The message's own time, ns."""
+    parts: dict[str, int] = {}
+    for name, value in numbers.items():
+        match = _STAMP.fullmatch(name)
+        if match is not None:
+            parts.setdefault("nanos" if match["part"].startswith("n") else "seconds", int(value))
+    if not parts.get("seconds"):
+        return None
+    return parts["seconds"] * 1_000_000_000 + parts.get("nanos", 0)
+
+
+def _with_known_names(streams: list[Stream], mapping: VariableMap, path: Path, guess: bool) -> list[Stream]:
+    """Streams whose numbers have the mapping's names besides their own, where their fields or their names tell them.
+
+    Raises:
+        CfbError: two topics hold the same, and ``guess`` says that no mapping of the user's decides.
+    """
+    out: list[Stream] = []
+    homes: dict[str, str] = {}
+    for stream in streams:
+        firmware = logged_names(stream.values, mapping)
+        known: dict[str, list[str]] = {}
+        for name in stream.values:
+            told = next((word.format(m[1]) for p, word in _KNOWN if (m := p.fullmatch(name))), None)
+            if (told := firmware.get(name, told)) is not None:
+                known.setdefault(told, []).append(name)
+        # Two of the same in one message are a pose and its set-point.
+        clear = {told: names[0] for told, names in known.items() if len(names) == 1}
+        for told, name in clear.items():
+            if homes.setdefault(told, stream.name) != stream.name and guess:
+                raise CfbError(
+                    f"{path}: {homes[told]} and {stream.name} both hold {told}; say which is the drone's with "
+                    f"--mapping FILE, where {name} is the name of the latter."
+                )
+        values = stream.values | {told: stream.values[name] for told, name in clear.items()}
+        out.append(Stream(stream.name, stream.time, values))
+    return out
+
+
+def _table(streams: list[Stream]) -> Table:
+    """All numbers on the rows of the longest stream, each held: what names are told from."""
+    longest = max(streams, key=lambda s: len(s.time))
+    table = Table({"t": longest.time})
+    for stream in streams:
+        row = np.clip(np.searchsorted(stream.time, longest.time, side="right") - 1, 0, len(stream.time) - 1)
+        table |= {name: values[row] for name, values in stream.values.items()}
+    return table
