@@ -31,7 +31,7 @@ from cfb_mjx.errors import CfbError  # noqa: E402
 from cfb_mjx.logs import read_log, write_mcap, write_tabular  # noqa: E402
 from cfb_mjx.logs.flight_log import OPTIONAL, REQUIRED  # noqa: E402
 
-CHECKED = ("micro SD card", "MCAP bag", "own MCAP", "own parquet", "npz")
+CHECKED = ("micro SD card", "MCAP bag", "MCAP of JSON", "own MCAP", "own parquet", "npz")
 """Formats with a checksum over every value."""
 SLOW, LARGE = 20.0, 1 << 30
 
@@ -69,6 +69,7 @@ def samples(folder: Path) -> dict[str, list[tuple[Path, dict]]]:
     foreign_logs.write_ros1(folder / "flight.bag", messages)
     foreign_logs.write_radio_csv(folder / "dense.csv", flight, [state + imu + motors])
     foreign_logs.write_radio_csv(folder / "sparse.csv", flight, [state, imu, motors], every=[2, 1, 1])
+    foreign_logs.write_channels(folder / "json.mcap", foreign_logs.json_channels(flight))
     write_mcap(flight, folder / "ours.mcap")
     for name in ("ours.parquet", "ours.csv"):
         write_tabular(flight, folder / name)
@@ -80,6 +81,7 @@ def samples(folder: Path) -> dict[str, list[tuple[Path, dict]]]:
     return {
         "micro SD card": [(folder / name, {}) for name in files if name.endswith("usd")],
         "MCAP bag": [(folder / "bag.mcap", {"topics_yaml": topics})],
+        "MCAP of JSON": [(folder / "json.mcap", {})],
         "own MCAP": [(folder / "ours.mcap", {})],
         "own parquet": [(folder / "ours.parquet", {})],
         "npz": [(folder / "flight.npz", {})],

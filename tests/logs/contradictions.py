@@ -19,8 +19,7 @@ class Contradiction:
         change: what is done to a good log.
         advice: fragments of which one must be in the message: the right remedy.
         moves: relations of the good log (name, axis) of which one must move, for the fault to show; ``motors`` where
-            the
-            motors must tell.
+            the motors must tell.
         differs: field that must become another one; empty where that is certain.
     """
 
@@ -49,6 +48,10 @@ def without_gravity(log):
 
 def in_world(log):
     return log.replace(specific_force=rotation.to_world(rotation.tidy(log.quaternion), log.specific_force))
+
+
+def rate_in_world(log):
+    return log.replace(body_rate=rotation.to_world(rotation.tidy(log.quaternion), log.body_rate))
 
 
 def all_ned(log):
@@ -161,6 +164,7 @@ CONTRADICTIONS: dict[str, Contradiction] = {
     ),
     "gravity subtracted": Contradiction(without_gravity, ("accelerometer-gravity=subtracted",)),
     "accelerometer in world axes": Contradiction(in_world, ("accelerometer-frame=world",), SHOVED),
+    "gyro in world axes": Contradiction(rate_in_world, ("gyro-frame=world",), TURNING, "body_rate"),
     "all with z down": Contradiction(all_ned, ("frame=ned",)),
     "position left-handed": Contradiction(
         axes("position", signs=(-1, 1, 1)), ("position-axes=-x,y,z",), (("displacement", X),)

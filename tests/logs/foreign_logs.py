@@ -1,6 +1,7 @@
 """Writers of other people's log formats, sharing nothing with the readers: from a `FlightLog` to firmware variables."""
 
 import csv
+import json
 import struct
 import zlib
 from types import SimpleNamespace
@@ -353,3 +354,73 @@ def ulog(log, topics=tuple(ULOG_TOPICS)):
             numbers = values[name][row].astype("<f4").tobytes()
             data += _ulog_message("D", struct.pack("<HQ", i, round(1e6 * (5 + time))) + numbers)
     return data
+
+
+START = 1_772_419_726_250_000_000  # ns: when messages of JSON and protobuf begin
+
+
+def xyz(v):
+    return dict(zip("xyz", map(float, v), strict=True))
+
+
+def wxyz(q):
+    return dict(zip("wxyz", map(float, q), strict=True))
+
+
+def stamp(t, names=("sec", "nsec")):
+    now = START + round(t * 1e9)
+    return dict(zip(names, divmod(now, 1_000_000_000), strict=True))
+
+
+def write_channels(path, channels, late=0.0):
+    """``channels``: topic to (schema name, encoding, description, payloads by time)."""
+    from mcap.writer import Writer
+
+    with open(path, "wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="a lab's recorder")
+        for topic, (name, encoding, described, payloads) in channels.items():
+            kind = "jsonschema" if encoding == "json" else "protobuf"
+            schema = writer.register_schema(name=name, encoding=kind, data=described)
+            channel = writer.register_channel(topic=topic, message_encoding=encoding, schema_id=schema)
+            for t, data in payloads:
+                writer.add_message(channel, log_time=START + round((t + late) * 1e9), data=data, publish_time=0)
+        writer.finish()
+
+
+def as_json(log, make):
+    return [(t, json.dumps(make(row, t)).encode()) for row, t in enumerate(log.time)]
+
+
+def json_channels(log, transform=False, motors="motor"):
+    """A flight in JSON messages of common schemas: a pose or a transform, IMU readings, a velocity, named motors."""
+
+    def pose(row, t):
+        return {
+            "timestamp": stamp(t),
+            "frame_id": "world",
+            "pose": {"position": xyz(log.position[row]), "orientation": wxyz(log.quaternion[row])},
+        }
+
+    def placed(row, t):
+        inner = {"translation": xyz(log.position[row]), "rotation": wxyz(log.quaternion[row])}
+        return {"timestamp": stamp(t), "parent_frame_id": "world", "child_frame_id": "cf", "transform": inner}
+
+    def imu(row, t):
+        return {
+            "header": {"stamp": stamp(t, ("sec", "nanosec")), "frame_id": "cf"},
+            "angular_velocity": xyz(log.body_rate[row]),
+            "linear_acceleration": xyz(log.specific_force[row]),
+        }
+
+    named = lambda row, t: {  # noqa: E731
+        "timestamp": stamp(t), motors: {f"m{i}": float(round(65535 * u)) for i, u in enumerate(log.command[row], 1)}
+    }  # fmt: skip
+    velocity = lambda row, t: {"timestamp": stamp(t), "velocity": xyz(log.velocity[row])}  # noqa: E731
+    place = ("FrameTransform", placed) if transform else ("foxglove.PoseInFrame", pose)
+    return {
+        "/tf" if transform else "/cf1/pose": (place[0], "json", b"{}", as_json(log, place[1])),
+        "/cf1/imu": ("Imu", "json", b"{}", as_json(log, imu)),
+        "/cf1/velocity": ("Twist", "json", b"{}", as_json(log, velocity)),
+        "/cf1/log": ("Log", "json", b"{}", as_json(log, named)),
+    }

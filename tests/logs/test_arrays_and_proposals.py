@@ -9,7 +9,7 @@ import scipy.io
 from synthetic_logs import make_flight
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs import read_log
+from cfb_mjx.logs import read_log, rotation
 from cfb_mjx.logs.proposal import UnknownNames, propose
 from cfb_mjx.logs.variables import load_mapping
 
@@ -132,6 +132,44 @@ def test_a_quaternion_with_its_scalar_last(flight, tmp_path):
     log = read_log(path, mapping=mapping)
     assert np.abs(log.quaternion - flight.quaternion).max() < 1e-9
     assert any("array quat was read as a quaternion x, y, z, w" in note for note in log.metadata["notes"])
+
+
+def test_arrays_of_simulators_in_worlds_and_drones(flight, tmp_path):
+    """As crazyflow keeps them: (steps, worlds, drones, k), scalar last, the rate in world axes."""
+    path = tmp_path / "flight.npz"
+
+    def saved(copies=1, **changes):
+        states = {
+            "pos": flight.position,
+            "quat": np.roll(flight.quaternion, -1, axis=1),
+            "vel": flight.velocity,
+            "ang_vel": rotation.to_world(flight.quaternion, flight.body_rate),
+            "rotor_vel": flight.rotor_speed,
+        }
+        shaped = {name: np.repeat(v[:, None, None, :], copies, axis=1) for name, v in states.items()}
+        np.savez(path, **({"time": flight.time} | shaped | changes))
+
+    saved()
+    with pytest.raises(UnknownNames) as error:
+        read_log(path)
+    mapping = tmp_path / "mine.yaml"
+    mapping.write_text(error.value.mapping)
+    with pytest.raises(CfbError, match="--fix gyro-frame=world"):
+        read_log(path, mapping=mapping)
+    log = read_log(path, mapping=mapping, fix=["gyro-frame=world"])
+    assert np.abs(log.body_rate - flight.body_rate[: len(log)]).max() < 1e-9
+    saved(copies=3)
+    with pytest.raises(CfbError, match=r"array \w+ has shape \(800, 3, [34]\), so it holds several drones"):
+        read_log(path)
+
+
+def test_arrays_without_motors_are_told_what_they_lack(flight, tmp_path):
+    path = tmp_path / "flight.npz"
+    np.savez(path, time=flight.time, pos=flight.position, quat=flight.quaternion, cmd_f=flight.time * 0)
+    with pytest.raises(
+        CfbError, match=r"has arrays time, pos\.x, .* to hold motors \(commands or rotor speeds\); record"
+    ):
+        read_log(path)
 
 
 def test_arrays_in_the_tabular_layout_need_no_mapping(flight, tmp_path):

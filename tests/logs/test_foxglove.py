@@ -1,36 +1,19 @@
 """MCAP files of others: JSON and protobuf messages, by the fields of common schemas and by names of one's own."""
 
-import json
-
 import numpy as np
 import pytest
+from foreign_logs import json_channels, stamp, write_channels, wxyz, xyz
 from google.protobuf import descriptor_pb2
-from mcap.writer import Writer
 from synthetic_logs import make_flight
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FORMATS, mcap_schema, read_log, write_mcap
 from cfb_mjx.logs.proposal import UnknownNames
 
-START = 1_772_419_726_250_000_000
-
 
 @pytest.fixture(scope="module")
 def flight():
     return make_flight(duration=4.0, rate=200.0)
-
-
-def xyz(v):
-    return dict(zip("xyz", map(float, v), strict=True))
-
-
-def wxyz(q):
-    return dict(zip("wxyz", map(float, q), strict=True))
-
-
-def stamp(t, names=("sec", "nsec")):
-    now = START + round(t * 1e9)
-    return dict(zip(names, divmod(now, 1_000_000_000), strict=True))
 
 
 def motors_class():
@@ -41,56 +24,6 @@ def motors_class():
     message.field.add(name="vbat", number=2, label=1, type=1, json_name="vbat")
     described = descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString()
     return described, mcap_schema.message_class("lab.Motors", described)
-
-
-def write(path, channels, late=0.0):
-    """``channels``: topic to (schema name, encoding, description, payloads by time)."""
-    with open(path, "wb") as file:
-        writer = Writer(file)
-        writer.start(profile="", library="a lab's recorder")
-        for topic, (name, encoding, described, payloads) in channels.items():
-            kind = "jsonschema" if encoding == "json" else "protobuf"
-            schema = writer.register_schema(name=name, encoding=kind, data=described)
-            channel = writer.register_channel(topic=topic, message_encoding=encoding, schema_id=schema)
-            for t, data in payloads:
-                writer.add_message(channel, log_time=START + round((t + late) * 1e9), data=data, publish_time=0)
-        writer.finish()
-
-
-def as_json(log, make):
-    return [(t, json.dumps(make(row, t)).encode()) for row, t in enumerate(log.time)]
-
-
-def common(log, transform=False, motors="motor"):
-    def pose(row, t):
-        return {
-            "timestamp": stamp(t),
-            "frame_id": "world",
-            "pose": {"position": xyz(log.position[row]), "orientation": wxyz(log.quaternion[row])},
-        }
-
-    def placed(row, t):
-        inner = {"translation": xyz(log.position[row]), "rotation": wxyz(log.quaternion[row])}
-        return {"timestamp": stamp(t), "parent_frame_id": "world", "child_frame_id": "cf", "transform": inner}
-
-    def imu(row, t):
-        return {
-            "header": {"stamp": stamp(t, ("sec", "nanosec")), "frame_id": "cf"},
-            "angular_velocity": xyz(log.body_rate[row]),
-            "linear_acceleration": xyz(log.specific_force[row]),
-        }
-
-    named = lambda row, t: {  # noqa: E731
-        "timestamp": stamp(t), motors: {f"m{i}": float(round(65535 * u)) for i, u in enumerate(log.command[row], 1)}
-    }  # fmt: skip
-    velocity = lambda row, t: {"timestamp": stamp(t), "velocity": xyz(log.velocity[row])}  # noqa: E731
-    place = ("FrameTransform", placed) if transform else ("foxglove.PoseInFrame", pose)
-    return {
-        "/tf" if transform else "/cf1/pose": (place[0], "json", b"{}", as_json(log, place[1])),
-        "/cf1/imu": ("Imu", "json", b"{}", as_json(log, imu)),
-        "/cf1/velocity": ("Twist", "json", b"{}", as_json(log, velocity)),
-        "/cf1/log": ("Log", "json", b"{}", as_json(log, named)),
-    }
 
 
 def same(log, flight, fields=("position", "velocity", "quaternion", "body_rate", "specific_force")):
@@ -104,7 +37,7 @@ def same(log, flight, fields=("position", "velocity", "quaternion", "body_rate",
 @pytest.mark.parametrize("transform", [False, True])
 def test_common_schemas_in_json(flight, tmp_path, transform):
     path = tmp_path / "flight.mcap"
-    write(path, common(flight, transform))
+    write_channels(path, json_channels(flight, transform))
     log = read_log(path)
     assert log.metadata["format"] == "foxglove"
     assert "foxglove" in FORMATS
@@ -122,7 +55,7 @@ def test_protobuf_with_messages_of_its_own(flight, tmp_path):
         return pose_class(timestamp=now, frame_id="world", pose=body).SerializeToString()
 
     own, motors = motors_class()
-    channels = common(flight) | {
+    channels = json_channels(flight) | {
         "/cf1/pose": (
             "foxglove.PoseInFrame",
             "protobuf",
@@ -140,7 +73,7 @@ def test_protobuf_with_messages_of_its_own(flight, tmp_path):
         ),
     }
     path = tmp_path / "flight.mcap"
-    write(path, channels)
+    write_channels(path, channels)
     with pytest.raises(UnknownNames, match=r"position, .*command") as error:
         read_log(path)
     mapping = tmp_path / "mine.yaml"
@@ -153,31 +86,31 @@ def test_protobuf_with_messages_of_its_own(flight, tmp_path):
 
 def test_late_recording_does_not_move_stamped_messages(flight, tmp_path):
     path = tmp_path / "flight.mcap"
-    write(path, common(flight), late=0.3)
+    write_channels(path, json_channels(flight), late=0.3)
     same(read_log(path), flight)
 
 
 def test_two_poses_are_not_guessed_between(flight, tmp_path):
-    channels = common(flight)
+    channels = json_channels(flight)
     channels["/target/pose"] = channels["/cf1/pose"]
     path = tmp_path / "flight.mcap"
-    write(path, channels)
+    write_channels(path, channels)
     with pytest.raises(CfbError, match=r"/cf1/pose and /target/pose both hold pose\.x; say which .* --mapping FILE"):
         read_log(path)
 
 
 def test_what_is_missing_is_named(flight, tmp_path):
-    channels = common(flight)
+    channels = json_channels(flight)
     del channels["/cf1/log"]
     path = tmp_path / "flight.mcap"
-    write(path, channels)
+    write_channels(path, channels)
     with pytest.raises(CfbError, match="no logged variables for command"):
         read_log(path)
 
 
 def test_damage_is_named_and_what_is_whole_is_kept(flight, tmp_path):
     path = tmp_path / "flight.mcap"
-    write(path, common(flight))
+    write_channels(path, json_channels(flight))
     data = path.read_bytes()
     path.write_bytes(data[:60])
     with pytest.raises(CfbError, match="MCAP"):

@@ -218,7 +218,7 @@ def test_format_can_be_named(columns, tmp_path):
     path = tmp_path / "a.parquet"
     pq.write_table(pa.table(columns), path)
     assert same_data(read_log(path, format="idsia"), read_idsia(path))
-    with pytest.raises(CfbError, match="missing columns"):
+    with pytest.raises(CfbError, match="none is known by its name to hold motors"):
         read_log(path, format="tabular")
 
 

@@ -136,7 +136,7 @@ def test_header_only(tmp_path):
 def test_something_else_entirely(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("a,b\n1,2\n")
-    with pytest.raises(CfbError, match="missing columns t, px"):
+    with pytest.raises(CfbError, match="none is known by its name to hold time, position, attitude, motors"):
         read_log(path)
 
 

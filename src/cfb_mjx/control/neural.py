@@ -48,7 +48,7 @@ class Network(eqx.Module):
 
 
 _SUMS_FAIL = jax.__version_info__ >= (0, 11)
-"""Of jaxlib 0.12 such a sum over no more than `_FEW` columns does not compile ("Fusion kind not implemented on CPU")."""
+"""On jaxlib 0.12 such a sum over at most `_FEW` columns does not compile ("Fusion kind not implemented on CPU")."""
 _FEW = 8
 
 

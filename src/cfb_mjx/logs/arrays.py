@@ -55,6 +55,11 @@ def read_arrays(path: Path) -> Table:
             "name."
         )
     rows = max(set(lengths), key=lengths.count)
+    for name, values in arrays.items():
+        if values.ndim > 2 and rows in values.shape and values.shape[-1] in (3, 4):
+            raise CfbError(
+                f"{path}: array {name} has shape {values.shape}, so it holds several drones; save the arrays of one."
+            )
     table = Table()
     for name, values in arrays.items():
         if rows not in values.shape or values.ndim > 2:

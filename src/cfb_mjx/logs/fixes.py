@@ -177,6 +177,7 @@ def command_fixes() -> list[Fix]:
 def _named() -> list[Fix]:
     found = [
         Fix("velocity-frame=body", "reading the velocity in body axes", _velocity_from_body),
+        Fix("gyro-frame=world", "reading the gyro in world axes", _rate_from_world),
         Fix("accelerometer-frame=world", "reading the specific force in world axes", _force_from_world),
         Fix(
             "accelerometer-gravity=subtracted",
@@ -287,6 +288,10 @@ def _reversed(log: FlightLog) -> FlightLog:
 
 def _velocity_from_body(log: FlightLog) -> FlightLog:
     return log.replace(velocity=rotation.to_world(rotation.tidy(log.quaternion), log.velocity))
+
+
+def _rate_from_world(log: FlightLog) -> FlightLog:
+    return log.replace(body_rate=rotation.to_body(rotation.tidy(log.quaternion), log.body_rate))
 
 
 def _force_from_world(log: FlightLog) -> FlightLog:

@@ -24,6 +24,7 @@ from cfb_mjx.logs.assembly import Import, assemble
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.proposal import UnknownNames, propose
 from cfb_mjx.logs.radio_csv import logged_names
+from cfb_mjx.logs.ros_bag import lacks_checksums
 from cfb_mjx.logs.streams import Stream, ordered
 from cfb_mjx.logs.tabular import Table
 from cfb_mjx.logs.variables import MissingNames, VariableMap, load_mapping
@@ -69,6 +70,8 @@ def read_foxglove(path: str | os.PathLike, mapping: str | os.PathLike | Variable
     mapping = mapping if isinstance(mapping, VariableMap) else load_mapping(mapping)
     notes: list[str] = []
     warnings: list[str] = []
+    if lacks_checksums(read_bytes(path)):
+        notes.append("the MCAP file has no checksums, so damage to values in it would go unnoticed.")
     streams = [ordered(s, path, notes, _OVERTAKING) for s in _streams(path, notes, warnings)]
     streams = _with_known_names(streams, mapping, path, guess=asked is None)
     try:
@@ -118,7 +121,7 @@ def _streams(path: Path, notes: list[str], warnings: list[str]) -> list[Stream]:
 
 def _messages(path: Path, warnings: list[str]) -> Iterable[tuple[str, int, dict[str, float]]]:
     """Topic, time of recording (ns) and numbers by name of every message that has any."""
-    from mcap.records import Channel, Message, Schema
+    from mcap.records import Channel, Message, Schema, Statistics
     from mcap.stream_reader import StreamReader
 
     data = read_bytes(path)
@@ -126,7 +129,7 @@ def _messages(path: Path, warnings: list[str]) -> Iterable[tuple[str, int, dict[
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     decoders: dict[int, Callable[[bytes], Any] | None] = {}
-    read = 0
+    read = seen = 0
     try:
         for item in StreamReader(io.BytesIO(data), validate_crcs=True, record_size_limit=len(data)).records:
             if isinstance(item, Schema):
@@ -134,7 +137,15 @@ def _messages(path: Path, warnings: list[str]) -> Iterable[tuple[str, int, dict[
             elif isinstance(item, Channel):
                 channels[item.id] = item
                 decoders[item.id] = _decoder(item, schemas.get(item.schema_id))
-            elif isinstance(item, Message) and (decode := decoders[item.channel_id]) is not None:
+            elif isinstance(item, Statistics) and item.message_count > seen:
+                warnings.append(
+                    f"{item.message_count - seen} of the {item.message_count} messages that the file's own statistics "
+                    "count are missing: a part of it was lost."
+                )
+            elif isinstance(item, Message):
+                seen += 1
+                if (decode := decoders[item.channel_id]) is None:
+                    continue
                 numbers: dict[str, float] = {}
                 _collect(decode(item.data), "", numbers)
                 read += 1

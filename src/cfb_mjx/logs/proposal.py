@@ -57,9 +57,35 @@ class Proposal(NamedTuple):
 
 def propose(table: Mapping[str, np.ndarray | Text]) -> Proposal | None:
     """A mapping for a table's columns; None where they do not hold a flight by any reading of their names."""
-    numbers = {name: np.asarray(v, float) for name, v in table.items() if not isinstance(v, Text)}
-    if clock_of(numbers) is None or min((len(v) for v in numbers.values()), default=0) < 2:
+    numbers = _numbers(table)
+    found = _fields(numbers)
+    if _missing(numbers, found) or min((len(v) for v in numbers.values()), default=0) < 2:
         return None
+    return _document(found, numbers)
+
+
+def lacking(table: Mapping[str, np.ndarray | Text]) -> list[str]:
+    """What a flight needs and no column of a table is named after, in words."""
+    numbers = _numbers(table)
+    return _missing(numbers, _fields(numbers))
+
+
+def _numbers(table: Mapping[str, np.ndarray | Text]) -> dict[str, np.ndarray]:
+    return {name: np.asarray(v, float) for name, v in table.items() if not isinstance(v, Text)}
+
+
+def _missing(numbers: Mapping[str, np.ndarray], found: Mapping[str, list[str]]) -> list[str]:
+    needed = {
+        "time": clock_of(numbers) is not None,
+        "position": "position" in found,
+        "attitude": bool({"quaternion", "angles"} & set(found)),
+        "motors (commands or rotor speeds)": bool({"command", "rotor_speed"} & set(found)),
+    }
+    return [what for what, there in needed.items() if not there]
+
+
+def _fields(numbers: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
+    """Field to its columns, as their names tell."""
     found = _families(numbers)
     if "quaternion" not in found:
         angles = {m[2].lower(): n for n in numbers if (m := _ANGLES.fullmatch(_plain(n))) and not m[1].endswith("rate")}
@@ -70,16 +96,10 @@ def propose(table: Mapping[str, np.ndarray | Text]) -> Proposal | None:
         rates = {(m[1] or m[3]).lower(): n for n in numbers if (m := _RATES.fullmatch(_plain(n)))}
         if len(rates) == 3:
             found["body_rate"] = [rates[a] for a in ("roll", "pitch", "yaw")]
-    if (
-        "position" not in found
-        or not {"quaternion", "angles"} & set(found)
-        or not {"command", "rotor_speed"} & set(found)
-    ):
-        return None
     battery = next((n for n in numbers if _BATTERY.fullmatch(_plain(n))), None)
     if battery is not None:
         found["battery_voltage"] = [battery]
-    return _document(found, numbers)
+    return found
 
 
 def _plain(name: str) -> str:

@@ -28,7 +28,7 @@ from cfb_mjx.logs.fixes import Fix, fix_of
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.flown import flown_part, without_spans
 from cfb_mjx.logs.gate import Verdict
-from cfb_mjx.logs.proposal import UnknownNames, propose
+from cfb_mjx.logs.proposal import UnknownNames, lacking, propose
 from cfb_mjx.logs.validation import examine
 from cfb_mjx.logs.variables import MissingNames, load_mapping, mapping_of
 
@@ -172,10 +172,8 @@ def _or_proposed(tables: list[tabular.Table], paths: list[Path], format: str, op
         if sum(name in tables[0] for names in tabular.COLUMNS.values() for name in names) > _OWN_LAYOUT:
             raise  # this library's own layout, not whole
         proposal = propose(tables[0]) if len(tables) == 1 else None
-        head = read_bytes(paths[0], 64)
-        if proposal is None and arrays.recognises(paths[0], head):
-            said = str(error).removeprefix(f"{paths[0]}: ")
-            raise CfbError(f"{paths[0]}: {arrays.kind(head)} has arrays {', '.join(tables[0])}: {said}") from None
+        if proposal is None and format == "tabular":
+            raise CfbError(f"{paths[0]}: {_not_told(tables[0], read_bytes(paths[0], 64), paths[0])}.") from None
         if proposal is None:
             raise
         raise UnknownNames(
@@ -185,12 +183,25 @@ def _or_proposed(tables: list[tabular.Table], paths: list[Path], format: str, op
         ) from error
 
 
+def _not_told(table: tabular.Table, head: bytes, path: Path) -> str:
+    """Why a table of foreign names is no flight, and what to do about it."""
+    names = list(table)
+    listed = ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
+    what = f"{arrays.kind(head)} has arrays" if arrays.recognises(path, head) else "it has columns"
+    missing = ", ".join(lacking(table)) or "more than one row"
+    return (
+        f"{what} {listed}, and none is known by its name to hold {missing}; record that too, or say which it is with "
+        f"--mapping FILE, a changed copy of configs/logs/crazyflie.yaml, or by the names {tabular.LAYOUT}"
+    )
+
+
 def _table(path: Path) -> tabular.Table:
     head = read_bytes(path, 64)
     return arrays.read_arrays(path) if arrays.recognises(path, head) else tabular.read_table(path)
 
 
 _OWN_LAYOUT = 17  # of its columns that make a table one of the tabular layout
+_LISTED = 12  # names of a foreign table in a message
 _MCAP_MAGIC = b"\x89MCAP"
 
 
