@@ -41,11 +41,11 @@ def import_log(
 
     Args:
         sources: log to read: parquet, csv, MCAP, Crazyflie micro SD card binary, ROS bag or its folder, radio csv,
-            .npz, .mat, PX4's ULog; several tables, as cfclient writes one per log block, are one flight.
+            .npz, .mat, PX4's ULog, an MCAP of others; several tables, as cfclient writes one per log block, are one flight.
         output: MCAP file to write.
         format: layout of the source; auto looks at its content.
         motor_shift: s by which to delay the motor columns of an IDSIA log instead of the estimated shift.
-        mapping: YAML saying which logged variable is what (micro SD card, Crazyswarm2, radio csv).
+        mapping: YAML saying which logged variable, column or field is what.
         topics_yaml: crazyflies.yaml with the variable names of the custom topics of a Crazyswarm2 bag.
         robot: whose flight to read from a Crazyswarm2 bag or a table of several.
         time_unit: unit of the time column of a radio csv: s, ms, us or ns.
