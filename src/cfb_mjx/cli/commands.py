@@ -41,7 +41,8 @@ def import_log(
 
     Args:
         sources: log to read: parquet, csv, MCAP, Crazyflie micro SD card binary, ROS bag or its folder, radio csv,
-            .npz, .mat, PX4's ULog, an MCAP of others; several tables, as cfclient writes one per log block, are one flight.
+            .npz, .mat, PX4's ULog, an MCAP of others; several tables, as cfclient writes one per log block, are one
+            flight.
         output: MCAP file to write.
         format: layout of the source; auto looks at its content.
         motor_shift: s by which to delay the motor columns of an IDSIA log instead of the estimated shift.
