@@ -1,17 +1,21 @@
 """Bad input: one sentence that names the file, exit status 2, no traceback, earlier results as they were."""
 
+import ast
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
 import warnings
+from inspect import signature
 from pathlib import Path
 
 import numpy as np
 import pyarrow.csv
 import pytest
 
+import cfb_mjx
 from cfb_mjx.cli import unusual_said_once
 from cfb_mjx.interrupts import held_back
 from cfb_mjx.parameters import load_model_file
@@ -235,3 +239,33 @@ sys.exit(cli.main([]))
     assert done.returncode == 130, done.stderr
     assert "interrupted" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def _messages(source: Path):
+    """Texts of a module that a user may read: all but its docstrings, with what f-strings put in left blank."""
+    tree = ast.parse(source.read_text())
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    docstrings = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, documented) and node.body and isinstance(node.body[0], ast.Expr)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in docstrings:
+            yield node.value
+
+
+def test_flags_in_messages_are_flags_of_the_commands():
+    from cfb_mjx.cli.commands import COMMANDS
+
+    options = {f"--{name.replace('_', '-')}" for command in COMMANDS.values() for name in signature(command).parameters}
+    options |= {"--help", "--version", "--no", "--head"}  # every command's, cfb's, a switch's, ray's
+    package = Path(cfb_mjx.__file__).parent
+    named = {
+        (flag, str(source.relative_to(package)))
+        for source in package.rglob("*.py")
+        for text in _messages(source)
+        for flag in re.findall(r"(?<![\w-])--[a-z][a-z-]*[a-z]\b(?!_)", text)
+    }
+    assert ("--keep-ground", "logs/flown.py") in named
+    assert sorted(pair for pair in named if pair[0] not in options) == []
