@@ -9,7 +9,7 @@ from synthetic_logs import make_flight, same_data
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
-from cfb_mjx.logs import read_log, validate, write_tabular
+from cfb_mjx.logs import gate, read_log, validate, write_tabular
 from cfb_mjx.logs.fixes import candidates, command_fixes, fix_of, motor_fixes
 from cfb_mjx.logs.gate import judge
 
@@ -57,6 +57,22 @@ def test_a_hover_is_too_gentle_to_tell():
     assert "nothing moves enough" in verdict.summary()
     lively = judge(make_flight(duration=3.0))
     assert lively.summary().startswith("signals agree: displacement x y")
+
+
+def test_minutes_of_a_flight_that_then_lasts_too_short_to_compare(flown):
+    """At 100 Hz ten seconds are a sixth of one."""
+    slow = flown.rows(slice(0, None, 3))
+    with pytest.raises(CfbError, match=r"times as far as the velocity says; reading the time in min.*time-unit=min"):
+        validate(slow.replace(time=slow.time / 60.0), "x")
+    validate(slow.slice(0.0, 0.5), "x")
+
+
+def test_a_copy_is_found_whatever_the_sign_of_its_quaternion(flown):
+    twice = np.r_[0:800, 400:800, 800 : len(flown)]
+    sign = np.where((np.arange(len(twice)) >= 800) & (np.arange(len(twice)) < 1200), -1.0, 1.0)
+    copied = flown.rows(twice).replace(time=np.arange(len(twice)) * flown.nominal_interval)
+    copied = copied.replace(quaternion=copied.quaternion * sign[:, None])
+    assert "repeat earlier rows" in str(gate._repeated(copied))
 
 
 def test_what_no_change_mends_is_a_warning_with_its_time(flown):

@@ -43,7 +43,7 @@ _UNIT_WORDS = {
 }
 # Numbers that were taken for another unit on the way: an importer's mistake, undone the same way.
 _UNDONE = {"gyro": {"rad/s": 180 / math.pi}, "accelerometer": {"m/s^2": 1 / _G}}
-_TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _SCALES = (0.1, 0.5, 2.0, 10.0, 0.01, 100.0)
 _QUATERNIONS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "xyzw": (
@@ -216,7 +216,7 @@ def _named() -> list[Fix]:
             )
     found += [
         Fix(f"time-unit={unit}", f"reading the time in {unit}", lambda log, s=scale: _rescaled(log, s))
-        for unit, scale in _TIMES.items()
+        for unit, scale in TIMES.items()
     ]
     return found + command_fixes()
 

@@ -9,12 +9,13 @@ import numpy as np
 from cfb_mjx.logs import consistency
 from cfb_mjx.logs.alignment import GAIN, nominal_speeds, nominal_thrust
 from cfb_mjx.logs.consistency import ORDER, Relation
-from cfb_mjx.logs.fixes import COMMAND_UNITS, Fix, candidates, motor_fixes
+from cfb_mjx.logs.fixes import COMMAND_UNITS, TIMES, Fix, candidates, fix_of, motor_fixes
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.gaps import changes
 
 _ROWS = 6000  # of a long log that decide: the liveliest stretch
 _UNTOLD, _GONE = 0.5, 2.0  # cost of an axis that moved before a change and does not after it, or cannot be compared
+_SHORT, _RUSHED, _FARTHER = 1.0, 5.0, 0.1  # s that are too short to compare; ratio; m
 _DISORDER = 0.2  # share of rows whose position leaps
 _GAIN = (1100.0, 6500.0)  # rad/s of a rotor for a command of one, brushed and brushless
 _UNIT = 0.13  # by which a slope may be off after a change of unit: estimators stretch velocities by a tenth
@@ -104,6 +105,8 @@ def judge(log: FlightLog) -> Verdict:
         if heavy and not remedy:
             problem += "; give what the accelerometer reads, gravity included, in m/s^2"
         return Verdict(relations, {}, problem, remedy, alternatives, heavy, left)
+    if (rushed := _rushed(log)) is not None:
+        return Verdict(relations, {}, *rushed, certain=True)
     if (repeated := _repeated(log)) is not None:
         return Verdict(relations, {}, repeated, certain=True)
     return _judge_motors(log, relations)
@@ -195,6 +198,20 @@ def _exact(fix: Fix, relations: list[Relation]) -> bool:
     return all(abs(r.slope / max(r.correlation, 0.1) - 1) < _UNIT for r in compared if r.correlation > 0.8)
 
 
+def _rushed(log: FlightLog) -> tuple[str, tuple[Fix, ...]] | None:
+    """A log too short to compare, whose path is many times as long as its velocities allow: time in another unit."""
+    if log.duration > _SHORT or len(log) < 20:
+        return None
+    steps = np.diff(log.time)[:, None]
+    travelled = np.cumsum((log.velocity[1:] + log.velocity[:-1]) / 2 * steps, axis=0)
+    moved, told = (float(np.linalg.norm(np.ptp(x, axis=0))) for x in (log.position, travelled))
+    if moved < _FARTHER or moved < _RUSHED * told:
+        return None
+    units = [u for u, scale in TIMES.items() if 0.5 < moved / max(told, 1e-9) / scale < 2.0]
+    times = f"{moved / max(told, 1e-9):.0f} times as far as the velocity says"
+    return f"in {log.duration:.2g} s the position moves {times}", tuple(fix_of(f"time-unit={u}") for u in units)
+
+
 def _disorder(log: FlightLog) -> str | None:
     """Rows that do not follow each other: the position leaps everywhere."""
     step = np.diff(log.time)
@@ -214,7 +231,9 @@ def _disorder(log: FlightLog) -> str | None:
 
 def _repeated(log: FlightLog) -> str | None:
     """Rows that come again, to the last bit: a copy pasted behind the original, or rows out of order."""
-    rows = np.concatenate([log.position, log.velocity, log.quaternion, log.body_rate, log.specific_force], axis=1)
+    # Of one attitude's two quaternions the same: a copy may have got the other sign.
+    q = log.quaternion * np.where(log.quaternion[:, :1] < 0, -1.0, 1.0)
+    rows = np.concatenate([log.position, log.velocity, q, log.body_rate, log.specific_force], axis=1)
     kept = np.flatnonzero(changes(rows))
     # Only rows in which something moves: a simulated hover repeats itself.
     kept = kept[np.abs(log.body_rate[kept]).max(axis=1) > 1e-3]

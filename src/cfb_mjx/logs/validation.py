@@ -16,7 +16,7 @@ _COMMAND_TOLERANCE = 1e-3
 # No Crazyflie rotor turns faster than about 2900 rad/s; twice that can only be another unit or a bad packet.
 _ROTOR_SPEED_LIMIT = 6000.0
 _BEHIND = 20  # rows that follow a step back before the time is where it was: more are no rows out of order
-_FASTEST = 1.5e-4  # s between rows: no sensor of a Crazyflie is read more than 4000 times a second
+_FASTEST = 2.2e-4  # s between rows: no sensor of a Crazyflie is read more than 4000 times a second
 # No flight of a Crazyflie has more: an arena of 10 km, twice the range of gyro and accelerometer.
 _LIMITS = {"position": 1e4, "velocity": 60.0, "body_rate": 70.0, "specific_force": 320.0}
 _UNITS = {"position": "m", "velocity": "m/s", "body_rate": "rad/s", "specific_force": "m/s^2"}
