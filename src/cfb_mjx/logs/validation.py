@@ -7,7 +7,7 @@ import os
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs import gate, rotation
+from cfb_mjx.logs import gate, motor_checks, rotation
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.tabular import COLUMNS, OPTIONAL_COLUMNS
 
@@ -142,7 +142,7 @@ def _command(log: FlightLog, fail) -> None:
         return
     if low >= -_COMMAND_TOLERANCE and float(np.median(log.command)) > 1.0:
         force = float(np.median(np.linalg.norm(log.specific_force, axis=1)))
-        looks = gate.command_unit(log.command, force if force > 1.0 else 9.81)
+        looks = motor_checks.command_unit(log.command, force if force > 1.0 else 9.81)
         if looks is not None:
             fail(f"u1..u4 reach {high:.4g}: they {looks}")
     row, motor = np.unravel_index(int(np.argmax(np.abs(log.command - 0.5))), log.command.shape)
