@@ -202,9 +202,10 @@ def _rushed(log: FlightLog) -> tuple[str, tuple[Fix, ...]] | None:
     moved, told = (float(np.linalg.norm(np.ptp(x, axis=0))) for x in (log.position, travelled))
     if moved < _FARTHER or moved < _RUSHED * told:
         return None
-    units = [u for u, scale in TIMES.items() if 0.5 < moved / max(told, 1e-9) / scale < 2.0]
-    times = f"{moved / max(told, 1e-9):.0f} times as far as the velocity says"
-    return f"in {log.duration:.2g} s the position moves {times}", tuple(fix_of(f"time-unit={u}") for u in units)
+    ratio = moved / max(told, 1e-9)
+    known = {f"time-unit={unit}": scale for unit, scale in TIMES.items()} | {"time-scale=10": 10.0}
+    fixes = tuple(fix_of(name) for name, scale in known.items() if 0.5 < ratio / scale < 2.0)
+    return f"in {log.duration:.2g} s the position moves {ratio:.0f} times as far as the velocity says", fixes
 
 
 def _disorder(log: FlightLog) -> str | None:
