@@ -75,8 +75,8 @@ def main() -> int:
     rows = [f"| {name} | {c[0]} | {c[1]} | {c[2]} |" for name, c in counts.items()]
     said = (
         f"{len(CONTRADICTIONS)} contradictions in {len(chosen)} flights each: of {total[0]} that show (the flight "
-        f"moves along the axis in question) {total[1]} were noticed ({total[1] / total[0]:.1%}), {total[2]} with the right "
-        f"advice ({total[2] / total[0]:.1%}). False alarms: {len(alarms)} of {len(paths)} undamaged flights."
+        f"moves along the axis in question) {total[1]} were noticed ({total[1] / total[0]:.1%}), {total[2]} with the "
+        f"right advice ({total[2] / total[0]:.1%}). False alarms: {len(alarms)} of {len(paths)} undamaged flights."
     )
     table = ["", "| contradiction | shows in | noticed | right advice |", "|---|---:|---:|---:|", *rows]
     text = said if arguments.unseen else "\n".join([said, *table])
