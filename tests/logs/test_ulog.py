@@ -39,3 +39,10 @@ def test_a_log_that_was_cut_is_read_up_to_its_end(flight, tmp_path):
     whole = foreign.ulog(flight)
     path.write_bytes(whole[: len(whole) * 6 // 10])
     assert 0.4 * len(flight) < len(read_log(path)) < len(flight)
+
+
+def test_descriptions_alone_are_not_damage(flight, tmp_path):
+    path = tmp_path / "flight.ulg"
+    path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + (40).to_bytes(2, "little") + b"B" + bytes(40))
+    with pytest.raises(CfbError, match="the PX4 ULog holds no data"):
+        read_log(path)

@@ -38,6 +38,8 @@ def read_ulog(path: str | os.PathLike, mapping: str | os.PathLike | VariableMap 
     said = io.StringIO()
     data = read_bytes(path)
     whole = _framed(data)
+    if whole[0] == len(data) and not any(data[at + 2] == ord("D") for at in whole[1]):
+        raise CfbError(f"{path}: the PX4 ULog holds no data, only what describes them; give the log of a flight.")
     try:
         if not any(data[at + 2] in b"AL" for at in whole[1]):
             raise ValueError("it ends before its data")
