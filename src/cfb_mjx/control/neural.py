@@ -19,7 +19,7 @@ class Network(eqx.Module):
     """Weights (inputs, outputs) and biases, first layer first; the activation stands between layers."""
 
     weights: tuple[Float[Array, "_ _"], ...]
-    biases: tuple[Float[Array, "_"], ...]
+    biases: tuple[Float[Array, " _"], ...]
     activation: str = eqx.field(static=True, default="tanh")
 
     @classmethod
@@ -92,7 +92,7 @@ class NeuralController(eqx.Module):
         """Time between two commands, s."""
         return self.layout.control_dt_s
 
-    def act(self, shown: Float[Array, "size *drones"]) -> Float[Array, "4 *drones"]:
+    def act(self, shown: Float[Array, " size *drones"]) -> Float[Array, " 4 *drones"]:
         """Command in (0, 1) on an observation."""
         network = self.network if shown.ndim == 1 else self.network.columns
         return 0.5 * (1 + jnp.tanh(network(shown)))
@@ -102,13 +102,13 @@ class NeuralController(eqx.Module):
         network = self.network
         return NeuralController(WrittenOut(network.weights, network.biases, network.activation), self.layout)
 
-    def start(self, estimate: Estimate, command: Float[Array, "4 *drones"] | float = 0.55) -> Memory:
+    def start(self, estimate: Estimate, command: Float[Array, " 4 *drones"] | float = 0.55) -> Memory:
         """Memory of a controller that takes over: it has commanded ``command`` on ``estimate`` for long."""
         return start(self.layout, estimate, command)
 
     def command(
-        self, memory: Memory, estimate: Estimate, setpoint: Float[Array, "setpoints *drones"] | None = None
-    ) -> tuple[Memory, Float[Array, "4 *drones"]]:
+        self, memory: Memory, estimate: Estimate, setpoint: Float[Array, " setpoints *drones"] | None = None
+    ) -> tuple[Memory, Float[Array, " 4 *drones"]]:
         """New memory and command; called every ``layout.control_dt_s``. Policies with set-points need them."""
         u = self.act(observation(self.layout, memory, estimate, setpoint))
         return remember(self.layout, memory, estimate, u), u

@@ -80,12 +80,12 @@ class Task:
         """What the best step is worth."""
         raise NotImplementedError
 
-    def draw_setpoint(self, key: PRNGKeyArray) -> Float[Array, "setpoints"]:
+    def draw_setpoint(self, key: PRNGKeyArray) -> Float[Array, " setpoints"]:
         """What an episode asks for beside its target; ``layout.setpoint_scales`` has one scale for each number."""
         return jnp.zeros(0)
 
     def draw_start(
-        self, model: Quadrotor, target: Float[Array, "3"], setpoint: Float[Array, "setpoints"], key: PRNGKeyArray
+        self, model: Quadrotor, target: Float[Array, "3"], setpoint: Float[Array, " setpoints"], key: PRNGKeyArray
     ) -> State:
         """A random initial state."""
         raise NotImplementedError
@@ -94,7 +94,7 @@ class Task:
         self,
         state: State,
         target: Float[Array, "3"],
-        setpoint: Float[Array, "setpoints"],
+        setpoint: Float[Array, " setpoints"],
         command: Float[Array, "4"],
         parameters: Parameters,
     ) -> Float[Array, ""]:
@@ -111,7 +111,7 @@ class Task:
         return -300.0
 
     def errors(
-        self, state: State, target: Float[Array, "3"], setpoint: Float[Array, "setpoints"]
+        self, state: State, target: Float[Array, "3"], setpoint: Float[Array, " setpoints"]
     ) -> Float[Array, "errors"]:
         """The distances that the reward falls with, each scaled to about one: what a value network is told."""
         raise NotImplementedError
@@ -213,7 +213,7 @@ class Episode(eqx.Module):
     """The drone of this episode."""
     state: State
     target: Float[Array, "3"]
-    setpoint: Float[Array, "setpoints"]
+    setpoint: Float[Array, " setpoints"]
     """What is asked for beside the target; empty for tasks that ask for nothing else."""
     past: DelayLine
     """Of `Pose`: estimates arrive late."""
@@ -243,7 +243,7 @@ def reset(
     state: State | None = None,
     target: Float[AnyArray, "3"] | tuple[float, float, float] = (0.0, 0.0, 0.0),
     magnitude: Float[Array, ""] | float | None = None,
-    setpoint: Float[AnyArray, "setpoints"] | tuple[float, ...] | None = None,
+    setpoint: Float[AnyArray, " setpoints"] | tuple[float, ...] | None = None,
 ) -> Episode:
     """Begin an episode.
 
@@ -301,7 +301,7 @@ def choose(condition: Array, yes: Any, no: Any) -> Any:
     )
 
 
-def observe(task: Task, episode: Episode) -> Float[Array, "size"]:
+def observe(task: Task, episode: Episode) -> Float[Array, " size"]:
     """What the controller's network is given now."""
     return seen.observation(task.layout, episode.memory, episode.estimate, episode.setpoint)
 

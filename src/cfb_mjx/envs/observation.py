@@ -61,13 +61,13 @@ class Layout:
 class Estimate(eqx.Module):
     """What the state estimator reports."""
 
-    position: Float[Array, "3 *drones"]
+    position: Float[Array, " 3 *drones"]
     """Position minus target, world, m."""
-    velocity: Float[Array, "3 *drones"]
+    velocity: Float[Array, " 3 *drones"]
     """World, m/s."""
-    quaternion: Float[Array, "4 *drones"]
+    quaternion: Float[Array, " 4 *drones"]
     """[w, x, y, z], body to world."""
-    body_rate: Float[Array, "3 *drones"]
+    body_rate: Float[Array, " 3 *drones"]
     """Body, rad/s."""
 
 
@@ -78,11 +78,11 @@ class Memory(eqx.Module):
     """Of every control step, shown or not, newest first."""
     commands: Float[Array, "commands 4 *drones"]
     """As the observation shows them: 2 u - 1."""
-    integral: Float[Array, "3 *drones"]
+    integral: Float[Array, " 3 *drones"]
     """Of the relative position, m s."""
 
 
-def rotation_matrix(q: Float[Array, "4 *drones"]) -> Float[Array, "3 3 *drones"]:
+def rotation_matrix(q: Float[Array, " 4 *drones"]) -> Float[Array, "3 3 *drones"]:
     """Rotation matrix of a unit quaternion, body to world."""
     w, x, y, z = q
     return jnp.stack(
@@ -94,7 +94,7 @@ def rotation_matrix(q: Float[Array, "4 *drones"]) -> Float[Array, "3 3 *drones"]
     )
 
 
-def frame(layout: Layout, estimate: Estimate) -> Float[Array, "frame *drones"]:
+def frame(layout: Layout, estimate: Estimate) -> Float[Array, " frame *drones"]:
     """The numbers of one estimate, scaled."""
     turn, velocity = rotation_matrix(estimate.quaternion), estimate.velocity
     if layout.body_velocity:
@@ -110,7 +110,7 @@ def frame(layout: Layout, estimate: Estimate) -> Float[Array, "frame *drones"]:
     return jnp.concatenate(parts)
 
 
-def start(layout: Layout, estimate: Estimate, command: Float[Array, "4 *drones"] | float) -> Memory:
+def start(layout: Layout, estimate: Estimate, command: Float[Array, " 4 *drones"] | float) -> Memory:
     """Memory of a controller that has seen ``estimate`` and commanded ``command`` [0 to 1] for long."""
     shown = frame(layout, estimate)
     drones = shown.shape[1:]
@@ -120,8 +120,8 @@ def start(layout: Layout, estimate: Estimate, command: Float[Array, "4 *drones"]
 
 
 def observation(
-    layout: Layout, memory: Memory, estimate: Estimate, setpoint: Float[Array, "setpoints *drones"] | None = None
-) -> Float[Array, "size *drones"]:
+    layout: Layout, memory: Memory, estimate: Estimate, setpoint: Float[Array, " setpoints *drones"] | None = None
+) -> Float[Array, " size *drones"]:
     """What the network is given, (``layout.size``,).
 
     Args:
@@ -141,7 +141,7 @@ def observation(
     return jnp.concatenate(parts)
 
 
-def remember(layout: Layout, memory: Memory, estimate: Estimate, command: Float[Array, "4 *drones"]) -> Memory:
+def remember(layout: Layout, memory: Memory, estimate: Estimate, command: Float[Array, " 4 *drones"]) -> Memory:
     """Memory after ``command`` [0 to 1] was given on ``estimate``; called once every ``layout.control_dt_s``."""
     frames, commands = memory.frames, memory.commands
     if layout.past_estimates:

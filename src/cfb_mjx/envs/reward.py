@@ -77,6 +77,6 @@ def commanded_torque(parameters: Parameters, command: Float[Array, "4"]) -> Floa
     return parameters.rotor_spacing / 2 * (jnp.asarray(TORQUE_SIGNS[:2], settled.dtype) @ settled)
 
 
-def length(vector: Float[Array, "n"]) -> Float[Array, ""]:
+def length(vector: Float[Array, " n"]) -> Float[Array, ""]:
     """Euclidean norm with a finite slope at zero."""
     return jnp.sqrt(jnp.sum(vector * vector) + 1e-12)

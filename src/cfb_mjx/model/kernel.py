@@ -39,7 +39,7 @@ def fly(
     step: Program,
     constants: Sequence[Array],
     own: Sequence[bool],
-    start: Sequence[Float[Array, "drones"]],
+    start: Sequence[Float[Array, " drones"]],
     commands: Float[Array, "rows 4"] | Float[Array, "rows 4 drones"],
     *,
     hold: int,

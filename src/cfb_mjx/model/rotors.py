@@ -221,7 +221,7 @@ def steady_command(parameters: Parameters, speed: Float[Array, "4"]) -> Float[Ar
 
 
 def rotor_speed_history(
-    parameters: Parameters, times: Float[Array, "n"], commands: Float[Array, "n 4"]
+    parameters: Parameters, times: Float[Array, " n"], commands: Float[Array, "n 4"]
 ) -> Float[Array, "n 4"]:
     """Rotor speeds at ``times`` [s] from logged commands held between rows, steady at the first row, rad/s.
 

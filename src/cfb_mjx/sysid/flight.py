@@ -27,9 +27,9 @@ _VOLTAGE_SMOOTHING = 0.02
 class Flight(eqx.Module):
     """N rows of one log; the padding repeats the last row with zero time between."""
 
-    time: Float[Array, "n"]
+    time: Float[Array, " n"]
     """Since the log's time zero, s."""
-    interval: Float[Array, "n"]
+    interval: Float[Array, " n"]
     """To the next row, s; 0 at the last and in the padding."""
     position: Float[Array, "n 3"]
     velocity: Float[Array, "n 3"]
@@ -42,11 +42,11 @@ class Flight(eqx.Module):
     """Measured, rad/s; 0 where not."""
     measured: Float[Array, ""]
     """1 where the log has rotor speeds throughout."""
-    voltage: Float[Array, "n"]
+    voltage: Float[Array, " n"]
     """Of the battery, V, smoothed over past rows; NaN where not measured."""
-    fresh: Float[Array, "n"]
+    fresh: Float[Array, " n"]
     """1 at the first row and at the first after a gap."""
-    valid: Float[Array, "n"]
+    valid: Float[Array, " n"]
     """1 where what the model predicts can be compared with the row."""
 
 

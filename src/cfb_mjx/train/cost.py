@@ -37,7 +37,7 @@ class SmoothCost:
         self,
         state: State,
         target: Float[Array, "3"],
-        setpoint: Float[Array, "setpoints"],
+        setpoint: Float[Array, " setpoints"],
         command: Float[Array, "4"],
         last: Float[Array, "4"],
     ) -> Float[Array, ""]:

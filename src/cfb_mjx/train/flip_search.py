@@ -63,7 +63,7 @@ class Found(NamedTuple):
 
     knobs: Knobs
     cost: Float[Array, ""]
-    history: Float[Array, "rounds"]
+    history: Float[Array, " rounds"]
     """Cost of the best candidate of each round."""
 
 

@@ -201,7 +201,7 @@ class Ppo:
         return self.ideal + critic(shown)[..., 0]
 
 
-def hidden(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array, "n"]:
+def hidden(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array, " n"]:
     """What the value network is shown: true frame, rotor speeds, integral, how the drone differs, set-points, errors.
 
     The reward falls with lengths of errors, whose tips at zero a small network is slow to form by itself.

@@ -27,9 +27,9 @@ class Unlogged(NamedTuple):
     On each axis of the body, and along z, the error is one number: the sum over the rotors with their signs, rad/s.
     """
 
-    variance: Float[Array, "n"]
+    variance: Float[Array, " n"]
     """What every interval adds to the error's variance."""
-    decay: Float[Array, "n"]
+    decay: Float[Array, " n"]
     jump: Float[Array, "n 3"]
     """Body rate per error, within the interval in which it arises."""
     later: Float[Array, "n 3"]
@@ -79,7 +79,7 @@ def rate_innovations(
 
 
 def force_innovations(
-    noise: Noise, piece: Segments, force: Float[Array, "n"], unlogged: Unlogged, robust: bool
+    noise: Noise, piece: Segments, force: Float[Array, " n"], unlogged: Unlogged, robust: bool
 ) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
     """Specific force along z against the model's ``force`` (m/s^2) behind the accelerometer's low-pass.
 

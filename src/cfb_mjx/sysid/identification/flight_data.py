@@ -32,7 +32,7 @@ class Segments(eqx.Module):
     """Mean of what is commanded until the next row, less ``command``: 0 as logged, see `innovation.as_held`."""
     rotor_speed: Float[Array, "s n 4"]
     """Measured, rad/s; what it holds where ``measured`` is 0 means nothing."""
-    measured: Float[Array, "s"]
+    measured: Float[Array, " s"]
     """1 where every rotor speed of the piece was measured."""
     warm_up: Float[Array, "s n"]
     """1 for rows used to find the rotor speed and the filter's state only."""

@@ -148,7 +148,7 @@ def _errors(
     )
 
 
-def _speed_after(parameters: Parameters, step: Float[Array, "p"], command: Float[Array, "p 4"]) -> Float[Array, "4"]:
+def _speed_after(parameters: Parameters, step: Float[Array, " p"], command: Float[Array, "p 4"]) -> Float[Array, "4"]:
     target = parameters.motor_gain * command + parameters.motor_speed_offset
 
     def advance(speed, row):

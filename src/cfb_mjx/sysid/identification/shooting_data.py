@@ -37,8 +37,8 @@ class Batch(eqx.Module):
     truth: State
     noise: Float[Array, "w 12"]
     """Of a row: position, velocity, attitude (rotation vector), body rate."""
-    rotor_noise: Float[Array, "w"]
-    live: Float[Array, "w"]
+    rotor_noise: Float[Array, " w"]
+    live: Float[Array, " w"]
     """0 for windows that only fill the batch."""
     delay: Float[Array, ""]
     """Age of the pose in a row that was assumed when the windows were cut, s."""

@@ -22,8 +22,8 @@ MAX_STEPS = 60
 
 
 def least_squares(
-    residual: Callable[[Array], PyTree], start: Float[Array, "k"], ridge: Float[Array, "k"] | float = RIDGE
-) -> Float[Array, "k"]:
+    residual: Callable[[Array], PyTree], start: Float[Array, " k"], ridge: Float[Array, " k"] | float = RIDGE
+) -> Float[Array, " k"]:
     """The minimum of the sum of squares, from ``start``; forward-mode Jacobian.
 
     ``ridge`` is one over the standard deviation of each unknown's prior about zero; a large one holds it.

@@ -67,11 +67,11 @@ class Unknowns(eqx.Module):
     """1 where every command acts until the next row, whatever ``command_hold`` says."""
 
     @property
-    def start(self) -> Float[Array, "k"]:
+    def start(self) -> Float[Array, " k"]:
         """The vector of the nominal parameters: zeros."""
         return jnp.zeros(len(self.names))
 
-    def apply(self, vector: Float[Array, "k"]) -> Parameters:
+    def apply(self, vector: Float[Array, " k"]) -> Parameters:
         """Parameters at ``vector``; differentiable."""
         p, change = self.nominal, dict(zip(self.names, vector, strict=True))
         factors = tuple(getattr(p, name) * jnp.exp(change.get(name, 0.0)) for name in _FACTORS)
@@ -98,7 +98,7 @@ class Unknowns(eqx.Module):
             ),
         )
 
-    def hold(self, vector: Float[Array, "k"]) -> Float[Array, ""] | None:
+    def hold(self, vector: Float[Array, " k"]) -> Float[Array, ""] | None:
         """How long a logged command acts before the next one that was sent, s; infinite where until the next row.
 
         None where that is not fitted.
@@ -110,7 +110,7 @@ class Unknowns(eqx.Module):
     def _hold(self, vector):
         return HOLD + OFFSETS["command_hold"] * vector[self.names.index("command_hold")]
 
-    def values(self, vector: Float[Array, "k"]) -> Float[Array, "k"]:
+    def values(self, vector: Float[Array, " k"]) -> Float[Array, " k"]:
         """The chosen quantities at ``vector``, SI (means over the motors); differentiable."""
         p = self.apply(vector)
         known = {
@@ -123,12 +123,12 @@ class Unknowns(eqx.Module):
         }
         return jnp.stack([known[name] for name in self.names])
 
-    def scale(self, vector: Float[Array, "k"]) -> np.ndarray:
+    def scale(self, vector: Float[Array, " k"]) -> np.ndarray:
         """(k,) what one unit of a relative change is in SI: the value itself, or the unit of `OFFSETS`."""
         values = np.asarray(self.values(vector))
         return np.array([OFFSETS.get(name, value) for name, value in zip(self.names, values, strict=True)])
 
-    def slope(self, vector: Float[Array, "k"]) -> np.ndarray:
+    def slope(self, vector: Float[Array, " k"]) -> np.ndarray:
         """(k, k) derivative of the relative changes of the quantities by the vector."""
         return np.asarray(jax.jacfwd(self.values)(vector)) / self.scale(vector)[:, None]
 

@@ -90,7 +90,7 @@ def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, 
 
 
 @eqx.filter_jit
-def term_squares(model: Quadrotor, flight: Flight, driven: Array) -> Float[Array, "c"]:
+def term_squares(model: Quadrotor, flight: Flight, driven: Array) -> Float[Array, " c"]:
     """Mean squares of the signals of the formulas' library over a flight: body terms, then places."""
     _, seen = _seen(model, flight, driven)
     signals = jnp.stack([*body_signals(seen), *place_signals(seen)], axis=-1)
