@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs.bench_layouts import SteadyPoints, read_bench_table, recognises
+from cfb_mjx.logs.bench_layouts import SteadyPoints, joined, read_bench_table, recognises
 from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
 from cfb_mjx.logs.tabular import read_table
 from cfb_mjx.sysid.rotors.steady import fit_steady
@@ -90,7 +90,31 @@ def test_commands_under_the_name_of_rpm(tmp_path):
     ):
         read(tmp_path, {"rpm": np.linspace(5000, 65000, 80), "weight[g]": GRAMS})
     with pytest.raises(CfbError, match="has no rotor speed"):
-        read(tmp_path, {"pwm": 65535 * U, "thrust[g]": GRAMS})
+        read(tmp_path, {"pwm": 65535 * U, "torque": GRAMS})
+
+
+def test_thrust_and_speed_in_two_tables_are_joined_at_equal_commands(tmp_path):
+    """One has the scale, the other the speeds, some counted double; a command only one of them has is left out."""
+    levels = np.linspace(0.2, 0.9, 8)
+    speed = 350 + 2300 * levels
+    (thrust,), _ = read(
+        tmp_path,
+        {
+            "pwm": 65535 * np.tile([*levels, 0.97], 9)[:80],
+            "weight": 4e3 / 9.81 * KF * np.tile([*speed, 2600], 9)[:80] ** 2,
+        },
+    )
+    each = np.repeat(levels, 10)
+    readings = np.repeat(speed, 10)[:, None] * RNG.choice([1.0, 1.0, 2.0], (80, 4)) + RNG.normal(0, 3, (80, 4))
+    columns = {"pwm": 65535 * each, "vbat[V]": VOLT} | {f"rpm{i}": readings[:, i - 1] * RPM for i in (1, 2, 3, 4)}
+    (points,), _ = read(tmp_path, columns)
+    notes = []
+    table = joined(thrust, [points], None, notes)
+    assert np.allclose(table.force, KF * table.rotor_speed**2, rtol=0.01)
+    assert len(table.force) == 72  # the last level of every nine has no speed
+    assert "thrust of 4 rotors" in notes[0]
+    with pytest.raises(CfbError, match="give a table that has it at the same commands"):
+        joined(thrust, [], None, [])
 
 
 def test_a_unit_nobody_knows(tmp_path):

@@ -16,7 +16,7 @@ from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, require_folder, together, write_json
 from cfb_mjx.logs import read_log
-from cfb_mjx.logs.bench_layouts import Bench, SteadyPoints, read_bench_table, recognises
+from cfb_mjx.logs.bench_layouts import Bench, SteadyPoints, ThrustPoints, joined, read_bench_table, recognises
 from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
 from cfb_mjx.logs.tabular import read_table
 
@@ -132,7 +132,7 @@ def _read(paths: list[Path], rotors: int | None):
     Returns:
         Records of motors in time, maps, steady points, and notes on how they were read.
     """
-    records, tables, points, notes = [], [], [], []
+    records, tables, points, thrust, notes = [], [], [], [], []
     for path in paths:
         found = _bench(path, rotors)
         if found is None:
@@ -144,8 +144,9 @@ def _read(paths: list[Path], rotors: int | None):
             found = Bench([record], [])
         notes += found.notes
         for part in found.parts:
-            kind = tables if isinstance(part, MapTable) else points if isinstance(part, SteadyPoints) else records
-            kind.append(part)
+            kinds = {MapTable: tables, SteadyPoints: points, ThrustPoints: thrust}
+            kinds.get(type(part), records).append(part)
+    tables += [joined(part, points, rotors, notes) for part in thrust]
     return records, tables, points, notes
 
 

@@ -26,6 +26,8 @@ _DEAD = 0.5  # of the rows under command: with more zeros than that a sensor tel
 _STEP, _STEPS, _AFTER, _ANSWERED = 0.05, 3, 5, 0.05
 _APART = 0.1  # s: rows further apart than this are no recording of a motor, which answers in 0.05
 _BACK_ROWS = 5
+_SAME = 0.003  # of full: commands that are the same in two tables
+_AGREE = 0.4  # of the readings of a speed
 _SETTLED = 0.01  # of the speed over 0.1 s: faster changes are not steady
 
 
@@ -38,18 +40,40 @@ class SteadyPoints:
         command: (n,) in [0, 1].
         rotor_speed: (n,) rad/s.
         battery_voltage: (n,) V, or None.
+        readings: (n, k) rad/s of each of the k rotors that were read, NaN where one was not; None: one rotor's.
     """
 
     name: str
     command: np.ndarray
     rotor_speed: np.ndarray
     battery_voltage: np.ndarray | None
+    readings: np.ndarray | None = None
+
+    @property
+    def rotors(self) -> int:
+        """How many rotors' speeds stand in a row."""
+        return 1 if self.readings is None else self.readings.shape[1]
+
+
+@dataclass(frozen=True)
+class ThrustPoints:
+    """Commands and the thrust at them, without a speed: `joined` finds it in another table of the same bench.
+
+    Attributes:
+        path: of the file, for messages.
+        command: (n,) in [0, 1].
+        force: (n,) N, of all rotors on the scale.
+    """
+
+    path: Path
+    command: np.ndarray
+    force: np.ndarray
 
 
 class Bench(NamedTuple):
     """What one file holds, and what was done to read it."""
 
-    parts: list[MotorRecord | MapTable | SteadyPoints]
+    parts: list[MotorRecord | MapTable | SteadyPoints | ThrustPoints]
     notes: list[str]
 
 
@@ -86,9 +110,12 @@ def read_bench_table(table: Table, path: Path, rotors: int | None = None) -> Ben
     columns = in_si(table, path, notes)
     si, names = columns.values, columns.names
     if not any(re.fullmatch(r"omega[1-4]?", key) for key in si):
+        command = {key: v for key, v in si.items() if re.fullmatch(r"u[1-4]?", key)}
+        if command and "force" in si:
+            return Bench([_thrust_points(command, si["force"], path)], notes)
         raise CfbError(
-            f"{path}: has no rotor speed (a column rpm1..rpm4 or omega), and thrust against command alone tells "
-            "neither the motors nor the rotors; measure the speed too."
+            f"{path}: has no rotor speed (a column rpm1..rpm4 or omega) and no thrust at commands, which tells neither "
+            "motors nor rotors; measure the speed too."
         )
     si = _in_time(columns, path, notes)
     speeds = {key: si[key] for key in si if re.fullmatch(r"omega[1-4]?", key)}
@@ -119,7 +146,7 @@ def _refuse_commands_as_speed(speeds: dict[str, np.ndarray], names: dict[str, st
             raw = known / RPM
             hint = "multiply it by 2 pi / 60" if not names[key].lower().startswith("rpm") else "it is in another unit"
             if names[key].lower().startswith("rpm") and raw.max() <= 65535.5:
-                hint = "these look like 16-bit commands; name the column pwm, and measure the speed too"
+                hint = "these look like 16-bit commands; name the column pwm, and give a table with the speeds as well"
             raise CfbError(
                 f"{path}: column {names[key]} reaches {known.max():.0f} rad/s ({raw.max():.0f} rpm), which no rotor of "
                 f"this size turns; {hint}."
@@ -297,7 +324,61 @@ def _steady_points(speeds, command, voltage, path: Path) -> SteadyPoints:
     good = np.isfinite(omega) & np.isfinite(u) & (u > _LEAST_COMMAND)
     if voltage is not None:
         good &= np.isfinite(voltage) & (voltage > 0)
-    u, omega = u[good], omega[good]
+    u, omega, readings = u[good], omega[good], readings[good]
     if len(u):
         check_command(u, list(command), path)
-    return SteadyPoints(path.stem, u, omega, None if voltage is None else voltage[good])
+    return SteadyPoints(path.stem, u, omega, None if voltage is None else voltage[good], readings)
+
+
+def _thrust_points(command, force: np.ndarray, path: Path) -> ThrustPoints:
+    u = _mean(command)
+    good = np.isfinite(u) & np.isfinite(force) & (u > _LEAST_COMMAND)
+    if good.any():
+        check_command(u[good], list(command), path)
+    return ThrustPoints(path, u[good], force[good])
+
+
+def joined(thrust: ThrustPoints, steady: list[SteadyPoints], rotors: int | None, notes: list[str]) -> MapTable:
+    """Thrust against the speed that another table of the same bench has at the same command.
+
+    Args:
+        thrust: commands and forces.
+        steady: commands and speeds.
+        rotors: on the scale; None: as many as the other table has speeds in a row.
+        notes: told what was joined.
+
+    Raises:
+        CfbError: no other table has a speed at these commands.
+    """
+    each = [(s.command, s.rotor_speed[:, None] if s.readings is None else s.readings) for s in steady]
+    speed = np.array(
+        [
+            _typical(np.concatenate([np.zeros(0), *(x[np.abs(u - command) < _SAME].ravel() for u, x in each)]))
+            for command in thrust.command
+        ]
+    )
+    good = np.isfinite(speed)
+    if not good.any():
+        raise CfbError(
+            f"{thrust.path}: has no rotor speed (a column rpm1..rpm4 or omega), and thrust against command alone tells "
+            "neither motors nor rotors; measure the speed too, or give a table that has it at the same commands."
+        )
+    count = rotors or max(s.rotors for s in steady)
+    notes.append(
+        f"{thrust.path.name}: thrust of {count} rotor{'s' * (count > 1)} at {int(good.sum())} of {len(good)} commands "
+        f"at which {', '.join(s.name for s in steady)} has a speed that most readings agree on; both must be of one "
+        "supply."
+    )
+    table = Table({"omega": speed[good], "force": thrust.force[good] / count})
+    return from_columns(table, thrust.path)
+
+
+def _typical(readings: np.ndarray) -> float:
+    """What most readings agree on to 5 %; NaN where fewer than two in five do: a sensor that counts blades twice."""
+    x = np.sort(readings[readings > 0])
+    if not len(x):
+        return float("nan")
+    first, last = np.searchsorted(x, 0.95 * x), np.searchsorted(x, 1.05 * x, side="right")
+    best = int(np.argmax(last - first))
+    alike = x[first[best] : last[best]]
+    return float(np.median(alike)) if len(alike) >= _AGREE * len(x) else float("nan")
