@@ -154,6 +154,17 @@ def test_too_few_steady_points():
         fit_steady([one])
 
 
+def test_readings_that_are_counted_double_at_a_command_that_is_held(tmp_path):
+    """With half of the sensors wrong the median of a row is of no rotor."""
+    u = np.repeat([0.3, 0.6], 40)
+    speed = 350 + 613 * 3.7 * u
+    wrong = np.where(np.arange(80)[:, None] % 2 == 0, [2.0, 2.0, 1.0, 1.0], 1.0) * speed[:, None]
+    columns = {"pwm": 65535 * u, "vbat[V]": 3.7} | {f"rpm{i}": wrong[:, i - 1] * RPM for i in (1, 2, 3, 4)}
+    (points,), notes = read(tmp_path, columns)
+    assert np.allclose(points.rotor_speed, speed)
+    assert any("80 of 320 readings of speed are far from what most" in n for n in notes)
+
+
 def test_sensors_that_count_blades_twice(tmp_path):
     """A fifth of the settings read double: left out as outliers."""
     wrong = np.where(np.arange(80) % 5 == 0, 2.0, 1.0) * SPEED + RNG.normal(0, 5, 80)

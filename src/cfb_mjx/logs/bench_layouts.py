@@ -27,6 +27,8 @@ _STEP, _STEPS, _AFTER, _ANSWERED = 0.05, 3, 5, 0.05
 _APART = 0.1  # s: rows further apart than this are no recording of a motor, which answers in 0.05
 _BACK_ROWS = 5
 _SAME = 0.003  # of full: commands that are the same in two tables
+_REPEATED = 20  # rows at one command from which it can be said what most of them say
+_APART_AT_LEVEL = 0.15
 _AGREE = 0.4  # of the readings of a speed
 _SETTLED = 0.01  # of the speed over 0.1 s: faster changes are not steady
 
@@ -225,7 +227,7 @@ def _parts(
         parts.append(_command_before(record, notes))
         steady = _steady(si["t"], _mean(speeds))
     elif command:
-        parts.append(_steady_points(speeds, command, si.get("vbat"), path))
+        parts.append(_steady_points(speeds, command, si.get("vbat"), path, notes))
     force, torque = si.get("force"), si.get("torque")
     if force is not None and not (np.abs(force) > 0).any():
         notes.append(f"{path.name}: {names['force']} is 0 in every row, so the scale was not read; it was left out.")
@@ -314,10 +316,33 @@ def _steady(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
     return (time - time[0] > 0.1) & (change <= _SETTLED * np.abs(speed)) if len(time) > 1 else np.ones(1, bool)
 
 
-def _steady_points(speeds, command, voltage, path: Path) -> SteadyPoints:
-    """One point a row: the median of its rotors, which one that is counted double does not move."""
-    omega = np.full(len(next(iter(speeds.values()))), np.nan)
-    readings = np.stack(list(speeds.values()), axis=1)
+def _agreeing(readings: np.ndarray, u: np.ndarray, path: Path, notes: list[str]) -> np.ndarray:
+    """Readings that most others at the same command agree with; the rest become NaN.
+
+    Half of the sensors may count blades twice for a while, and the median of a row is then of no rotor.
+    """
+    kept = readings.copy()
+    for level in np.unique(u[np.isfinite(u)].round(4)):
+        rows = np.abs(u - level) < 1e-4
+        known = kept[rows]
+        if rows.sum() < _REPEATED or np.isnan(known).all():
+            continue
+        typical = _typical(known[np.isfinite(known)])
+        # A supply that sags moves the speed by some per cent within a level.
+        kept[rows] = np.where(np.abs(known - typical) < _APART_AT_LEVEL * typical, known, np.nan)
+    lost = int(np.isfinite(readings).sum() - np.isfinite(kept).sum())
+    if lost:
+        notes.append(
+            f"{path.name}: {lost} of {int(np.isfinite(readings).sum())} readings of speed are far from what most "
+            "at the same command say, and were left out."
+        )
+    return kept
+
+
+def _steady_points(speeds, command, voltage, path: Path, notes: list[str]) -> SteadyPoints:
+    """One point a row: the median of its rotors."""
+    readings = _agreeing(np.stack(list(speeds.values()), axis=1), _mean(command), path, notes)
+    omega = np.full(len(readings), np.nan)
     read = np.isfinite(readings).any(axis=1)
     omega[read] = np.nanmedian(readings[read], axis=1)
     u = _mean(command)
