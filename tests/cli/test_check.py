@@ -43,6 +43,7 @@ def test_check_says_what_recordings_hold_and_writes_a_page(folder, tmp_path, cap
     assert "1 of 3 recordings were refused" in err
     assert out.count("signals agree: displacement x y z") == 2
     assert "mirrored.csv: REFUSED" in out
+    assert out.count("rotors of a Crazyflie Brushless carry 44.0 g") == 2
     assert "--fix velocity-axes=x,-y,z" in out
     assert "good for: fit of J_x, J_y and motors" in out
     page = (tmp_path / "page" / "index.html").read_text()

@@ -13,9 +13,11 @@ from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, scratch, together, write_json, write_text
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.alignment import nominal_thrust
 from cfb_mjx.logs.gate import Verdict
 from cfb_mjx.logs.reading import read_judged
 
+_LIFTS, _ENOUGH = 4.0, 50  # m/s^2, rows
 _FAST, _SLOW = 240.0, 95.0  # rows per s: of 250 Hz and 100 Hz, with jitter
 
 
@@ -66,6 +68,7 @@ def _lines(one: Checked) -> list[str]:
         f"{len(log.gaps())} gaps",
         f"  measured: {', '.join(_measured(log))}",
         f"  {verdict.summary()}",
+        *(f"  {line}" for line in _carries(log)),
         *(f"  {line}" for line in said),
         f"  good for: {', '.join(good_for(log, verdict)) or 'a look'}",
         *(f"  next time: {line}" for line in next_time(log, verdict)),
@@ -82,6 +85,27 @@ def _measured(log: FlightLog) -> list[str]:
     if log.battery_voltage is not None:
         said.append(f"battery {log.battery_voltage.min():.2f} to {log.battery_voltage.max():.2f} V")
     return said
+
+
+def carried(log: FlightLog) -> float | None:
+    """kg that the measured rotor speeds carry in the median row, by the paper's thrust curve; None without speeds."""
+    if log.rotor_speed is None:
+        return None
+    known = np.isfinite(log.rotor_speed).all(axis=1) & (log.specific_force[:, 2] > _LIFTS)
+    if known.sum() < _ENOUGH:
+        return None
+    thrust = nominal_thrust(log.rotor_speed[known]).sum(axis=1)
+    return float(np.median(thrust / log.specific_force[known, 2]))
+
+
+def _carries(log: FlightLog) -> list[str]:
+    mass = carried(log)
+    if mass is None:
+        return []
+    return [
+        f"rotors of a Crazyflie Brushless carry {1e3 * mass:.1f} g at these speeds (the paper's curve): what the drone "
+        "weighs over that is its thrust scale"
+    ]
 
 
 def _moving(verdict: Verdict, name: str) -> set[str]:
@@ -143,6 +167,7 @@ def _json(one: Checked) -> dict:
         "measured": _measured(log),
         "warnings": list(log.metadata.get("warnings") or ()),
         "notes": list(log.metadata.get("notes") or ()),
+        "carried_mass_kg": carried(log),
         "checks": verdict.report(),
         "problem": verdict.problem,
         "good_for": good_for(log, verdict),
