@@ -169,7 +169,7 @@ def main() -> int:
         formats = samples(Path(name))
         for format, files in formats.items():
             originals = [(p.read_bytes(), read_log(p, **o), p, o) for p, o in files]
-            for k in range(round(arguments.n / len(formats))):
+            for k in range(-(-arguments.n // len(formats))):
                 data, truth, path, options = originals[k % len(originals)]
                 path.write_bytes(damaged(data, rng))
                 began = time.monotonic()

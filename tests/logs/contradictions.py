@@ -135,6 +135,9 @@ CONTRADICTIONS: dict[str, Contradiction] = {
     "quaternion scalar last": Contradiction(
         vector("quaternion", lambda q: q[:, [1, 2, 3, 0]]), ("quaternion=xyzw",), TURNING
     ),
+    "quaternion scalar first taken for last": Contradiction(
+        vector("quaternion", lambda q: q[:, [3, 0, 1, 2]]), ("quaternion=wxyz",), TURNING
+    ),
     "quaternion world to body": Contradiction(
         vector("quaternion", rotation.conjugate), ("quaternion=inverse",), TURNING
     ),

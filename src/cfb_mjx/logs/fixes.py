@@ -50,6 +50,10 @@ _QUATERNIONS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
         "reading the quaternion as scalar-last [x, y, z, w]; reorder the columns to [w, x, y, z]",
         lambda q: q[:, [3, 0, 1, 2]],
     ),
+    "wxyz": (
+        "reading the quaternion as scalar-first [w, x, y, z], which was taken for scalar-last",
+        lambda q: q[:, [1, 2, 3, 0]],
+    ),
     "inverse": (
         "inverting the quaternion, which is world to body; negate qx qy qz to get body to world",
         rotation.conjugate,
