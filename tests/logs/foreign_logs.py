@@ -372,16 +372,16 @@ def stamp(t, names=("sec", "nsec")):
     return dict(zip(names, divmod(now, 1_000_000_000), strict=True))
 
 
-def write_channels(path, channels, late=0.0):
+def write_channels(path, channels, late=0.0, described=True):
     """``channels``: topic to (schema name, encoding, description, payloads by time)."""
     from mcap.writer import Writer
 
     with open(path, "wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="a lab's recorder")
-        for topic, (name, encoding, described, payloads) in channels.items():
+        for topic, (name, encoding, schema_data, payloads) in channels.items():
             kind = "jsonschema" if encoding == "json" else "protobuf"
-            schema = writer.register_schema(name=name, encoding=kind, data=described)
+            schema = writer.register_schema(name=name, encoding=kind, data=schema_data) if described else 0
             channel = writer.register_channel(topic=topic, message_encoding=encoding, schema_id=schema)
             for t, data in payloads:
                 writer.add_message(channel, log_time=START + round((t + late) * 1e9), data=data, publish_time=0)

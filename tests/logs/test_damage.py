@@ -83,7 +83,7 @@ def test_a_bag_that_lost_a_chunk_is_noticed_against_its_own_statistics(bag):
     start, stop = chunks(data)[1]
     path.write_bytes(data[:start] + data[stop:])
     log = read_log(path, topics_yaml=topics)
-    assert any("that the bag's own statistics count are missing" in w for w in log.metadata["warnings"])
+    assert any("that the file's own statistics count are missing" in w for w in log.metadata["warnings"])
 
 
 @pytest.mark.parametrize("ours", [True, False])

@@ -126,3 +126,10 @@ def test_own_files_stay_own(flight, tmp_path):
     path = tmp_path / "own.mcap"
     write_mcap(flight, path)
     assert read_log(path).metadata["format"] == "mcap"
+
+
+def test_channels_without_a_schema(flight, tmp_path):
+    """``Channel(topic, message_encoding="json")`` of Foxglove's own library has none."""
+    path = tmp_path / "flight.mcap"
+    write_channels(path, json_channels(flight), described=False)
+    same(read_log(path), flight)

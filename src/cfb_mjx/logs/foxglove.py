@@ -7,11 +7,10 @@ firmware variables by their names wherever these stand; for names of one's own a
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +18,15 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
-from cfb_mjx.logs import mcap_schema
+from cfb_mjx.logs import mcap_schema, mcap_stream
 from cfb_mjx.logs.assembly import Import, assemble
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.proposal import UnknownNames, propose
 from cfb_mjx.logs.radio_csv import logged_names
-from cfb_mjx.logs.ros_bag import lacks_checksums
 from cfb_mjx.logs.streams import Stream, ordered
 from cfb_mjx.logs.tabular import Table
 from cfb_mjx.logs.variables import MissingNames, VariableMap, load_mapping
 
-_MAGIC = b"\x89MCAP0\r\n"
 _STAMP = re.compile(r"(?:.*\.)?(?:timestamp|stamp|time)\.(?P<part>n(?:ano)?(?:sec|s)\w*|sec\w*|secs)")
 # Where fields of common messages end, and what they are called in `configs/logs/crazyflie.yaml`.
 _KNOWN = (
@@ -46,7 +43,7 @@ _OVERTAKING = 0.1  # s by which messages may overtake each other on their way in
 def recognises(path: str | os.PathLike) -> bool:
     """Whether an MCAP holds JSON or protobuf messages of others; this library's own files are none."""
     data = read_bytes(path)
-    known = data[-(1 << 16) :] if data.endswith(_MAGIC) else data[: 1 << 16]
+    known = data[-(1 << 16) :] if data.endswith(mcap_stream.MAGIC) else data[: 1 << 16]
     return b"cfb_mjx." not in known and (b"json" in known or b"protobuf" in known)
 
 
@@ -70,7 +67,7 @@ def read_foxglove(path: str | os.PathLike, mapping: str | os.PathLike | Variable
     mapping = mapping if isinstance(mapping, VariableMap) else load_mapping(mapping)
     notes: list[str] = []
     warnings: list[str] = []
-    if lacks_checksums(read_bytes(path)):
+    if mcap_stream.lacks_checksums(read_bytes(path)):
         notes.append("the MCAP file has no checksums, so damage to values in it would go unnoticed.")
     streams = [ordered(s, path, notes, _OVERTAKING) for s in _streams(path, notes, warnings)]
     streams = _with_known_names(streams, mapping, path, guess=asked is None)
@@ -92,7 +89,8 @@ def _streams(path: Path, notes: list[str], warnings: list[str]) -> list[Stream]:
     """One stream per topic and set of fields, in s since the first message."""
     groups: dict[tuple[str, tuple[str, ...]], list[tuple[int, list[float]]]] = {}
     unstamped: set[str] = set()
-    for topic, logged, numbers in _messages(path, warnings):
+    for message in mcap_stream.messages(read_bytes(path), path, warnings, _decoder):
+        topic, logged, numbers = message.channel.topic, message.logged_ns, message.content
         stamp = _stamp(numbers)
         if stamp is None:
             unstamped.add(topic)
@@ -119,51 +117,21 @@ def _streams(path: Path, notes: list[str], warnings: list[str]) -> list[Stream]:
     return streams
 
 
-def _messages(path: Path, warnings: list[str]) -> Iterable[tuple[str, int, dict[str, float]]]:
-    """Topic, time of recording (ns) and numbers by name of every message that has any."""
-    from mcap.records import Channel, Message, Schema, Statistics
-    from mcap.stream_reader import StreamReader
-
-    data = read_bytes(path)
-    mcap_schema.refuse_bombs(data, path)
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    decoders: dict[int, Callable[[bytes], Any] | None] = {}
-    read = seen = 0
-    try:
-        for item in StreamReader(io.BytesIO(data), validate_crcs=True, record_size_limit=len(data)).records:
-            if isinstance(item, Schema):
-                schemas[item.id] = item
-            elif isinstance(item, Channel):
-                channels[item.id] = item
-                decoders[item.id] = _decoder(item, schemas.get(item.schema_id))
-            elif isinstance(item, Statistics) and item.message_count > seen:
-                warnings.append(
-                    f"{item.message_count - seen} of the {item.message_count} messages that the file's own statistics "
-                    "count are missing: a part of it was lost."
-                )
-            elif isinstance(item, Message):
-                seen += 1
-                if (decode := decoders[item.channel_id]) is None:
-                    continue
-                numbers: dict[str, float] = {}
-                _collect(decode(item.data), "", numbers)
-                read += 1
-                yield channels[item.channel_id].topic, item.log_time, numbers
-    except Exception as error:  # the MCAP library and decoders let errors of every kind of damaged bytes through
-        reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
-        kind = "cut short" if not data.endswith(_MAGIC) else "damaged"
-        if not read:
-            raise CfbError(f"{path}: the MCAP file is {kind} ({reason}); copy or record it again.") from None
-        warnings.append(f"the MCAP file is {kind} ({reason}); what follows in it was left out.")
-
-
-def _decoder(channel: Any, schema: Any) -> Callable[[bytes], Any] | None:
+def _decoder(channel: Any, schema: Any) -> Callable[[bytes], dict[str, float]] | None:
+    """Numbers by name of a channel's messages."""
     if channel.message_encoding == "json":
-        return json.loads
-    if channel.message_encoding == "protobuf" and schema is not None:
-        return mcap_schema.message_class(schema.name, schema.data).FromString
-    return None
+        parse = json.loads
+    elif channel.message_encoding == "protobuf" and schema is not None:
+        parse = mcap_schema.message_class(schema.name, schema.data).FromString
+    else:
+        return None
+
+    def decode(data: bytes) -> dict[str, float]:
+        numbers: dict[str, float] = {}
+        _collect(parse(data), "", numbers)
+        return numbers
+
+    return decode
 
 
 def _collect(value: Any, name: str, out: dict[str, float]) -> None:

@@ -14,8 +14,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
 from cfb_mjx.logs import mcap_schema
 from cfb_mjx.logs.flight_log import FlightLog, from_nanoseconds
+from cfb_mjx.logs.mcap_stream import MAGIC, refuse_bombs
 
-_MAGIC = b"\x89MCAP0\r\n"
 _STAMP = ("timestamp.seconds", "timestamp.nanos")
 _POSE_COLUMNS = tuple(f"pose.position.{c}" for c in "xyz") + tuple(f"pose.orientation.{c}" for c in "wxyz")
 
@@ -31,9 +31,9 @@ def read_mcap(path: str | os.PathLike) -> FlightLog:
     data = read_bytes(path)
     if not data:
         raise CfbError(f"{path}: the file is empty; export the log again.")
-    if not data.startswith(_MAGIC):
+    if not data.startswith(MAGIC):
         raise CfbError(f"{path}: this is not an MCAP file; give a log written by cfb_mjx or a table (parquet, csv).")
-    mcap_schema.refuse_bombs(data, path)
+    refuse_bombs(data, path)
     try:
         schemas, channels, payloads, record = _records(data)
     except Exception as error:  # the MCAP library lets struct, codec and lookup errors of damaged bytes through
@@ -71,7 +71,7 @@ def _records(data: bytes):
 
 
 def _diagnosis(data: bytes, error: Exception) -> str:
-    if not data.endswith(_MAGIC):
+    if not data.endswith(MAGIC):
         return "cut short (its closing bytes are missing)"
     if "crc" in str(error):
         return "damaged (a checksum does not match)"

@@ -7,10 +7,7 @@ The pose uses Foxglove's published message, field names and numbers as in https:
 from __future__ import annotations
 
 import functools
-from pathlib import Path
 from typing import NamedTuple
-
-from cfb_mjx.errors import CfbError
 
 METADATA_RECORD = "cfb_mjx.flight_log"
 FORMAT_VERSION = "1"
@@ -114,20 +111,3 @@ def message_class(name: str, descriptors: bytes):
     for file in descriptor_pb2.FileDescriptorSet.FromString(descriptors).file:
         pool.Add(file)
     return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
-
-
-_MAGIC = b"\x89MCAP0\r\n"
-_LARGEST_CHUNK = 1 << 29  # bytes; writers make chunks of about a megabyte
-
-
-def refuse_bombs(data: bytes, path: Path) -> None:
-    """Refuse a chunk (record type 6) that would unpack to more than any recording of a flight holds."""
-    position = len(_MAGIC)
-    while position + 9 <= len(data):
-        kind, length = data[position], int.from_bytes(data[position + 1 : position + 9], "little")
-        size = int.from_bytes(data[position + 25 : position + 33], "little")  # after two times
-        if kind == 6 and position + 33 <= len(data) and size > _LARGEST_CHUNK:
-            raise CfbError(
-                f"{path}: a chunk would unpack to {size >> 20} MiB, so the MCAP file is damaged; copy it again."
-            )
-        position += 9 + length

@@ -28,6 +28,7 @@ from cfb_mjx.logs.fixes import Fix, fix_of
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.flown import flown_part, without_spans
 from cfb_mjx.logs.gate import Verdict
+from cfb_mjx.logs.mcap_stream import MAGIC
 from cfb_mjx.logs.proposal import UnknownNames, lacking, propose
 from cfb_mjx.logs.validation import examine
 from cfb_mjx.logs.variables import MissingNames, load_mapping, mapping_of
@@ -202,7 +203,6 @@ def _table(path: Path) -> tabular.Table:
 
 _OWN_LAYOUT = 17  # of its columns that make a table one of the tabular layout
 _LISTED = 12  # names of a foreign table in a message
-_MCAP_MAGIC = b"\x89MCAP"
 
 
 def _detect(paths: list[Path], options: dict[str, Any], tables: dict[Path, tabular.Table]) -> str:
@@ -219,7 +219,7 @@ def _detect(paths: list[Path], options: dict[str, Any], tables: dict[Path, tabul
         return "crazyswarm"
     if head.startswith(usd_card.MAGIC):
         return "usd_card"
-    if head.startswith(_MCAP_MAGIC):
+    if head.startswith(MAGIC[:5]):
         if ros_bag.recognises(path):
             return "crazyswarm"
         return "foxglove" if foxglove.recognises(path) else "mcap"

@@ -7,7 +7,6 @@ read by the library `rosbags <https://gitlab.com/ternaris/rosbags>`_.
 
 from __future__ import annotations
 
-import io
 import os
 import re
 from pathlib import Path
@@ -15,13 +14,13 @@ from typing import Any, NamedTuple
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, scratch
-from cfb_mjx.logs.mcap_schema import refuse_bombs
+from cfb_mjx.logs import mcap_stream
+from cfb_mjx.logs.mcap_stream import MAGIC
 
 SQLITE, ROS1 = b"SQLite format 3\0", b"#ROSBAG V2.0"
 _LOG_DATA = "std_msgs/Header header\nuint32 timestamp\nfloat{}[] values\n"
 """Bags in sqlite3 do not describe their messages; this one is Crazyswarm2's own."""
 
-MAGIC = b"\x89MCAP0\r\n"
 GENERIC = "crazyflie_interfaces/LogDataGeneric"
 GENERIC_1 = "crazyflie_driver/GenericLogData"
 """Of Crazyswarm 1: without the firmware's time stamp."""
@@ -84,44 +83,28 @@ def read_messages(data: bytes, path: Path, warnings: list[str]) -> list[BagMessa
         CfbError: nothing could be read, or a message is encoded otherwise. What is lost after something could be read
             goes into ``warnings``.
     """
-    from mcap.records import Channel, Message, Schema, Statistics
-    from mcap.stream_reader import StreamReader
     from mcap_ros2.decoder import DecoderFactory
 
-    factory, schemas, channels, out, foreign = DecoderFactory(), {}, {}, [], set()
-    seen = 0
-    refuse_bombs(data, path)
-    try:
-        for item in StreamReader(io.BytesIO(data), validate_crcs=True, record_size_limit=len(data)).records:
-            if isinstance(item, Schema):
-                schemas[item.id] = item
-            elif isinstance(item, Channel):
-                channels[item.id] = item
-            elif isinstance(item, Statistics):
-                if item.message_count > seen:
-                    warnings.append(
-                        f"{item.message_count - seen} of the {item.message_count} messages that the bag's own "
-                        "statistics count are missing: a part of it was lost."
-                    )
-            elif isinstance(item, Message):
-                seen += 1
-                channel = channels[item.channel_id]
-                schema = schemas[channel.schema_id]
-                kind = schema.name.replace("/msg/", "/")
-                if kind not in VARIABLES or channel.topic.count("/") < 2:
-                    continue
-                decode = factory.decoder_for(channel.message_encoding, schema)
-                if decode is None:
-                    foreign.add(f"{channel.topic} ({channel.message_encoding}, {schema.encoding})")
-                    continue
-                single = re.search(rb"float32\[\]\s+values", schema.data) is not None
-                out.append(BagMessage(channel.topic, kind, item.log_time, decode(item.data), single))
-    except Exception as error:  # the MCAP library lets struct, codec and lookup errors of damaged bytes through
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        kind = "cut short" if not data.endswith(MAGIC) else "damaged"
-        if not out:
-            raise CfbError(f"{path}: the MCAP file is {kind} ({reason}); copy the bag again.") from None
-        warnings.append(f"the MCAP file is {kind} ({reason}); what follows in it was left out.")
+    factory, foreign = DecoderFactory(), set()
+
+    def decoder_of(channel, schema):
+        if schema is None or schema.name.replace("/msg/", "/") not in VARIABLES or channel.topic.count("/") < 2:
+            return None
+        decode = factory.decoder_for(channel.message_encoding, schema)
+        if decode is None:
+            foreign.add(f"{channel.topic} ({channel.message_encoding}, {schema.encoding})")
+        return decode
+
+    out = [
+        BagMessage(
+            m.channel.topic,
+            m.schema.name.replace("/msg/", "/"),
+            m.logged_ns,
+            m.content,
+            re.search(rb"float32\[\]\s+values", m.schema.data) is not None,
+        )
+        for m in mcap_stream.messages(data, path, warnings, decoder_of)
+    ]
     if foreign:
         raise CfbError(
             f"{path}: {', '.join(sorted(foreign))} is not encoded as CDR with ros2msg descriptions, which is what this "
@@ -149,7 +132,7 @@ def read_bag(path: Path, warnings: list[str]) -> Bag:
     head = read_bytes(path, 16)
     if head.startswith(MAGIC):
         data = read_bytes(path)
-        return Bag(read_messages(data, path, warnings), "a ROS 2 bag (MCAP)", not lacks_checksums(data))
+        return Bag(read_messages(data, path, warnings), "a ROS 2 bag (MCAP)", not mcap_stream.lacks_checksums(data))
     if head.startswith(SQLITE):
         return Bag(_by_rosbags(path, ".db3", warnings), "a ROS 2 bag in sqlite3 storage", False)
     if head.startswith(ROS1):
@@ -207,15 +190,3 @@ def _by_rosbags(path: Path, suffix: str, warnings: list[str]) -> list[BagMessage
             raise CfbError(f"{path}: this {what} cannot be read ({reason}); copy it again.") from None
         warnings.append(f"the bag is damaged or cut short ({reason}); what follows in it was left out.")
     return out
-
-
-def lacks_checksums(data: bytes) -> bool:
-    """Whether a chunk (record type 6) was written without the CRC of its content, or messages (5) outside chunks."""
-    position = len(MAGIC)
-    while position + 9 <= len(data):
-        kind, length = data[position], int.from_bytes(data[position + 1 : position + 9], "little")
-        crc = position + 9 + 24  # after two times and the uncompressed size
-        if kind == 5 or (kind == 6 and not any(data[crc : crc + 4])):
-            return True
-        position += 9 + length
-    return False
