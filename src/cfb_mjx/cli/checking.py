@@ -65,7 +65,7 @@ def _lines(one: Checked) -> list[str]:
     return [
         f"{one.path}: {log.metadata['format']}, {len(log)} rows, {log.duration:.1f} s at "
         f"{1 / log.nominal_interval:.0f} Hz, "
-        f"{len(log.gaps())} gaps",
+        f"{len(log.gaps())} gap{'s' * (len(log.gaps()) != 1)}",
         f"  measured: {', '.join(_measured(log))}",
         f"  {verdict.summary()}",
         *(f"  {line}" for line in _carries(log)),
