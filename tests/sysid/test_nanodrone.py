@@ -270,6 +270,28 @@ def folder(tmp_path) -> Path:
     return tmp_path / "flights"
 
 
+def test_processed_files_count_row_by_row(folder, tmp_path, capsys, monkeypatch):
+    """As the benchmark's own evaluation takes them: the ground too, copies that were held too."""
+    monkeypatch.setattr("cfb_mjx.cli.nanodrone.configure_jax", lambda x64: None)
+    out = tmp_path / "result.json"
+    assert main(["benchmark-nanodrone", str(folder), "--official"]) == 2
+    assert "is a raw merge of the benchmark" in capsys.readouterr().err
+    table = pq.read_table(folder / "made.parquet")
+    held = {name: table[name].to_numpy().copy() for name in table.column_names}
+    for name in ("x", "y", "z", *idsia.STAMPS):
+        held[name][100:110] = held[name][100]
+    pq.write_table(pa.table(held | {"rx": np.zeros(338)}), folder / "made.parquet")
+    assert main(["benchmark-nanodrone", str(folder), "--official", "--stride", "7", "--json", str(out)]) == 0
+    found = json.loads(out.read_text())
+    start = np.arange(0, 338 - 50, 7)
+    assert found["windows"] == len(start)
+    position = np.stack([held[axis] for axis in "xyz"], axis=1)
+    ahead = position[start[:, None] + np.arange(1, 51)] - position[start][:, None]
+    expected = np.linalg.norm(ahead, axis=2).mean(axis=0).sum()
+    assert found["rows"]["naive"]["position_sum_m"] == pytest.approx(expected, rel=1e-9)
+    assert found["official"] is True
+
+
 def test_the_command_writes_its_table_and_json(folder, tmp_path, capsys, monkeypatch):
     # The session's own settings of jax stay: others would compile every program anew.
     monkeypatch.setattr("cfb_mjx.cli.nanodrone.configure_jax", lambda x64: None)

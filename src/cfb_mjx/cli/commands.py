@@ -55,6 +55,7 @@ def benchmark_nanodrone(
     model: str = "cfb-idsia-predictor",
     json: File = None,
     stride: int = 1,
+    official: bool = False,
 ) -> None:
     """Judge a model by the rules of the IDSIA nano-drone benchmark, beside the published results.
 
@@ -62,15 +63,17 @@ def benchmark_nanodrone(
     cfb-idsia, the plant fitted to flights of that drone, stands beside the model.
 
     Args:
-        folder: holds the flights, raw 100 Hz merges (parquet or csv).
+        folder: holds the flights, raw 100 Hz merges or processed files (parquet or csv).
         model: preset or model YAML; judged alone and with a disturbance observer. The default was fitted to flights of
             the benchmark's drone, none of them its test flights.
         json: write the results here.
         stride: rows from one prediction's start to the next.
+        official: the folder holds the benchmark's processed files (data/real/processed): every row counts as it is, as
+            in the benchmark's own evaluation, and the published rows are comparable. Raw merges are cleaned otherwise.
     """
     from cfb_mjx.cli.nanodrone import run_nanodrone
 
-    run_nanodrone(folder, model, json, stride)
+    run_nanodrone(folder, model, json, stride, official)
 
 
 def bench(

@@ -8,6 +8,7 @@ from cfb_mjx.cli.runtime import Progress, configure_jax, environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json
 from cfb_mjx.logs import read_log
+from cfb_mjx.logs.idsia import read_as_published
 
 DECLARED = "cfb-guards"
 PLANT = "cfb-idsia"
@@ -15,7 +16,7 @@ PLANT = "cfb-idsia"
 _ENDINGS = (".parquet", ".csv")
 
 
-def run_nanodrone(folder: Path, model: str, json: Path | None, stride: int) -> None:
+def run_nanodrone(folder: Path, model: str, json: Path | None, stride: int, official: bool = False) -> None:
     """Run the benchmark, print its table, write the results.
 
     Raises:
@@ -29,7 +30,7 @@ def run_nanodrone(folder: Path, model: str, json: Path | None, stride: int) -> N
     paths = sorted(path for path in folder.iterdir() if path.suffix in _ENDINGS)
     if not paths:
         raise CfbError(f"{folder}: holds no .parquet or .csv file; name a folder with the benchmark's flights.")
-    logs = [read_log(path, "idsia") for path in paths]
+    logs = [read_as_published(path) if official else read_log(path, "idsia") for path in paths]
     if len({log.name for log in logs}) < len(logs):
         raise CfbError(f"{folder}: two flights have one name; keep each flight as parquet or as csv.")
     configure_jax(x64=True)
@@ -53,6 +54,7 @@ def run_nanodrone(folder: Path, model: str, json: Path | None, stride: int) -> N
         "published": published,
         "steps": STEPS,
         "stride": stride,
+        "official": official,
         "model": model,
         "environment": environment(),
     }

@@ -33,6 +33,9 @@ ERPM = tuple(f"m{i}_erpm" for i in range(1, 5))
 STAMPS = ("ros_timestamp_x", "ros_timestamp_y", "ros_timestamp")  # state, motor and accelerometer packets
 COLUMNS = ("t", *POSITION, *VELOCITY, *QUATERNION, *GYRO, *ACCELERATION, *COMMAND, *ERPM, *STAMPS, "Vbat")
 
+PROCESSED = ("m1_rads", "rx")
+"""Columns that only the benchmark's processed files have: rotor speeds and a rotation vector."""
+
 VEHICLE_MASS = 0.045  # kg, with both decks (the benchmark's description)
 RAD_PER_S_PER_ERPM = 2.0 * np.pi / 60.0 / 6.0  # 12 poles: 6 electrical turns per mechanical one
 ERPM_LIMIT, ERPM_INVALID = 1.75e5, 65535.0
@@ -71,8 +74,36 @@ def read_idsia(path: str | os.PathLike, motor_shift: float | None = None) -> Fli
     return from_columns(read_table(path), path, motor_shift)
 
 
+def read_as_published(path: str | os.PathLike) -> FlightLog:
+    """A flight as the benchmark's own evaluation takes it: every row as it is, nothing cut, shifted or left out.
+
+    Args:
+        path: one of the benchmark's processed files (``data/real/processed``), parquet or csv.
+
+    Raises:
+        CfbError: unreadable file, missing columns, or a raw merge, which nobody has processed.
+    """
+    path = Path(path)
+    table = read_table(path)
+    if not any(name in table for name in PROCESSED):
+        raise CfbError(
+            f"{path}: is a raw merge of the benchmark, which its own evaluation does not take as it is; give a file of "
+            "data/real/processed, or leave out --official."
+        )
+    log, _ = _as_logged(table, path)
+    alignment_of = {"applied": False, "applied_ms": 0.0, "chosen_by": "benchmark"}
+    return log.replace(time=quantise_time(log.time - log.time[0]), metadata={"alignment": alignment_of})
+
+
 def from_columns(table: Table, path: Path, motor_shift: float | None = None) -> FlightLog:
     """`read_idsia` on columns already in memory."""
+    log, table = _as_logged(table, path)
+    held = np.stack([np.concatenate([[False], np.diff(table[c]) <= 0]) for c in STAMPS], axis=1)
+    return _clean(log, held, path, motor_shift)
+
+
+def _as_logged(table: Table, path: Path) -> tuple[FlightLog, Table]:
+    """Every row in this library's conventions, and the table with the packets' stamps under the names of `STAMPS`."""
     if "ros_timestamp_motors" in table and "ros_timestamp_x" not in table:
         table = Table(
             {_STAMPS_OF_CSV.get(name, name): values for name, values in table.items()}, table.notes, table.warnings
@@ -120,8 +151,7 @@ def from_columns(table: Table, path: Path, motor_shift: float | None = None) -> 
             "vehicle_mass": VEHICLE_MASS,
         },
     )
-    held = np.stack([np.concatenate([[False], np.diff(table[c]) <= 0]) for c in STAMPS], axis=1)
-    return _clean(log, held, path, motor_shift)
+    return log, table
 
 
 def _clean(log: FlightLog, held: np.ndarray, path: Path, motor_shift: float | None) -> FlightLog:
