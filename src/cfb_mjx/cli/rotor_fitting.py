@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import asdict, replace
 from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,9 +16,10 @@ from cfb_mjx.cli.runtime import Progress, configure_jax, environment
 from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, require_folder, together, write_json
-from cfb_mjx.logs import read_log
+from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.logs.bench_layouts import Bench, SteadyPoints, ThrustPoints, joined, read_bench_table, recognises
 from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
+from cfb_mjx.logs.flown import flown_part
 from cfb_mjx.logs.tabular import read_table
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from cfb_mjx.sysid.rotors.motors import MotorFit
     from cfb_mjx.sysid.rotors.rotor_maps import MapFit
     from cfb_mjx.sysid.rotors.steady import SteadyFit
+    from cfb_mjx.sysid.rotors.thrust_in_flight import ThrustInFlight
 
 _FILE_NAMES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
 _COLUMN = {"thrust": "force", "torque": "torque"}
@@ -59,7 +62,7 @@ def run_fit_rotors(
         from cfb_mjx.view.style import check_path
 
         check_path(figure)
-    records, tables, points, notes = _read(paths, rotors)
+    records, tables, points, flights, notes = _read(paths, rotors)
     configure_jax(x64=True)
     from cfb_mjx.parameters import save_model_file
 
@@ -77,6 +80,7 @@ def run_fit_rotors(
     elif points:
         notes.append("steady points were not used: command steps tell gain and offset too, and the lag.")
     maps = _fit_maps(tables, base, per_motor, robust, tared)
+    pulls = _in_flight(flights, base)
     corrected, written = _corrected(base, motors, steady, maps, output, paths)
     if not written:
         reasons = "; ".join(motors.common.unidentifiable.values()) if motors else ""
@@ -84,13 +88,20 @@ def run_fit_rotors(
     with together():
         save_model_file(corrected, output)
         if json is not None:
-            write_json(json, _json(motors, steady, maps, base, written))
+            flown = {} if pulls is None else {"thrust_in_flight": asdict(pulls)}
+            write_json(json, _json(motors, steady, maps, base, written) | flown)
         if figure is not None:
             from cfb_mjx.sysid.rotors.motor_replay import replay
             from cfb_mjx.view.rotors import rotor_figure
 
             rotor_figure(replay(motors) if motors else [], maps, figure, output.stem)
     _print(motors, steady, maps, base, {name for name, on in extras.items() if on})
+    if pulls is not None:
+        print(
+            f"thrust in flight: {pulls.ratio:.3f} +- {pulls.ratio_std:.3f} times the curve of {base.name} at the same "
+            f"rotor speeds, by the specific force of {1e3 * pulls.mass:.1f} g (not written: cfb refine takes "
+            "thrust_scale from predictions)"
+        )
     for note in notes:
         print(note)
     print(f"model: {output} ({', '.join(written)})")
@@ -130,24 +141,36 @@ def _read(paths: list[Path], rotors: int | None):
     """Every file by its content: bench tables by their columns, all else as a flight.
 
     Returns:
-        Records of motors in time, maps, steady points, and notes on how they were read.
+        Records of motors in time, maps, steady points, flights, and notes on how they were read.
     """
-    records, tables, points, thrust, notes = [], [], [], [], []
+    records, tables, points, thrust, flights, notes = [], [], [], [], [], []
     for path in paths:
         found = _bench(path, rotors)
         if found is None:
             from cfb_mjx.sysid.rotors.motor_tracks import record_of
 
-            record = record_of(read_log(path, keep_ground=True))
+            log = read_log(path, keep_ground=True)
+            record = record_of(log)
             if record is None:
                 raise CfbError(f"{path}: holds no rotor speeds; log them, or leave this flight out.")
             found = Bench([record], [])
+            flights.append(log)
         notes += found.notes
         for part in found.parts:
             kinds = {MapTable: tables, SteadyPoints: points, ThrustPoints: thrust}
             kinds.get(type(part), records).append(part)
     tables += [joined(part, points, rotors, notes) for part in thrust]
-    return records, tables, points, notes
+    return records, tables, points, flights, notes
+
+
+def _in_flight(logs: list[FlightLog], base: ModelFile) -> ThrustInFlight | None:
+    from cfb_mjx.sysid.rotors.thrust_in_flight import thrust_in_flight
+
+    flown = []
+    for log in logs:
+        with suppress(CfbError):  # motors on the ground are a recording of motors all the same
+            flown.append(flown_part(log, Path(log.name)))
+    return thrust_in_flight(flown, base.parameters())
 
 
 def _bench(path: Path, rotors: int | None) -> Bench | None:
