@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from cfb_mjx.cli import refining
+from cfb_mjx.cli import main, refining
 from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.logs import read_log
 from cfb_mjx.model.effects import Inertia, RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file
+from cfb_mjx.sysid.refinement import plausible_numbers
 from cfb_mjx.sysid.sensor_faults import HEALTHY
 from cfb_mjx.sysid.tracing.given import Given
 
@@ -48,6 +49,21 @@ def test_a_number_that_ends_at_its_bound_says_so(monkeypatch):
 
     assert found(0.0)
     assert not found(0.01)
+
+
+def test_all_that_a_drone_usually_lacks(monkeypatch, tmp_path):
+    asked = []
+
+    def fit(base, logs, names, **_):
+        asked.extend(names)
+        return base, {"numbers": {}, "loss": {"before": 2.0, "after": 1.0}}
+
+    monkeypatch.setattr("cfb_mjx.cli.refining.by_predictions", fit)
+    monkeypatch.setattr("cfb_mjx.cli.refining.configure_jax", lambda x64: None)
+    assert main(["refine", str(LOG), "--effects", "plant", "-o", str(tmp_path / "m.yaml")]) == 0
+    assert {"blade_flapping", "thrust_scale", "inertia", "battery_sag"} <= set(asked)
+    assert not {"payload", "payload_swing", "wind", "gust"} & set(asked)
+    assert plausible_numbers(load_model_file("cfb-guards").parameters(), asked)
 
 
 def test_effects_that_are_not_fitted_anew_keep_what_is_known_of_them(monkeypatch):

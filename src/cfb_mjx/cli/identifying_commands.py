@@ -245,7 +245,8 @@ def refine(
     Args:
         logs: flight logs to fit.
         output: model YAML to write.
-        effects: names, comma separated (docs/effects.md); by default those the model has.
+        effects: names, comma separated (docs/effects.md), or plant: all that a drone in one piece usually lacks. By
+            default those the model has.
         held_out: other flights, to be judged on.
         model: preset or model YAML to start from.
         set: parameters to change, for instance mass=0.045.

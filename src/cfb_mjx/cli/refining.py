@@ -51,6 +51,7 @@ def run_refine(
     configure_jax(x64=True)
     from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS
     from cfb_mjx.parameters import save_model_file
+    from cfb_mjx.sysid.refinement.numbers import PLANT
     from cfb_mjx.sysid.sensor_faults import SensorFaults
 
     base = changed_model(model, changes)
@@ -58,9 +59,15 @@ def run_refine(
         known = SensorFaults.from_mappings(base.effects, f"model {base.name}").as_logged.to_mappings()
         physics = (e for e in base.effects if e["name"] not in SENSOR_FAULTS)
         base = replace(base, effects=(*physics, *known))
-    names = effects.split(",") if effects else [e["name"] for e in base.effects if e["name"] in CATALOGUE]
+    if effects == "plant":
+        names = list(PLANT)
+    else:
+        names = effects.split(",") if effects else [e["name"] for e in base.effects if e["name"] in CATALOGUE]
     if not names:
-        raise CfbError(f"model {base.name} has no effects; name some to fit, for instance --effects rotor_drag.")
+        raise CfbError(
+            f"model {base.name} has no effects; name some to fit, for instance --effects rotor_drag, or all a drone "
+            "usually lacks with --effects plant."
+        )
     innovations = estimator == "innovations"
     fit = by_innovations if innovations else by_predictions
     extra = {"as_logged": as_logged} if innovations else {"predictor": predictor, "weights": shares}

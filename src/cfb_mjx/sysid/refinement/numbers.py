@@ -15,6 +15,12 @@ from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import KNOWN, Effect, RegressionDilution
 from cfb_mjx.parameters import Parameters
 
+PLANT = (
+    *("blade_flapping", "inflow_thrust", "rotor_drag", "thrust_scale", "inertia", "cog_offset", "torque_scale"),
+    *("thrust_tilt", "position_moment", "command_delay", "motor_asymmetry", "battery_sag"),
+)
+"""What a drone in one piece lacks beside the paper's model, all at once: one by one none of them predicts better.
+Loads, wind and what only some drones have are for where there is a reason."""
 INERTIA = 0.25
 """Largest plausible change of a moment of inertia, as a share: what decks and another battery bring about."""
 RATE_DAMPING = 2.0
