@@ -12,7 +12,7 @@ import pytest
 from cfb_mjx.errors import CfbError
 from cfb_mjx.labelled_plants import EFFECTS, Case, fly_campaigns
 from cfb_mjx.labelled_plants.effects import put
-from cfb_mjx.logs import read_log
+from cfb_mjx.logs import read_log, resample
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import Inertia, RotorDrag, Wind
 from cfb_mjx.parameters import load_model_file
@@ -127,6 +127,19 @@ def test_the_gradient_is_that_of_the_loss(campaign):
     turn[1, 0] = 1e-5 * TRIM
     slope = (loss(values, trims + turn) - loss(values, trims - turn)) / 2e-5
     assert normal.gradient[len(numbers) + 3] == pytest.approx(slope, rel=1e-4)
+
+
+def test_flights_logged_at_several_rates_are_fitted_together():
+    """The same flight at 250 and at 500 Hz: each costs what it costs by itself."""
+    log = read_log(DRAG).slice(0.0, 5.0)
+    fast = resample(log, 500.0).replace(metadata={"name": "fast"})
+    model = _prepared(Quadrotor(GUARDS()), plausible_numbers(GUARDS(), ("rotor_drag",)))
+    cost = {}
+    for name, logs in (("slow", [log]), ("fast", [fast]), ("both", [log, fast])):
+        data = Predictions.of(model, logs, np.ones(len(logs)))
+        cost[name] = data.cost(model, np.zeros((len(logs), 3)))
+    assert cost["slow"] == pytest.approx(cost["fast"], rel=0.02)
+    assert cost["both"] == pytest.approx((cost["slow"] + cost["fast"]) / 2, rel=0.01)
 
 
 def test_numbers_stay_within_their_bounds(campaign):

@@ -188,11 +188,13 @@ class Predictions:
 def _part(flights: list[tuple], share: np.ndarray, measured: bool) -> _Part | None:
     """Windows of one kind; None if no flight has any."""
     parts, owner = [], []
+    # Logged at several rates, or with a gap, flights have windows of several lengths.
+    steps = max((windows.step.shape[1] for windows, *_ in flights if len(windows)), default=0)
     for i, (windows, start, memory) in enumerate(flights):
         if not len(windows) or (measured and not _has_rotor_speed(windows)):
             continue
         whole = np.isfinite(windows.rotor_speed).all(axis=(1, 2)) if measured else np.ones(len(windows), dtype=bool)
-        inputs = _inputs(windows, start, memory, measured)
+        inputs = _inputs(windows, start, memory, measured, steps)
         parts.append(jax.tree.map(lambda x, keep=whole: np.asarray(x)[keep], inputs))
         owner.append(np.full(whole.sum(), i))
     flight = np.concatenate(owner) if owner else np.zeros(0, dtype=int)
@@ -213,8 +215,9 @@ def _has_rotor_speed(windows: Windows) -> bool:
     return windows.rotor_speed.size > 0 and bool(np.isfinite(windows.rotor_speed).mean() > MEASURED_SHARE)
 
 
-def _inputs(windows: Windows, start: np.ndarray, memory: tuple, measured: bool) -> dict[str, Any]:
-    pad = _STEPS * -(-windows.step.shape[1] // _STEPS) - windows.step.shape[1]
+def _inputs(windows: Windows, start: np.ndarray, memory: tuple, measured: bool, steps: int) -> dict[str, Any]:
+    """What is predicted from, every window with as many steps as the longest needs, in whole `_STEPS`."""
+    pad = _STEPS * -(-steps // _STEPS) - windows.step.shape[1]
     fed = windows.rotor_speed[:, 1:] if measured else windows.command
     state = (windows.position, windows.velocity, windows.quaternion, windows.body_rate)
     return {
