@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs.bench_layouts import SteadyPoints, joined, read_bench_table, recognises
+from cfb_mjx.logs.bench_layouts import read_bench_table, recognises
+from cfb_mjx.logs.bench_points import SteadyPoints, joined
 from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
 from cfb_mjx.logs.tabular import read_table
 from cfb_mjx.sysid.rotors.steady import fit_steady

@@ -17,7 +17,8 @@ from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, require_folder, together, write_json
 from cfb_mjx.logs import FlightLog, read_log
-from cfb_mjx.logs.bench_layouts import Bench, SteadyPoints, ThrustPoints, joined, read_bench_table, recognises
+from cfb_mjx.logs.bench_layouts import Bench, read_bench_table, recognises
+from cfb_mjx.logs.bench_points import SteadyPoints, ThrustPoints, joined
 from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
 from cfb_mjx.logs.flown import flown_part
 from cfb_mjx.logs.tabular import read_table
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
 _FILE_NAMES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
 _COLUMN = {"thrust": "force", "torque": "torque"}
 _FOUR_LEAST = 2.5
-_VARIES = 0.05  # V of spread from which a voltage can be told
 _LIMIT = "the model file has one time constant per motor and no dead time"
 
 
@@ -116,13 +116,14 @@ def _fit_motors(
     """Motors from commands, or from commands times voltage where a bench measured that and it is likelier."""
     from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE
     from cfb_mjx.sysid.rotors.motors import fit_motors
+    from cfb_mjx.sysid.rotors.steady import VARIES
 
     def fitted(used: list[MotorRecord], said: str) -> MotorFit:
         return fit_motors(used, base.parameters(), **extras, per_motor=per_motor, progress=Progress(said))
 
     plain = fitted(records, "fitting motors")
     voltages = [r.battery_voltage for r in records]
-    if any(v is None or not np.isfinite(v).all() for v in voltages) or np.std(np.concatenate(voltages)) < _VARIES:
+    if any(v is None or not np.isfinite(v).all() for v in voltages) or np.std(np.concatenate(voltages)) < VARIES:
         return plain
     scaled = [replace(r, command=r.command * r.battery_voltage[:, None] / NOMINAL_VOLTAGE) for r in records]
     followed = fitted(scaled, "fitting motors to command times voltage")

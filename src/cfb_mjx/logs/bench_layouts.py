@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,59 +16,16 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.bench_columns import RPM, Columns, in_si, keys_of
-from cfb_mjx.logs.bench_tables import FORCE_LIMIT, SPEED_LIMIT, MapTable, MotorRecord, check_command, from_columns
+from cfb_mjx.logs.bench_points import LEAST_COMMAND, SteadyPoints, ThrustPoints, mean_of, steady_points, thrust_points
+from cfb_mjx.logs.bench_tables import FORCE_LIMIT, SPEED_LIMIT, MapTable, MotorRecord, from_columns
 from cfb_mjx.logs.bench_tables import recognises as standard
 from cfb_mjx.logs.tabular import Table
 
-_LEAST_COMMAND = 0.05
 _DEAD = 0.5  # of the rows under command: with more zeros than that a sensor tells nothing
 _STEP, _STEPS, _AFTER, _ANSWERED = 0.05, 3, 5, 0.05
 _APART = 0.1  # s: rows further apart than this are no recording of a motor, which answers in 0.05
 _BACK_ROWS = 5
-_SAME = 0.003  # of full: commands that are the same in two tables
-_REPEATED = 20  # rows at one command from which it can be said what most of them say
-_APART_AT_LEVEL = 0.15
-_AGREE = 0.4  # of the readings of a speed
 _SETTLED = 0.01  # of the speed over 0.1 s: faster changes are not steady
-
-
-@dataclass(frozen=True)
-class SteadyPoints:
-    """Commands and the speeds the rotors settle at, without time.
-
-    Attributes:
-        name: file name without its ending.
-        command: (n,) in [0, 1].
-        rotor_speed: (n,) rad/s.
-        battery_voltage: (n,) V, or None.
-        readings: (n, k) rad/s of each of the k rotors that were read, NaN where one was not; None: one rotor's.
-    """
-
-    name: str
-    command: np.ndarray
-    rotor_speed: np.ndarray
-    battery_voltage: np.ndarray | None
-    readings: np.ndarray | None = None
-
-    @property
-    def rotors(self) -> int:
-        """How many rotors' speeds stand in a row."""
-        return 1 if self.readings is None else self.readings.shape[1]
-
-
-@dataclass(frozen=True)
-class ThrustPoints:
-    """Commands and the thrust at them, without a speed: `joined` finds it in another table of the same bench.
-
-    Attributes:
-        path: of the file, for messages.
-        command: (n,) in [0, 1].
-        force: (n,) N, of all rotors on the scale.
-    """
-
-    path: Path
-    command: np.ndarray
-    force: np.ndarray
 
 
 class Bench(NamedTuple):
@@ -114,7 +70,7 @@ def read_bench_table(table: Table, path: Path, rotors: int | None = None) -> Ben
     if not any(re.fullmatch(r"omega[1-4]?", key) for key in si):
         command = {key: v for key, v in si.items() if re.fullmatch(r"u[1-4]?", key)}
         if command and "force" in si:
-            return Bench([_thrust_points(command, si["force"], path)], notes)
+            return Bench([thrust_points(command, si["force"], path)], notes)
         raise CfbError(
             f"{path}: has no rotor speed (a column rpm1..rpm4 or omega) and no thrust at commands, which tells neither "
             "motors nor rotors; measure the speed too."
@@ -188,7 +144,7 @@ def _filled(si: dict[str, np.ndarray], path: Path, notes: list[str]) -> dict[str
 
 def _living(speeds, command, names, path: Path, notes: list[str]) -> dict[str, np.ndarray]:
     """The speeds of sensors that read something; single zeros under command become NaN."""
-    on = _mean(command) > 2 * _LEAST_COMMAND if command else _mean(speeds) > 100.0
+    on = mean_of(command) > 2 * LEAST_COMMAND if command else mean_of(speeds) > 100.0
     living = {}
     for key, values in speeds.items():
         lost = (values == 0) & on
@@ -206,13 +162,6 @@ def _living(speeds, command, names, path: Path, notes: list[str]) -> dict[str, n
     return living
 
 
-def _mean(columns: dict[str, np.ndarray]) -> np.ndarray:
-    """Of the readings in a row; NaN where there is none."""
-    values = np.stack(list(columns.values()), axis=1)
-    count = np.isfinite(values).sum(axis=1)
-    return np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
-
-
 def _parts(
     si, speeds, command, path: Path, rotors, columns: Columns, notes
 ) -> list[MotorRecord | MapTable | SteadyPoints]:
@@ -225,9 +174,9 @@ def _parts(
         table |= {k: np.clip(v, 0, None) for k, v in command.items()}
         record = dataclasses.replace(from_columns(Table(table), path), battery_voltage=si.get("vbat"))
         parts.append(_command_before(record, notes))
-        steady = _steady(si["t"], _mean(speeds))
+        steady = _steady(si["t"], mean_of(speeds))
     elif command:
-        parts.append(_steady_points(speeds, command, si.get("vbat"), path, notes))
+        parts.append(steady_points(speeds, command, si.get("vbat"), path, notes))
     force, torque = si.get("force"), si.get("torque")
     if force is not None and not (np.abs(force) > 0).any():
         notes.append(f"{path.name}: {names['force']} is 0 in every row, so the scale was not read; it was left out.")
@@ -236,12 +185,12 @@ def _parts(
         return parts
     count = rotors or (4 if len(si.keys() & {f"omega{i}" for i in range(1, 5)}) > 1 else 1)
     # With thrust as the square of the speed, the root of the mean square is what carries the mean thrust.
-    speed = np.sqrt(_mean({key: values**2 for key, values in speeds.items()}))
+    speed = np.sqrt(mean_of({key: values**2 for key, values in speeds.items()}))
     good = steady & np.isfinite(speed)
     for values in (force, torque):
         good &= np.isfinite(values) if values is not None else True
     if command:
-        good &= _mean(command) > _LEAST_COMMAND
+        good &= mean_of(command) > LEAST_COMMAND
     if not good.any():
         said = f"in no row do speed and {names.get('force', names.get('torque'))} stand still together"
         if not parts:
@@ -314,96 +263,3 @@ def _steady(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
     row = np.searchsorted(time, time - 0.1)
     change = np.abs(speed - speed[row])
     return (time - time[0] > 0.1) & (change <= _SETTLED * np.abs(speed)) if len(time) > 1 else np.ones(1, bool)
-
-
-def _agreeing(readings: np.ndarray, u: np.ndarray, path: Path, notes: list[str]) -> np.ndarray:
-    """Readings that most others at the same command agree with; the rest become NaN.
-
-    Half of the sensors may count blades twice for a while, and the median of a row is then of no rotor.
-    """
-    kept = readings.copy()
-    for level in np.unique(u[np.isfinite(u)].round(4)):
-        rows = np.abs(u - level) < 1e-4
-        known = kept[rows]
-        if rows.sum() < _REPEATED or np.isnan(known).all():
-            continue
-        typical = _typical(known[np.isfinite(known)])
-        # A supply that sags moves the speed by some per cent within a level.
-        kept[rows] = np.where(np.abs(known - typical) < _APART_AT_LEVEL * typical, known, np.nan)
-    lost = int(np.isfinite(readings).sum() - np.isfinite(kept).sum())
-    if lost:
-        notes.append(
-            f"{path.name}: {lost} of {int(np.isfinite(readings).sum())} readings of speed are far from what most "
-            "at the same command say, and were left out."
-        )
-    return kept
-
-
-def _steady_points(speeds, command, voltage, path: Path, notes: list[str]) -> SteadyPoints:
-    """One point a row: the median of its rotors."""
-    readings = _agreeing(np.stack(list(speeds.values()), axis=1), _mean(command), path, notes)
-    omega = np.full(len(readings), np.nan)
-    read = np.isfinite(readings).any(axis=1)
-    omega[read] = np.nanmedian(readings[read], axis=1)
-    u = _mean(command)
-    good = np.isfinite(omega) & np.isfinite(u) & (u > _LEAST_COMMAND)
-    if voltage is not None:
-        good &= np.isfinite(voltage) & (voltage > 0)
-    u, omega, readings = u[good], omega[good], readings[good]
-    if len(u):
-        check_command(u, list(command), path)
-    return SteadyPoints(path.stem, u, omega, None if voltage is None else voltage[good], readings)
-
-
-def _thrust_points(command, force: np.ndarray, path: Path) -> ThrustPoints:
-    u = _mean(command)
-    good = np.isfinite(u) & np.isfinite(force) & (u > _LEAST_COMMAND)
-    if good.any():
-        check_command(u[good], list(command), path)
-    return ThrustPoints(path, u[good], force[good])
-
-
-def joined(thrust: ThrustPoints, steady: list[SteadyPoints], rotors: int | None, notes: list[str]) -> MapTable:
-    """Thrust against the speed that another table of the same bench has at the same command.
-
-    Args:
-        thrust: commands and forces.
-        steady: commands and speeds.
-        rotors: on the scale; None: as many as the other table has speeds in a row.
-        notes: told what was joined.
-
-    Raises:
-        CfbError: no other table has a speed at these commands.
-    """
-    each = [(s.command, s.rotor_speed[:, None] if s.readings is None else s.readings) for s in steady]
-    speed = np.array(
-        [
-            _typical(np.concatenate([np.zeros(0), *(x[np.abs(u - command) < _SAME].ravel() for u, x in each)]))
-            for command in thrust.command
-        ]
-    )
-    good = np.isfinite(speed)
-    if not good.any():
-        raise CfbError(
-            f"{thrust.path}: has no rotor speed (a column rpm1..rpm4 or omega), and thrust against command alone tells "
-            "neither motors nor rotors; measure the speed too, or give a table that has it at the same commands."
-        )
-    count = rotors or max(s.rotors for s in steady)
-    notes.append(
-        f"{thrust.path.name}: thrust of {count} rotor{'s' * (count > 1)} at {int(good.sum())} of {len(good)} commands "
-        f"at which {', '.join(s.name for s in steady)} has a speed that most readings agree on; both must be of one "
-        "supply."
-    )
-    table = Table({"omega": speed[good], "force": thrust.force[good] / count})
-    return from_columns(table, thrust.path)
-
-
-def _typical(readings: np.ndarray) -> float:
-    """What most readings agree on to 5 %; NaN where fewer than two in five do: a sensor that counts blades twice."""
-    x = np.sort(readings[readings > 0])
-    if not len(x):
-        return float("nan")
-    first, last = np.searchsorted(x, 0.95 * x), np.searchsorted(x, 1.05 * x, side="right")
-    best = int(np.argmax(last - first))
-    alike = x[first[best] : last[best]]
-    return float(np.median(alike)) if len(alike) >= _AGREE * len(x) else float("nan")

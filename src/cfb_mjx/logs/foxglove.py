@@ -67,9 +67,10 @@ def read_foxglove(path: str | os.PathLike, mapping: str | os.PathLike | Variable
     mapping = mapping if isinstance(mapping, VariableMap) else load_mapping(mapping)
     notes: list[str] = []
     warnings: list[str] = []
-    if mcap_stream.lacks_checksums(read_bytes(path)):
+    data = read_bytes(path)
+    if mcap_stream.lacks_checksums(data):
         notes.append("the MCAP file has no checksums, so damage to values in it would go unnoticed.")
-    streams = [ordered(s, path, notes, _OVERTAKING) for s in _streams(path, notes, warnings)]
+    streams = [ordered(s, path, notes, _OVERTAKING) for s in _streams(data, path, notes, warnings)]
     streams = _with_known_names(streams, mapping, path, guess=asked is None)
     try:
         return assemble(Import("foxglove", streams, None, notes, warnings), mapping, path)
@@ -85,11 +86,11 @@ def read_foxglove(path: str | os.PathLike, mapping: str | os.PathLike | Variable
         ) from error
 
 
-def _streams(path: Path, notes: list[str], warnings: list[str]) -> list[Stream]:
+def _streams(data: bytes, path: Path, notes: list[str], warnings: list[str]) -> list[Stream]:
     """One stream per topic and set of fields, in s since the first message."""
     groups: dict[tuple[str, tuple[str, ...]], list[tuple[int, list[float]]]] = {}
     unstamped: set[str] = set()
-    for message in mcap_stream.messages(read_bytes(path), path, warnings, _decoder):
+    for message in mcap_stream.messages(data, path, warnings, _decoder):
         topic, logged, numbers = message.channel.topic, message.logged_ns, message.content
         stamp = _stamp(numbers)
         if stamp is None:

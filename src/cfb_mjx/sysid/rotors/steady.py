@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs.bench_layouts import SteadyPoints
+from cfb_mjx.logs.bench_points import SteadyPoints
 from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE
 from cfb_mjx.model.effects.fields import HOVER_SPEED
 
 _FEWEST, _LEVELS = 6, 3
-_VARIES = 0.05  # V of spread from which the voltage can be told
+VARIES = 0.05  # V of spread from which the voltage can be told
 _OUTLIER = 5.0
 
 
@@ -66,7 +66,7 @@ def fit_steady(tables: list[SteadyPoints]) -> SteadyFit:
     known = all(t.battery_voltage is not None for t in tables)
     voltage = np.concatenate([t.battery_voltage for t in tables]) if known else None
     plain = _line(u, omega, u)
-    scaled = None if voltage is None or np.std(voltage) < _VARIES else _line(u * voltage, omega, u)
+    scaled = None if voltage is None or np.std(voltage) < VARIES else _line(u * voltage, omega, u)
     if scaled is None or scaled[2] > plain[2]:  # a controller that keeps the speed does not follow the voltage
         (offset, slope), std, spread, outliers = plain
         return SteadyFit(slope, std[1], offset, std[0], None, spread, spread, outliers, len(u))
