@@ -19,7 +19,7 @@ from cfb_mjx.files import read_bytes, require_folder, together, write_json
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.logs.bench_layouts import Bench, read_bench_table, recognises
 from cfb_mjx.logs.bench_points import SteadyPoints, ThrustPoints, joined
-from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
+from cfb_mjx.logs.bench_tables import MapTable
 from cfb_mjx.logs.flown import flown_part
 from cfb_mjx.logs.tabular import read_table
 
@@ -71,7 +71,11 @@ def run_fit_rotors(
     motors = None
     extras = {"offset": offset, "asymmetric": asymmetric, "dead_time": dead_time}
     if records:
-        motors = _fit_motors(records, base, extras, per_motor, notes)
+        from cfb_mjx.sysid.rotors.supply import fit_under_supply
+
+        progress = Progress("fitting motors")
+        motors, said = fit_under_supply(records, base.parameters(), **extras, per_motor=per_motor, progress=progress)
+        notes += said
     steady = None
     if points and not records:
         from cfb_mjx.sysid.rotors.steady import fit_steady
@@ -108,34 +112,6 @@ def run_fit_rotors(
     if motors and motors.common.extras - {"offset"}:
         print(f"spin-up and spin-down constants and dead time are reported only: {_LIMIT}.")
     print_paths(results=json, figure=figure)
-
-
-def _fit_motors(
-    records: list[MotorRecord], base: ModelFile, extras: dict[str, bool], per_motor: bool, notes: list[str]
-) -> MotorFit:
-    """Motors from commands, or from commands times voltage where a bench measured that and it is likelier."""
-    from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE
-    from cfb_mjx.sysid.rotors.motors import fit_motors
-    from cfb_mjx.sysid.rotors.steady import VARIES
-
-    def fitted(used: list[MotorRecord], said: str) -> MotorFit:
-        return fit_motors(used, base.parameters(), **extras, per_motor=per_motor, progress=Progress(said))
-
-    plain = fitted(records, "fitting motors")
-    voltages = [r.battery_voltage for r in records]
-    if any(v is None or not np.isfinite(v).all() for v in voltages) or np.std(np.concatenate(voltages)) < VARIES:
-        return plain
-    scaled = [replace(r, command=r.command * r.battery_voltage[:, None] / NOMINAL_VOLTAGE) for r in records]
-    followed = fitted(scaled, "fitting motors to command times voltage")
-    gained = plain.common.optimum.loss - followed.common.optimum.loss
-    if gained <= 0:
-        notes.append("speed does not follow the voltage of the supply: the command alone explains it better.")
-        return plain
-    notes.append(
-        f"speed follows command times voltage (log-likelihood +{gained:.0f} over the command alone): the gain is that "
-        f"at {NOMINAL_VOLTAGE} V; the effect battery_sag makes a model follow the voltage."
-    )
-    return followed
 
 
 def _read(paths: list[Path], rotors: int | None):

@@ -166,8 +166,8 @@ def _converted(table: Table, key: str, column: str, path: Path) -> np.ndarray:
 def _compare(chosen: str, readings: dict[str, np.ndarray], path: Path, notes: list[str]) -> None:
     """Say where two sensors of one speed disagree: a wrong number of poles or of marks."""
     for column, values in readings.items():
-        both = (values > 0) & (readings[chosen] > 0) if column != chosen else np.zeros(len(values), bool)
-        if both.sum() < 3:
+        both = (values > 0) & (readings[chosen] > 0)
+        if column == chosen or both.sum() < 3:
             continue
         ratio = float(np.median(values[both] / readings[chosen][both]))
         if abs(ratio - 1) > _APART:
