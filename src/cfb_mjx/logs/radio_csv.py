@@ -151,7 +151,7 @@ def _variables(columns: Iterable[str], mapping: VariableMap) -> dict[str, str]:
 def _candidates(columns: Iterable[str], mapping: VariableMap) -> dict[str, list[str]]:
     """Logged name to the columns that may be it: several where a table holds several drones."""
     columns = list(columns)
-    wanted = {_bare(v): v for choices in mapping.choices.values() for c in choices for v in c.variables}
+    wanted = _bare_names(mapping)
     found: dict[str, str] = {}
     for column in columns:
         name = wanted.get(_bare(column))
@@ -169,7 +169,7 @@ def _candidates(columns: Iterable[str], mapping: VariableMap) -> dict[str, list[
 
 def logged_names(names: Iterable[str], mapping: VariableMap) -> dict[str, str]:
     """Name to the logged variable it ends in: ``cf1.log.gyro.x`` to ``gyro.x``."""
-    wanted = {_bare(v): v for choices in mapping.choices.values() for c in choices for v in c.variables}
+    wanted = _bare_names(mapping)
     found = {}
     for name in names:
         parts = re.split(r"[._/ :]", name)
@@ -197,6 +197,11 @@ def _of_one_drone(columns: Iterable[str], mapping: VariableMap, path: Path, robo
             f"{min(drones)}."
         )
     return {name: same[0] for name, same in candidates.items()}
+
+
+def _bare_names(mapping: VariableMap) -> dict[str, str]:
+    """The mapping's names by what is left of them without what joins their parts."""
+    return {_bare(v): v for choices in mapping.choices.values() for c in choices for v in c.variables}
 
 
 def _bare(name: str) -> str:
