@@ -67,7 +67,7 @@ AIR = {
     "thrust_tilt": ThrustTilt([0.04, -0.03], 0.05),
     "rotor_drag": RotorDrag(0.04),
     "parasitic_drag": ParasiticDrag(0.0, 0.01),
-    "blade_flapping": BladeFlapping(8e-4, 0.3, 0.2),
+    "blade_flapping": BladeFlapping(8e-4, [0.3, -0.2], 0.2, 1.7),
     "wind": Wind([2.0, -1.0, 0.5], 0.03),
     "position_moment": PositionMoment([4e-4, -3e-4]),
     "gust": Gust([2.0, 1.0, 0.5], time_scale=0.05, seed=3.0),
@@ -124,7 +124,9 @@ def _wrench(constants, y, on, time, conductance=0.03):
     if "parasitic_drag" in on:
         force -= 0.01 * np.abs(v) * v
     if "blade_flapping" in on:
-        torque += 8e-4 * speed.mean() / 1594 * np.exp(0.3 * v[2]) * np.array([-0.8 * v[1], 1.2 * v[0], 0.0])
+        along_x, along_y = np.exp(np.array([0.3, -0.2]) * v[2])
+        hub = np.array([-0.8 * v[1] * along_y, 1.2 * v[0] * along_x, 0.0])
+        torque += 8e-4 * (speed.mean() / 1594) ** 1.7 * hub
     if "wind" in on:
         force += conductance * matrix.T @ [2.0, -1.0, 0.5]
     if "position_moment" in on:
@@ -709,9 +711,9 @@ def test_load_hangs_below_what_the_drone_feels_after_a_gap(guards):
 @ONE_WORKER
 def test_wind_drag_tilt_and_a_load_follow_newton(guards, fly_fleet):
     """Composed: drone and load as two bodies with a string between them, for every force the same moving air."""
-    m, own, length, ratio = 0.006, 0.044, 0.2, 0.05
+    m, own, length, ratio, pivot = 0.006, 0.044, 0.2, 0.05, -0.02
     effects = (
-        PayloadSwing(m, length, ratio),
+        PayloadSwing(m, length, ratio, pivot),
         Wind([2.0, -1.0, 0.5], 0.0),
         ThrustTilt([0.04, -0.03], 0.05),
         InflowThrust(0.02),
@@ -736,7 +738,10 @@ def test_wind_drag_tilt_and_a_load_follow_newton(guards, fly_fleet):
         free = rate[3:6] + matrix @ force / own
         # m a_load = m g - T n, own a = own free + T n, and n . (a_load - a) = -length |n'|^2. Air damps the load.
         pull = (length * turning @ turning - along @ (free - gravity)) / (1 / m + 1 / own)
-        rate[3:6] = free + max(pull, 0.0) * along / own
+        tension = max(pull, 0.0) * along
+        rate[3:6] = free + tension / own
+        # The string is tied below the rotors' centre.
+        torque = torque + np.cross([0.0, 0.0, pivot], matrix.T @ tension)
         rate[10:13] += torque / constants.inertia
         felt = rate[3:6] - gravity
         swing = -(felt - along * (along @ felt)) / length - (turning @ turning) * along
@@ -753,6 +758,8 @@ def test_wind_drag_tilt_and_a_load_follow_newton(guards, fly_fleet):
     )
     # The load moves by semi-implicit steps: its share in the flight is right to one percent.
     load = np.abs(known[:, :3] - np.asarray(without.position[0])).max()
-    assert load > 0.01
-    for part, tolerance in (("position", 0.01 * load), ("velocity", 0.02), ("body_rate", 5e-3)):
+    turn = np.abs(known[:, 10:13] - np.asarray(without.body_rate[0])).max()
+    assert load > 0.005
+    assert turn > 0.5
+    for part, tolerance in (("position", 0.01 * load), ("velocity", 0.02), ("body_rate", 0.01 * turn)):
         assert np.abs(helpers.part(flown - known[:, :17], part)).max() < tolerance, part

@@ -17,6 +17,7 @@ from cfb_mjx.sysid.rotors.motor_likelihood import first_guess, maximise
 from cfb_mjx.sysid.rotors.motor_replay import replay
 from cfb_mjx.sysid.rotors.motor_tracks import ROWS, gather, record_of
 from cfb_mjx.sysid.rotors.motors import chi_square_tail, fit_motors
+from cfb_mjx.sysid.rotors.supply import fit_with_sag
 
 # They share fixtures and compiled programs.
 pytestmark = pytest.mark.xdist_group("motors")
@@ -171,3 +172,25 @@ def test_a_real_flight_spins_up_faster_than_down_and_is_affine():
     assert abs(dead) < 0.003
     assert found.estimates["motor_speed_offset"].value > 300
     assert {t.name for t in found.tests if t.supported} == {"asymmetric", "dead_time", "offset"}
+
+
+def test_how_far_motors_follow_the_battery_comes_back_with_their_constants():
+    """Three flights on a battery that empties: a slope of 0.6, and gains as they are at 3.7 V."""
+    slope, records = 0.6, []
+    for number in range(3):
+        rng = np.random.default_rng(40 + number)
+        command = steps(rng, 8.0)
+        voltage = 4.0 - 0.2 * number - 0.2 * np.linspace(0, 1, len(command))
+        driven = command * (1 + slope * (voltage - 3.7) / 3.7)
+        made = record(driven, rng, 0.045, 0.045, wander=10.0, motors=(1, 2, 3, 4))
+        commands = np.tile(command[:, None], 4)
+        records.append(replace(made, name=f"flight {number}", command=commands, battery_voltage=voltage))
+    found, sag = fit_with_sag(records, NOMINAL)
+    assert sag.slope == pytest.approx(slope, abs=0.06)
+    assert abs(sag.slope - slope) < 4 * sag.std
+    np.testing.assert_allclose(found.values("motor_gain")[0], 2900.0, rtol=0.01)
+    np.testing.assert_allclose(found.values("motor_time_constant")[0], 0.045, rtol=0.05)
+    # Without a voltage nobody can tell, and the motors are fitted all the same.
+    plain, none = fit_with_sag([replace(r, battery_voltage=None) for r in records[:1]], NOMINAL)
+    assert none is None
+    assert len(plain.motors) == 4

@@ -14,13 +14,13 @@ from cfb_mjx.labelled_plants import EFFECTS, Case, fly_campaigns
 from cfb_mjx.labelled_plants.effects import put
 from cfb_mjx.logs import read_log, resample
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.model.effects import Inertia, RotorDrag, Wind
+from cfb_mjx.model.effects import Inertia, PayloadSwing, RotorDrag, Wind
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.refinement import Number, free_numbers, plausible_numbers, refine
 from cfb_mjx.sysid.refinement.fitting import _prepared
 from cfb_mjx.sysid.refinement.numbers import INERTIA, RATE_DAMPING, with_values
-from cfb_mjx.sysid.refinement.predictions import TRIM, Predictions
+from cfb_mjx.sysid.refinement.predictions import TRIM, Predictions, kinds_alike
 from cfb_mjx.sysid.repeatability import repeated
 
 pytestmark = pytest.mark.xdist_group("refinement")
@@ -109,7 +109,7 @@ def test_the_gradient_is_that_of_the_loss(campaign):
     model = _prepared(Quadrotor(GUARDS()), numbers)
     flights = len(campaign.fit)
     share = np.linspace(0.5, 1.5, flights)
-    data = Predictions.of(model, campaign.fit, share)
+    data = Predictions.of(model, campaign.fit, share).started(model)
     count = sum(len(part.flight) for part in data.parts) * 5 * 2
     values, trims = np.array([n.of(model) for n in numbers]) + 1e-4, np.full((flights, 3), 1e-5)
     normal = data.normal_equations(model, numbers, values, trims)
@@ -136,7 +136,7 @@ def test_flights_logged_at_several_rates_are_fitted_together():
     model = _prepared(Quadrotor(GUARDS()), plausible_numbers(GUARDS(), ("rotor_drag",)))
     cost = {}
     for name, logs in (("slow", [log]), ("fast", [fast]), ("both", [log, fast])):
-        data = Predictions.of(model, logs, np.ones(len(logs)))
+        data = Predictions.of(model, logs, np.ones(len(logs))).started(model)
         cost[name] = data.cost(model, np.zeros((len(logs), 3)))
     assert cost["slow"] == pytest.approx(cost["fast"], rel=0.02)
     assert cost["both"] == pytest.approx((cost["slow"] + cost["fast"]) / 2, rel=0.01)
@@ -191,3 +191,51 @@ def test_what_is_missed_twice_shows():
     assert np.all(right.rms[:2] < 0.5 * same.rms[:2])
     with pytest.raises(CfbError, match="too short"):
         repeated(wrong, log, log.rows(log.time < log.time[0] + 5))
+
+
+def test_what_is_left_without_an_effect(campaign, refined):
+    """Leaving out what is there costs much, what is not there nothing; the other numbers make up for what they can."""
+    costs = {name: sum(loss.sum() for loss in refined.without([name]).losses) for name in ("rotor_drag", "inertia")}
+    whole = sum(loss.sum() for loss in refined.left.losses)
+    assert costs["rotor_drag"] > 1.3 * whole
+    assert costs["inertia"] < 1.02 * whole
+    assert refined.growth(["inertia"]) < 0.02 * refined.cost[1] < refined.growth(["rotor_drag"])
+    # Fitted anew without the effect, flights are predicted no better than the others made up for it.
+    anew = refine(Quadrotor(GUARDS()), campaign.fit, plausible_numbers(GUARDS(), ("inertia",)), iterations=4)
+    again = sum(loss.sum() for loss in anew.left.losses)
+    assert again == pytest.approx(costs["rotor_drag"], rel=0.1)
+    assert np.all(np.abs(refined.correlation[np.isfinite(refined.correlation)]) < 1 + 1e-9)
+
+
+def test_every_second_window_tells_nearly_as_much(campaign, refined):
+    found = refine(Quadrotor(GUARDS()), campaign.fit, refined.numbers, most_windows=len(refined.left.losses[0]) // 2)
+    assert len(found.left.losses[0]) <= len(refined.left.losses[0]) // 2 + len(campaign.fit)
+    assert found.values[0] == pytest.approx(refined.values[0], rel=0.05)
+
+
+def test_flights_of_a_rare_kind_count_as_much_as_the_many(campaign):
+    wild = campaign.fit[0]
+
+    def named(log, name):
+        return log.replace(metadata={**log.metadata, "name": name})
+
+    same = [named(wild, f"again {k}") for k in range(4)]
+    assert set(kinds_alike(Quadrotor(GUARDS()), [wild, *same]).values()) == {0.2}
+    still = wild.replace(quaternion=np.tile(wild.quaternion[:1], (len(wild), 1)), body_rate=0.01 + 0 * wild.body_rate)
+    both = kinds_alike(Quadrotor(GUARDS()), [*same, named(still, "still")])
+    assert both == {one.name: 0.25 for one in same} | {"still": 1.0}
+
+
+def test_a_load_on_a_string_is_found_from_far_off():
+    """Its swing at the start of a window follows from the flight before, by the model as the fit has it at that step.
+
+    Held as the model before the fit had it, the length stays wrong.
+    """
+    flown = fly_campaigns([Case("slung", 9011, (("payload_swing", 1.0),))], duration_scale=0.35)[0]
+    truth = flown.truth["effects"]["payload_swing"]
+    start = Quadrotor(GUARDS(), (PayloadSwing(mass=0.0005, length=0.5, damping_ratio=0.1),))
+    found = refine(start, flown.fit, plausible_numbers(GUARDS(), ("payload_swing",)))
+    value = dict(zip([n.name for n in found.numbers], found.values, strict=True))
+    assert value["payload_swing.mass"] == pytest.approx(truth["bob_mass"], rel=0.05)
+    assert value["payload_swing.length"] == pytest.approx(truth["bob_length"], rel=0.05)
+    assert abs(value["payload_swing.pivot"]) < 1e-3

@@ -37,6 +37,7 @@ def run_close_loop(
     from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
     from cfb_mjx.sysid.tracing.outcome import close_loop
     from cfb_mjx.view.closing import write_report
+    from cfb_mjx.view.closing_words import verdict
 
     base = changed_model(model, changes)
     output_folder(output)
@@ -46,7 +47,8 @@ def run_close_loop(
     story = provenance("close-loop", base.name, "fit_logs_sha256", fit, arguments, held_out=judged_on)
     corrected = outcome.model_file(f"{base.name}-closed", story)
     facts = environment()
-    report = {"case": output.resolve().name} | outcome.to_json() | {"model": base.name, "environment": facts}
+    report = {"case": output.resolve().name, "summary": verdict(outcome)} | outcome.to_json()
+    report |= {"model": base.name, "environment": facts}
     say("writing the report")
     with together():
         save_model_file(corrected, output / "model.yaml")
@@ -68,6 +70,10 @@ def _read(fit: list[Path], held_out: list[Path]) -> tuple[list[FlightLog], list[
     return logs, judged
 
 
+def _with_error(value: float, std: float | None) -> str:
+    return f"{value:.4g} (at its bound)" if std is None else f"{value:.4g} +- {std:.2g}"
+
+
 def _print(report: dict, output: Path) -> None:
     from cfb_mjx.view.closing_words import separating
 
@@ -78,7 +84,7 @@ def _print(report: dict, output: Path) -> None:
         for key, value in effect["parameters"].items():
             std = effect["uncertainty"].get(key)
             pairs = zip(value, std, strict=True) if isinstance(value, list) else [(value, std)]
-            values.append(f"{key} " + ", ".join(f"{v:.4g} +- {s:.2g}" for v, s in pairs))
+            values.append(f"{key} " + ", ".join(_with_error(v, s) for v, s in pairs))
         print(f"{effect['name']}: {'; '.join(values)} (p = {effect['p_value']:.1g})")
         if effect.get("confusable_with"):
             print(f"  these flights hardly tell it from {', '.join(effect['confusable_with'])}")

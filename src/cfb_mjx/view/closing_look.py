@@ -57,7 +57,9 @@ def _beside(outcome: Outcome, logs: list[FlightLog], repaired: bool) -> Search:
 
 def look(outcome: Outcome, logs: list[FlightLog]) -> Looked:
     """Residuals and predictions of the held-out ``logs``."""
-    judge, raw = _beside(outcome, logs, True), _beside(outcome, logs, False)
+    judge = _beside(outcome, logs, True)
+    # Motors fitted anew are part of what changed.
+    raw = replace(_beside(outcome, logs, False), parameters=outcome.base.parameters())
     hypothesis = outcome.hypothesis
     # Commands missing between rows are no effect: both models get the same share of them.
     declared = replace(judge.nothing(), lead=hypothesis.lead)

@@ -57,6 +57,14 @@ def _short(logs_fit: list[FlightLog], logs_held_out: list[FlightLog]) -> Section
     return Section("What was measured", [text])
 
 
+TOGETHER = (
+    "No single effect made predictions better than holding velocity and body rate, so all that a drone usually lacks "
+    "was fitted together, what only some drones have was tried beside it, and what did not earn its place was taken "
+    "out again. Motors come from commands and measured rotor speeds; everything else from predictions, commands in and "
+    "rotor speeds in. How much an error grows without an effect: the others have moved to make up for it."
+)
+
+
 def _how_many(logs: list[FlightLog], column: str) -> str:
     count = sum(getattr(log, column) is not None for log in logs)
     return {len(logs): "all", 0: "none"}.get(count, f"{count} of {len(logs)}")
@@ -73,12 +81,14 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
         for number in numbers(item):
             low, high = number.value - 1.96 * number.std, number.value + 1.96 * number.std
             plausible = "" if number.plausible is None else "{:g} to {:g}".format(*number.plausible)
-            span = f"{low:.4g} to {high:.4g}"
+            span = f"{low:.4g} to {high:.4g}" if np.isfinite(number.std) else "at a bound of the fit"
             rows.append([item.name, number.label, str(number), span, plausible, probability(item.p_value)])
     caption = (
         "Value ± standard deviation. p: probability of this much evidence by chance, on the held-out flights "
         "(of a sensor fault: from comparing the sensors with each other, without any model)."
     )
+    if outcome.together is not None:
+        paragraphs.insert(0, TOGETHER)
     head = ["effect", "parameter", "value", "95 % interval", "plausible", "p"]
     shown = [figure for item in outcome.reported for figure in figures.get(key_of(item.name), [])]
     if shown:

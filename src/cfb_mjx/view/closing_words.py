@@ -134,6 +134,8 @@ def verdict(outcome: Outcome) -> str:
     physics = [item for item in outcome.reported if not is_fault(item.name)]
     faults = [item for item in outcome.reported if is_fault(item.name)]
     parts = []
+    if outcome.together is not None:
+        return _many(outcome, physics)
     if len(physics) == 1:
         (item,) = physics
         parts.append(
@@ -155,6 +157,40 @@ def verdict(outcome: Outcome) -> str:
     if outcome.reported or outcome.unexplained is not None:
         parts.append(_bought(outcome))
     return " ".join(parts)
+
+
+SHOWN = 3
+"""Effects that the first paragraph names when there are many."""
+
+
+def _many(outcome: Outcome, physics: list[Reported]) -> str:
+    """What a drone has that lacks much at once, how much it buys, and what to do."""
+    first = "; ".join(f"{item.name} ({meaning(item.name)})" for item in physics[:SHOWN])
+    more = [item.name for item in physics[SHOWN:]]
+    count = f"{len(physics)} effects" if len(physics) != 1 else "one effect"
+    motors = ", beside motors of its own" if outcome.motors else ""
+    has = f"The drone flies with {count} the model lacks{motors}; what buys most: {first}"
+    has += f"; then {', '.join(more)}." if more else "."
+    horizon = f"@{max(outcome.before.horizons):g}s"
+    keys = {"attitude": ("attitude_mean_deg", "deg"), "velocity": ("velocity_mean_mps", "m/s")}
+    before, after, still = (
+        found.metrics(variant)
+        for found, variant in (
+            (outcome.before, "commands_in"),
+            (outcome.after, "commands_in"),
+            (outcome.before, "hold"),
+        )
+    )
+    errors = " and ".join(
+        f"the {name} error {horizon[1:-1]} s ahead goes from {before[key + horizon]:.3g} to {after[key + horizon]:.3g} "
+        f"{unit} (hold: {still[key + horizon]:.3g})"
+        for name, (key, unit) in keys.items()
+    )
+    bound = [number for item in outcome.reported for number in item.at_bound]
+    do = "Fly and train with model.yaml"
+    if bound:
+        do += f"; do not trust as physics what stands at the edge of what is plausible ({', '.join(bound)})"
+    return f"{has} On held-out flights {errors}. {do}."
 
 
 def _interval(item: Reported) -> str:

@@ -2,13 +2,13 @@
 
 The disc tilts or, on stiff blades, the hub is twisted:
 
-    tau_x = -(1 - anisotropy) c v_y,  tau_y = (1 + anisotropy) c v_x
-    c = coefficient (Omega / 1594 rad/s) exp(climb v_z)
+    tau_x = -(1 - anisotropy) c exp(climb_y v_z) v_y,  tau_y = (1 + anisotropy) c exp(climb_x v_z) v_x
+    c = coefficient (Omega / 1594 rad/s)^power
 
 with v the velocity through the air, in body axes, and the mean rotor speed. The sign is free, because stiffness and the
-height of the discs over the rotors' centre pull in opposite directions. ``climb`` lets the moment depend on the flow
-through the discs, without ever turning it round. With ``anisotropy`` flow along the body twists it more than flow from
-the side, for what sits between the rotors (battery, decks) is longer than wide.
+height of the discs over the rotors' centre pull in opposite directions. ``climb`` lets the moments depend on the flow
+through the discs, without ever turning them round. With ``anisotropy`` flow along the body twists it more than flow
+from the side, for what sits between the rotors (battery, decks) is longer than wide.
 """
 
 from __future__ import annotations
@@ -20,20 +20,25 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
-from cfb_mjx.model.effects.fields import mean_hover_ratio, number
+from cfb_mjx.model.effects.fields import mean_hover_ratio, number, vector
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 
 
 class BladeFlapping(Effect):
-    """tau = coefficient (Omega / 1594) exp(climb v_z) (-(1 - anisotropy) v_y, (1 + anisotropy) v_x, 0)."""
+    """tau = coefficient (Omega / 1594)^power (-(1 - anisotropy) v_y, (1 + anisotropy) v_x, 0) exp(climb v_z)."""
 
     name: ClassVar[str] = "blade_flapping"
     meaning: ClassVar[str] = "sideways motion tilts the rotor discs and turns the body"
     experiment: ClassVar[str] = (
         "straight passes at constant speed, 0.5 to 3 m/s, forth and back and in both body axes, repeated while climbing"
     )
-    units: ClassVar[dict[str, str]] = {"coefficient": "N s", "climb": "s/m", "anisotropy": "1"}
+    units: ClassVar[dict[str, str]] = {
+        "coefficient": "N s",
+        "climb": "s/m",
+        "anisotropy": "1",
+        "power": "1",
+    }
     source: ClassVar[str] = (
         "R. Mahony, V. Kumar, P. Corke, Multirotor aerial vehicles, IEEE RAM 19(3), 2012; G. Hoffmann, H. Huang, S."
         " Waslander, C. Tomlin, Quadrotor helicopter flight dynamics and control: theory and experiment, AIAA GNC "
@@ -43,23 +48,27 @@ class BladeFlapping(Effect):
         "coefficient": (-0.001, 0.001),
         "climb": (-0.5, 0.5),
         "anisotropy": (-0.5, 0.5),
+        "power": (0.0, 3.0),
     }
     limits: ClassVar[dict[str, Limits]] = {
         "coefficient": Limits(-0.1, 0.1, -0.004, 0.004),
         "climb": Limits(-2.0, 2.0, -1.5, 1.5),
         "anisotropy": Limits(-1.0, 1.0, -1.0, 1.0),
+        "power": Limits(-2.0, 6.0, -0.5, 4.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
     feels_air: ClassVar[bool] = True
     # Both are looked for at zero, and fitted once the moment is there.
-    probes: ClassVar[tuple[dict[str, float], ...]] = ({"climb": 0.0, "anisotropy": 0.0},)
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({"climb": 0.0, "anisotropy": 0.0, "power": 1.0},)
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
     """Of the four rotors together at hover speed."""
-    climb: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Relative change of the moment per velocity along body z."""
+    climb: Float[Array, "*batch 2"] = eqx.field(converter=vector(2))
+    """Relative change per velocity along body z of the moments that motion along body x and y brings about."""
     anisotropy: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
     """By which share pitching moments exceed, and rolling moments fall short of, their mean."""
+    power: Float[Array, "*batch"] = eqx.field(converter=number, default=1.0)
+    """Of the mean rotor speed: 1 as blade theory has it at a fixed pitch, 2 in proportion to thrust."""
 
     @classmethod
     def neutral(cls) -> BladeFlapping:
@@ -67,7 +76,7 @@ class BladeFlapping(Effect):
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         vx, vy, vz = condition.airspeed_body
-        c = self.coefficient * mean_hover_ratio(condition) * jnp.exp(self.climb * vz)
-        return Wrench(
-            wrench.force, wrench.torque + Vec(-(1 - self.anisotropy) * c * vy, (1 + self.anisotropy) * c * vx, 0.0)
-        )
+        c = self.coefficient * mean_hover_ratio(condition) ** self.power
+        along_x, along_y = (jnp.exp(climb * vz) for climb in Vec.unstack(self.climb))
+        roll = -(1 - self.anisotropy) * c * along_y * vy
+        return Wrench(wrench.force, wrench.torque + Vec(roll, (1 + self.anisotropy) * c * along_x * vx, 0.0))

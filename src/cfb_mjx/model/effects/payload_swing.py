@@ -1,13 +1,16 @@
-"""A load slung on a string from the rotors' centre: a spherical pendulum whose pivot flies.
+"""A load slung on a string from a point on the rotors' axis: a spherical pendulum whose pivot flies.
 
     n'' = -(1 - n n^T) (a + g e_z) / length - |n'|^2 n - 2 damping_ratio sqrt(g / length) n'
     F_world = T n,  T = max(length |n'|^2 - n . F / M, 0) m M / (m + M)
+    torque = (0, 0, pivot) x F,  about the rotors' centre, body axes
 
 n is the unit vector from the drone to the load, a the drone's acceleration, M its mass and F the force (world) of all
-else but gravity: the tension T follows from the string keeping its length. A string does not push; where
-it would go slack the load is still carried along on its sphere. Remembered are n and n'; at the start the load hangs
-still. Swings are hardly damped, and once a string was slack nothing tells where they began: beside a log, the force
-the model misses turns n towards where the string pulls (a Luenberger observer).
+else but gravity: the tension T follows from the string keeping its length. Where the string is tied below the centre of
+gravity (``pivot`` negative), a sideways pull also turns the drone; that the pivot then moves beside the drone's centre
+is left out. A string does not push; where it would go slack the load is still carried along on its sphere. Remembered
+are n and n'; at the start the load hangs still. Swings are hardly damped, and once a string was slack nothing tells
+where they began: beside a log, the force the model misses turns n towards where the string pulls (a Luenberger
+observer).
 """
 
 from __future__ import annotations
@@ -33,12 +36,12 @@ GAP = 0.05
 
 
 class PayloadSwing(Effect):
-    """A load on a string under the rotors' centre."""
+    """A load on a string tied to the drone on the rotors' axis."""
 
     name: ClassVar[str] = "payload_swing"
     meaning: ClassVar[str] = "a load swings below the drone"
     experiment: ClassVar[str] = "a sharp stop followed by a hover of five seconds: a load swings on"
-    units: ClassVar[dict[str, str]] = {"mass": "kg", "length": "m", "damping_ratio": "1"}
+    units: ClassVar[dict[str, str]] = {"mass": "kg", "length": "m", "damping_ratio": "1", "pivot": "m"}
     source: ClassVar[str] = (
         "K. Sreenath, T. Lee, V. Kumar, Geometric control and differential flatness of a quadrotor UAV with a "
         "cable-suspended load, CDC 2013"
@@ -47,19 +50,21 @@ class PayloadSwing(Effect):
         "mass": (0.0, 0.015),
         "length": (0.05, 0.5),
         "damping_ratio": (0.002, 0.4),
+        "pivot": (-0.04, 0.02),
     }
     limits: ClassVar[dict[str, Limits]] = {
         "mass": Limits(0.0, 1.0, 0.0, 0.06),
         "length": Limits(0.005, 100.0, 0.02, 5.0),
         "damping_ratio": Limits(0.0, 10.0, 0.0, 1.0),
+        "pivot": Limits(-1.0, 1.0, -0.1, 0.1),
     }
     strengths: ClassVar[tuple[str, ...]] = ("mass",)
     # The tension follows from all other forces.
     rank: ClassVar[int] = CONSTRAINT
     probes: ClassVar[tuple[dict[str, float], ...]] = (
-        {"length": 0.1, "damping_ratio": 0.05},
-        {"length": 0.15, "damping_ratio": 0.05},
-        {"length": 0.25, "damping_ratio": 0.05},
+        {"length": 0.1, "damping_ratio": 0.05, "pivot": 0.0},
+        {"length": 0.15, "damping_ratio": 0.05, "pivot": 0.0},
+        {"length": 0.25, "damping_ratio": 0.05, "pivot": 0.0},
     )
 
     mass: Float[Array, "*batch"] = eqx.field(converter=number)
@@ -68,6 +73,8 @@ class PayloadSwing(Effect):
     """Of the string."""
     damping_ratio: Float[Array, "*batch"] = eqx.field(converter=number, default=0.02)
     """Of the swing, against critical damping."""
+    pivot: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
+    """Where the string is tied: above the rotors' centre, along body z; below it negative."""
 
     @classmethod
     def neutral(cls) -> PayloadSwing:
@@ -83,7 +90,9 @@ class PayloadSwing(Effect):
         force = rotate(condition.quaternion, wrench.force)
         tension = jnp.maximum(self.length * turning.dot(turning) - along.dot(force) / own, 0.0)
         tension = tension * mass * own / (mass + own)
-        return Wrench(wrench.force + rotate_inverse(condition.quaternion, along * tension), wrench.torque)
+        pull = rotate_inverse(condition.quaternion, along * tension)
+        x, y, _ = pull
+        return Wrench(wrench.force + pull, wrench.torque + Vec(-self.pivot * y, self.pivot * x, 0.0))
 
     def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
         along, turning = condition.memory

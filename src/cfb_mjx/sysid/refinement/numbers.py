@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -23,6 +23,8 @@ PLANT = (
 Loads, wind and what only some drones have are for where there is a reason."""
 INERTIA = 0.25
 """Largest plausible change of a moment of inertia, as a share: what decks and another battery bring about."""
+HELD = 1e-12
+"""By so much a number that is held may move: its scale must not be nothing."""
 RATE_DAMPING = 2.0
 """Largest plausible damping of roll and pitch by axial inflow, 1/s: measured ones are about 1 to 2."""
 
@@ -48,9 +50,30 @@ class Number:
         at = "" if self.index is None else f"[{self.index}]"
         return f"{self.effect}.{self.field}{at}"
 
+    @property
+    def held_at_neutral(self) -> Number:
+        """The same, where it may not leave the value at which its effect vanishes.
+
+        A fit with such numbers runs the program compiled for all of them.
+        """
+        value = self.of_neutral()
+        return replace(self, low=value - HELD, high=value + HELD)
+
+    @property
+    def held(self) -> bool:
+        """Whether it may not move."""
+        return self.high - self.low <= 4 * HELD
+
     def of(self, model: Quadrotor) -> float:
         """Its value in a model."""
-        value = np.asarray(getattr(_effect(model, self.effect), self.field))
+        return self._in(_effect(model, self.effect))
+
+    def of_neutral(self) -> float:
+        """Its value where the effect vanishes."""
+        return self._in(KNOWN[self.effect].neutral())
+
+    def _in(self, effect: Effect) -> float:
+        value = np.asarray(getattr(effect, self.field))
         return float(value if self.index is None else value[self.index])
 
 

@@ -16,12 +16,13 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.model.effects import Condition, Effect, Wrench
+from cfb_mjx.model.effects.base import overrides
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.sysid.flight import MEASURED_SHARE, delay_of
 from cfb_mjx.sysid.metrics import BLOCK, errors
 from cfb_mjx.sysid.prediction import hold, predict_one, start_of_windows
 from cfb_mjx.sysid.refinement.numbers import Number, with_values
-from cfb_mjx.sysid.windows import Windows, find_windows
+from cfb_mjx.sysid.windows import Windows, find_starts, find_windows
 
 HORIZONS = (0.1, 0.2, 0.3, 0.4, 0.5)
 TRIM = 2e-4
@@ -32,6 +33,10 @@ HUBER = 0.3
 """Errors count squared up to this share of what `hold` errs, linearly beyond."""
 AT_BOUND = 1e-3
 """A number this near to a bound, in its scale, stands at it."""
+ALIKE = 2.0
+"""Factor between the errors of `hold` within which two flights are of one kind."""
+STEP = 1e-3
+"""Of a finite difference, in a number's scale."""
 CHUNK = 128
 _STEPS = 128
 
@@ -65,6 +70,17 @@ class Normal:
     """(F,) what flights count."""
     trimmed: bool
     """Whether every flight has a trim of its own; else they stay where they are."""
+
+    def chosen(self, free: np.ndarray) -> np.ndarray:
+        """Positions of some of the shared numbers, ``free`` (count,), and of the trims that are estimated."""
+        own = np.full(len(self.gradient) - self.count, self.trimmed)
+        return np.flatnonzero(np.concatenate([free, own]))
+
+    def weighed(self, free: np.ndarray) -> np.ndarray:
+        """The matrix with its priors, for those of `chosen`."""
+        trims = np.zeros(((len(self.gradient) - self.count) // 3, 3))
+        at = self.chosen(free)
+        return self._whole(np.zeros(self.count), trims)[0][np.ix_(at, at)]
 
     def _whole(self, offset: np.ndarray, trims: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # A prior of one scale (one TRIM), as strong as a single window: it decides where flights say nothing.
@@ -121,32 +137,61 @@ class Predictions:
     """(F,) what flights count, 1 on average."""
     sizes: Array
     """(H, 2) what `hold` errs: attitude rad, velocity m/s."""
+    flown: tuple[tuple[FlightLog, float, Windows], ...]
+    """Of every flight: its log, the age of its pose, its windows."""
 
     @classmethod
-    def of(cls, model: Quadrotor, logs: Sequence[FlightLog], share: np.ndarray) -> Predictions:
-        flights = []
-        for log in logs:
-            delay = delay_of(log, model.parameters)
-            windows = find_windows(log, HORIZONS, delay, float(model.parameters.gyro_delay))
-            flights.append((windows, *(start_of_windows(model, log, windows, delay) if len(windows) else ((), ()))))
-        held = [_norms(hold(windows, HORIZONS), windows) for windows, _, _ in flights if len(windows)]
+    def of(cls, model: Quadrotor, logs: Sequence[FlightLog], share: np.ndarray, most: int | None = None) -> Predictions:
+        """Every window of all flights, or of long ones every second, third and so on, so that ``most`` are left."""
+        gyro_delay = float(model.parameters.gyro_delay)
+        delays = [delay_of(log, model.parameters) for log in logs]
+        starts = [find_starts(log, HORIZONS, delay, gyro_delay) for log, delay in zip(logs, delays, strict=True)]
+        each = np.inf if most is None else most / len(logs)
+        flown = [
+            (log, delay, find_windows(log, HORIZONS, delay, gyro_delay, own[:: max(1, round(len(own) / each))]))
+            for log, delay, own in zip(logs, delays, starts, strict=True)
+        ]
+        held = [_norms(hold(windows, HORIZONS), windows) for _, _, windows in flown if len(windows)]
         if not held:
             names = ", ".join(log.name for log in logs)
             raise CfbError(f"{names}: no prediction window fits; a log must fly at least 1.2 s without a gap.")
         sizes = jnp.asarray(np.concatenate(held).mean(axis=0))
-        parts = [part for part in (_part(flights, share, measured) for measured in (False, True)) if part is not None]
-        return cls(parts, share, sizes)
+        return cls([], share, sizes, tuple(flown))
+
+    def started(self, model: Quadrotor) -> Predictions:
+        """The same windows, with rotor speeds and memories at their starts as a model says they were."""
+        flights = [
+            (windows, *(start_of_windows(model, log, windows, delay) if len(windows) else ((), ())))
+            for log, delay, windows in self.flown
+        ]
+        kinds = (_part(flights, self.share, measured) for measured in (False, True))
+        return replace(self, parts=[part for part in kinds if part is not None])
+
+    def errors(self, model: Quadrotor, trims: np.ndarray) -> list[np.ndarray]:
+        """Of every part: (W, H, 2) errors of attitude and velocity over what `hold` errs."""
+        found = []
+        for part in self.parts:
+            chunks = [np.asarray(_scaled(model, c, _own(trims, c), self.sizes, part.measured)) for c in part.chunks]
+            found.append(np.linalg.norm(np.concatenate(chunks)[: len(part.flight)], axis=-1))
+        return found
+
+    def losses(self, model: Quadrotor, trims: np.ndarray) -> list[np.ndarray]:
+        """Of every part: (W, H, 2), weighted."""
+        errors = zip(self.parts, self.errors(model, trims), strict=True)
+        return [
+            part.weight[:, None, None] * np.where(e < HUBER, 0.5 * e**2 / HUBER, e - 0.5 * HUBER) for part, e in errors
+        ]
+
+    @property
+    def count(self) -> int:
+        """Errors that a mean loss is the mean of."""
+        return sum(len(part.flight) for part in self.parts) * len(HORIZONS) * 2
 
     def cost(self, model: Quadrotor, trims: np.ndarray) -> float:
         """Mean loss of a window and horizon; the trims' prior belongs to it."""
-        total, count = 0.0, 0
-        for part in self.parts:
-            found = [np.asarray(_scaled(model, c, _own(trims, c), self.sizes, part.measured)) for c in part.chunks]
-            norm = np.linalg.norm(np.concatenate(found)[: len(part.flight)], axis=-1)
-            loss = np.where(norm < HUBER, 0.5 * norm**2 / HUBER, norm - 0.5 * HUBER)
-            total, count = total + np.sum(part.weight[:, None, None] * loss), count + loss.size
+        total = sum(np.sum(loss) for loss in self.losses(model, trims))
         prior = np.sum((trims / TRIM) ** 2) + NO_MEAN * np.sum((self.share @ trims / TRIM / len(trims)) ** 2)
-        mean = float((total + 0.5 * prior) / count)
+        mean = float((total + 0.5 * prior) / self.count)
         return mean if np.isfinite(mean) else np.inf
 
     def normal_equations(
@@ -161,15 +206,23 @@ class Predictions:
         count, flights = len(numbers), len(trims)
         width = count + 3 * flights
         matrix, gradient, scatter = np.zeros((width, width)), np.zeros(width), np.zeros((width, width))
-        here = jnp.asarray(values), jnp.asarray([n.scale for n in numbers])
+        scale = np.array([n.scale for n in numbers])
+        here = jnp.asarray(values), jnp.asarray(scale)
+        # Where an effect's memory follows the flights, its numbers also act by what is remembered at a window's start.
+        kept = {type(e).name for e in model.effects if overrides(e, "follow")}
+        moved = {k: self._moved(model, numbers, values, k) for k, n in enumerate(numbers) if n.effect in kept}
         # Other bounds are no reason to compile anew.
         numbers = tuple(replace(n, low=-1.0, high=1.0) for n in numbers)
-        for part in self.parts:
+        for place, part in enumerate(self.parts):
             found = [
                 _linearised(model, numbers, *here, chunk, _own(trims, chunk), self.sizes, part.measured)
                 for chunk in part.chunks
             ]
-            error, slope = (np.concatenate([np.asarray(f[k]) for f in found])[: len(part.flight)] for k in (0, 1))
+            error, slope = (np.array(np.concatenate([f[k] for f in found])[: len(part.flight)]) for k in (0, 1))
+            for k, (other, by, elsewhere) in moved.items():
+                chunks = elsewhere.parts[place].chunks
+                there = [_scaled(other, c, _own(trims, c), self.sizes, part.measured) for c in chunks]
+                slope[..., k] = (np.concatenate(there)[: len(part.flight)] - error) * (scale[k] / by)
             heavy = part.weight[:, None, None, None] / np.maximum(np.linalg.norm(error, axis=-1, keepdims=True), HUBER)
             flat = slope.reshape(len(slope), -1, count + 3)
             pull = (heavy * error).reshape(len(error), -1)
@@ -183,6 +236,30 @@ class Predictions:
                 sums = np.add.reduceat(each, np.arange(0, len(mine), BLOCK))
                 scatter[np.ix_(at, at)] += sums.T @ sums
         return Normal(matrix, gradient, scatter, count, self.share, trimmed)
+
+    def _moved(
+        self, model: Quadrotor, numbers: tuple[Number, ...], values: np.ndarray, k: int
+    ) -> tuple[Quadrotor, float, Predictions]:
+        """The model with one number moved a little, by how much, and the windows as that model starts them."""
+        number = numbers[k]
+        by = STEP * number.scale * (1 if values[k] + STEP * number.scale <= number.high else -1)
+        other = with_values(model, numbers, values + by * (np.arange(len(values)) == k))
+        return other, by, self.started(other)
+
+
+def kinds_alike(model: Quadrotor, logs: Sequence[FlightLog]) -> dict[str, float]:
+    """Weights of flights by name, such that many of one kind do not drown the few of another.
+
+    Of one kind are flights in which `hold` errs alike in attitude half a second ahead, within a factor `ALIKE`.
+    """
+    errs = {}
+    for log in logs:
+        delay = delay_of(log, model.parameters)
+        windows = find_windows(log, HORIZONS, delay, float(model.parameters.gyro_delay))
+        if len(windows):
+            errs[log.name] = np.log(_norms(hold(windows, HORIZONS), windows)[:, -1, 0].mean() + 1e-9)
+    near = np.log(ALIKE)
+    return {name: 1 / sum(abs(own - other) < near for other in errs.values()) for name, own in errs.items()}
 
 
 def _part(flights: list[tuple], share: np.ndarray, measured: bool) -> _Part | None:

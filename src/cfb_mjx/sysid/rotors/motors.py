@@ -150,26 +150,62 @@ def fit_motors(
     Raises:
         CfbError: too little data, or ``per_motor`` with recordings that do not say which motor they are of.
     """
-    numbers = sorted({n for r in records for n in r.motors} - {0}) if per_motor else []
-    names = ", ".join(r.name for r in records)
-    if per_motor and not numbers:
-        raise CfbError(
-            f"{names}: does not say which motor it is of; name the columns omega1..omega4 to fit each on its own."
-        )
+    if per_motor:
+        _motor_numbers(records)
     asked = {"offset": offset, "asymmetric": asymmetric, "dead_time": dead_time}
-    extras, groups = frozenset(name for name, on in asked.items() if on), {}
-    for done, number in enumerate([None, *numbers]):
-        data = gather(records, number)
-        if data is None or data.rows < 50:
-            what = f"motor {number} has" if number else "there are"
-            raise CfbError(f"{names}: {what} too few rotor speeds in a row to fit; at least 50 rows without a gap.")
+    extras = frozenset(name for name, on in asked.items() if on)
+    common = MotorFit(_fit_group(_gathered(records, None), nominal, None, extras, None), {}, {}, tuple(records))
+    if progress is not None:
+        progress(1, 1 + len(_motor_numbers(records)) if per_motor else 1)
+    return each_motor(common, nominal, progress) if per_motor else common
+
+
+def each_motor(fit: MotorFit, nominal: Parameters, progress: Callable[[int, int], None] | None = None) -> MotorFit:
+    """The same with every motor fitted on its own, with the extras that all of them together need.
+
+    Args:
+        fit: of all motors as one.
+        nominal: where to start.
+        progress: called with (done, total).
+
+    Raises:
+        CfbError: too little data, or recordings that do not say which motor they are of.
+    """
+    numbers = _motor_numbers(fit.records)
+    groups = {}
+    for done, number in enumerate(numbers):
         # One motor alone has less to say about extras than all together.
-        decided = groups[0].extras if number else None
-        groups[number or 0] = _fit_group(data, nominal, number, extras, decided)
+        data = _gathered(fit.records, number)
+        groups[number] = _fit_group(data, nominal, number, fit.common.extras, fit.common.extras)
         if progress is not None:
-            progress(done + 1, 1 + len(numbers))
-    common = groups.pop(0)
-    return MotorFit(common, groups, _differences(groups), tuple(records))
+            progress(done + 2, 1 + len(numbers))
+    return MotorFit(fit.common, groups, _differences(groups), fit.records)
+
+
+def fit_again(fit: MotorFit, records: Sequence[MotorRecord], nominal: Parameters) -> MotorFit:
+    """The same model of all motors as one, with the extras it holds, fitted to other recordings."""
+    extras = fit.common.extras
+    common = _fit_group(_gathered(records, None), nominal, None, extras, extras)
+    return MotorFit(common, {}, {}, tuple(records))
+
+
+def _motor_numbers(records: Sequence[MotorRecord]) -> list[int]:
+    numbers = sorted({n for r in records for n in r.motors} - {0})
+    if not numbers:
+        raise CfbError(
+            f"{', '.join(r.name for r in records)}: does not say which motor it is of; name the columns "
+            "omega1..omega4 to fit each on its own."
+        )
+    return numbers
+
+
+def _gathered(records: Sequence[MotorRecord], number: int | None) -> MotorData:
+    data = gather(records, number)
+    if data is None or data.rows < 50:
+        what = f"motor {number} has" if number else "there are"
+        names = ", ".join(r.name for r in records)
+        raise CfbError(f"{names}: {what} too few rotor speeds in a row to fit; at least 50 rows without a gap.")
+    return data
 
 
 def _fit_group(data: MotorData, nominal: Parameters, motor: int | None, asked: frozenset, decided) -> GroupFit:

@@ -1,26 +1,38 @@
-"""Motors on a bench whose supply sags: do they follow the command, or the command times the voltage?"""
+"""Motors whose supply sags: on a bench, do they follow the command or the command times the voltage; in flight, how
+far do they follow the battery?"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cfb_mjx.logs.bench_tables import MotorRecord
-from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE
+from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE, BatterySag
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.rotors.motors import MotorFit, fit_motors
+from cfb_mjx.sysid.rotors.motors import MotorFit, each_motor, fit_again, fit_motors
 from cfb_mjx.sysid.rotors.steady import VARIES
 
+SURE = 3.0
+"""Standard deviations a slope must be away from nothing."""
 
-def fit_under_supply(records: Sequence[MotorRecord], nominal: Parameters, **options) -> tuple[MotorFit, list[str]]:
+
+def fit_under_supply(
+    records: Sequence[MotorRecord],
+    nominal: Parameters,
+    per_motor: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+    **extras: bool,
+) -> tuple[MotorFit, list[str]]:
     """Motors from commands, or from commands times voltage where all records have one that changes and it is likelier.
 
     Args:
         records: as for `fit_motors`.
         nominal: as for `fit_motors`.
-        **options: as for `fit_motors`.
+        per_motor: as for `fit_motors`.
+        progress: likewise.
+        **extras: likewise.
 
     Returns:
         The fit, whose gain is that at 3.7 V where the voltage counts, and what was decided, in words.
@@ -28,17 +40,94 @@ def fit_under_supply(records: Sequence[MotorRecord], nominal: Parameters, **opti
     Raises:
         CfbError: as `fit_motors`.
     """
-    plain = fit_motors(records, nominal, **options)
+
+    def finished(fit: MotorFit) -> MotorFit:
+        return each_motor(fit, nominal, progress) if per_motor else fit
+
+    plain = fit_motors(records, nominal, **extras)
     voltages = [r.battery_voltage for r in records]
     if any(v is None or not np.isfinite(v).all() for v in voltages) or np.std(np.concatenate(voltages)) < VARIES:
-        return plain, []
+        return finished(plain), []
     scaled = [replace(r, command=r.command * r.battery_voltage[:, None] / NOMINAL_VOLTAGE) for r in records]
-    followed = fit_motors(scaled, nominal, **options)
+    followed = fit_motors(scaled, nominal, **extras)
     gained = plain.common.optimum.loss - followed.common.optimum.loss
     if gained <= 0:
-        return plain, ["speed does not follow the voltage of the supply: the command alone explains it better."]
+        return finished(plain), [
+            "speed does not follow the voltage of the supply: the command alone explains it better."
+        ]
     said = (
         f"speed follows command times voltage (log-likelihood +{gained:.0f} over the command alone): the gain is that "
         f"at {NOMINAL_VOLTAGE} V; the effect battery_sag makes a model follow the voltage."
     )
-    return followed, [said]
+    return finished(followed), [said]
+
+
+@dataclass(frozen=True)
+class Sag:
+    """How far rotor speed follows the battery: slope and lag of `BatterySag`, and the slope's standard deviation."""
+
+    slope: float
+    lag: float
+    std: float
+
+
+SLOPES = (0.0, 0.5, 1.0)
+"""At which the likelihood is asked; a parabola through them tells the best."""
+LAGS = (0.02, 3.0)
+"""Of what the rotors feel behind the battery's voltage, s: every dip under load, or how empty it is."""
+
+
+def fit_with_sag(records: Sequence[MotorRecord], nominal: Parameters, **extras: bool) -> tuple[MotorFit, Sag | None]:
+    """Every motor on its own, and how far all follow the battery's voltage (``battery_sag``).
+
+    A speed that follows the voltage is, divided by ``1 + slope (V - 3.7 V) / 3.7 V``, that of a motor that does not.
+
+    Args:
+        records: as for `fit_motors`.
+        nominal: as for `fit_motors`.
+        **extras: as for `fit_motors`.
+
+    Returns:
+        The fit, whose constants are those at 3.7 V, and the slope; None where no voltage was logged, it hardly changes,
+        or the motors do not follow it.
+
+    Raises:
+        CfbError: as `fit_motors`.
+    """
+    fit = fit_motors(records, nominal, **extras)
+    voltages = [r.battery_voltage for r in records]
+    if any(v is None or not np.isfinite(v).all() for v in voltages) or np.std(np.concatenate(voltages)) < VARIES:
+        return each_motor(fit, nominal), None
+
+    def divided(slope: float, lag: float) -> tuple[MotorFit, float]:
+        """The fit to divided speeds, and its loss as one of the speeds that were measured."""
+        factors = [1 + slope * (_felt(r, lag) - NOMINAL_VOLTAGE) / NOMINAL_VOLTAGE for r in records]
+        pairs = zip(records, factors, strict=True)
+        found = fit_again(fit, [replace(r, rotor_speed=r.rotor_speed / f[:, None]) for r, f in pairs], nominal)
+        best = found.common.optimum
+        return found, best.loss + best.rows * float(np.mean(np.log(np.concatenate(factors))))
+
+    low, high = BatterySag.prior["slope"]
+    best, least = None, fit.common.optimum.loss
+    for lag in LAGS:
+        losses = [fit.common.optimum.loss, *(divided(slope, lag)[1] for slope in SLOPES[1:])]
+        bend, tilt, _ = np.polyfit(SLOPES, losses, 2)
+        slope = float(np.clip(-0.5 * tilt / bend, low, high)) if bend > 0 else 0.0
+        followed, loss = divided(slope, lag)
+        widening = float(np.max(followed.common.optimum.inflation))
+        sag = Sag(slope, lag, widening / float(np.sqrt(2 * bend)) if bend > 0 else np.inf)
+        if loss < least and slope > SURE * sag.std:
+            best, least = (followed, sag), loss
+    if best is None:
+        return each_motor(fit, nominal), None
+    return each_motor(best[0], nominal), best[1]
+
+
+def _felt(record: MotorRecord, lag: float) -> np.ndarray:
+    """(n,) voltage through a first-order filter, V, from the first reading on."""
+    felt = np.empty(len(record.time))
+    felt[0] = record.battery_voltage[0]
+    kept = np.exp(-np.diff(record.time) / lag)
+    for i, (now, share) in enumerate(zip(record.battery_voltage[1:], kept, strict=True)):
+        felt[i + 1] = now + (felt[i] - now) * share
+    return felt

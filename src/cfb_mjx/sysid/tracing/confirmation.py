@@ -20,12 +20,12 @@ class Verdict:
     """How a richer hypothesis does beside a poorer one on held-out flights.
 
     Attributes:
-        gain: drop of half the sum of squared innovations, nats.
+        gain: drop of half the sum of squared innovations, nats; None where predictions judged.
         t: standard normal where the richer one explains nothing.
         p_value: one-sided.
     """
 
-    gain: float
+    gain: float | None
     t: float
     p_value: float
 

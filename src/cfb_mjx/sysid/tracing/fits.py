@@ -43,12 +43,22 @@ class Fit:
         linear: its derivatives by the whole catalogue; None for one among many, which may not be taken.
         errors: (8,) `ERRORS` over all flights.
         by_flight: (L, 8) `ERRORS` in each flight that has prediction windows.
+        beside_hold: `beside_hold` of its predictions.
     """
 
     hypothesis: Hypothesis
     linear: Linear | None
     errors: np.ndarray
     by_flight: np.ndarray
+    beside_hold: float = 0.0
+
+
+def beside_hold(evaluation: Evaluation) -> float:
+    """The larger of attitude and velocity error at the last horizon (means), over what hold errs there."""
+    model, still = (evaluation.metrics(variant) for variant in ("commands_in", "hold"))
+    keys = [f"{quantity}@{max(evaluation.horizons):g}s" for quantity in ("attitude_mean_deg", "velocity_mean_mps")]
+    found = max(model[key] / still[key] for key in keys)
+    return float(found) if np.isfinite(found) else np.inf
 
 
 def fitted(search: Search, hypothesis: Hypothesis, whole: bool = True) -> Fit:
@@ -61,7 +71,7 @@ def as_it_is(search: Search, hypothesis: Hypothesis, whole: bool = True) -> Fit:
     linear = search.whole(hypothesis) if whole else None
     evaluation = predicted(search, hypothesis)
     flights = [errors_of(one) for one in evaluation.each if len(one.logs[0].windows)]
-    return Fit(hypothesis, linear, errors_of(evaluation), np.array(flights))
+    return Fit(hypothesis, linear, errors_of(evaluation), np.array(flights), beside_hold(evaluation))
 
 
 def completed(search: Search, fit: Fit) -> Fit:

@@ -10,10 +10,11 @@ import numpy as np
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import SENSOR_FAULTS, effect_to_mapping
-from cfb_mjx.parameters import ModelFile
+from cfb_mjx.parameters import Entry, ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
 from cfb_mjx.sysid.flight import usual_delay
-from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.refinement.numbers import PLANT
+from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import FORMULA
 from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
@@ -25,7 +26,8 @@ from cfb_mjx.sysid.tracing.rare import with_rare
 from cfb_mjx.sysid.tracing.residuals import residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
-from cfb_mjx.sysid.tracing.trace import Found, Trace, numbers_of, trace
+from cfb_mjx.sysid.tracing.together import RULES, Part, Together, fit_together, hypothesis_of, paired
+from cfb_mjx.sysid.tracing.trace import PATIENCE, Found, Trace, numbers_of, trace
 
 ENOUGH, SAME_LINE = 3, 0.1
 """Held-out flights from which lines are looked for there too, and Hz by which the two may differ."""
@@ -44,14 +46,20 @@ class Reported:
     uncertainty: dict
     found: Found | None = None
     verdict: Verdict | None = None
+    at_bound: list[str] = field(default_factory=list)
+    """Names of its numbers that stand where they may not go further."""
 
     def to_json(self) -> dict:
         """The layout of ``report.json``."""
         more = {} if self.found is None else {"buys": self.found.buys, "confusable_with": self.found.confusable}
         if self.found is not None:
-            more |= {"p_value_cross_validated": self.found.p_value, "gain_nats": self.found.gain}
+            more |= {"p_value_cross_validated": self.found.p_value}
+            more |= {} if self.found.gain is None else {"gain_nats": self.found.gain}
         if self.verdict is not None:
-            more |= {"held_out_gain_nats": self.verdict.gain, "held_out_t": self.verdict.t}
+            more |= {"held_out_t": self.verdict.t}
+            more |= {} if self.verdict.gain is None else {"held_out_gain_nats": self.verdict.gain}
+        if self.at_bound:
+            more |= {"at_bound": self.at_bound}
         return {
             "name": self.name,
             "p_value": self.p_value,
@@ -104,6 +112,10 @@ class Outcome:
     before: Evaluation
     after: Evaluation
     unexplained: Unexplained | None = None
+    motors: dict[str, Entry] = field(default_factory=dict)
+    """Constants of the motors, fitted anew."""
+    together: Together | None = None
+    """Where the drone lacks so much that its effects were fitted together and judged by predictions."""
 
     def to_json(self) -> dict:
         """The part of ``report.json`` that comes from the flights (DESIGN 6)."""
@@ -130,7 +142,7 @@ class Outcome:
             "unconfirmed": [item.to_json() for item in self.unconfirmed],
             "sensors": {name: {"value": v, "std": s} for name, (v, s) in self.trace.sensors.measured.items()},
             "search": self.trace.tried,
-        }
+        } | ({"motors": {name: _written(entry) for name, entry in self.motors.items()}} if self.motors else {})
 
     def model_file(self, name: str, provenance: dict) -> ModelFile:
         """The corrected model."""
@@ -141,11 +153,14 @@ class Outcome:
                 effects.append(mapping | {"uncertainty": item.uncertainty, "p_value": item.p_value})
         if self.unexplained is not None and self.unexplained.proposal is not None:
             effects.append(effect_to_mapping(self.hypothesis.effect(FORMULA)))
-        replaced = {item["name"] for item in effects} | set(SENSOR_FAULTS)
+        replaced = {item["name"] for item in effects} | {item.name for item in self.unconfirmed} | set(SENSOR_FAULTS)
         kept = [item for item in self.base.effects if item["name"] not in replaced]
+        if self.together is not None:
+            kept = [item for item in kept if item["name"] in self.hypothesis.present]
         named = ", ".join(item.name for item in self.reported) or "nothing"
         return replace(
             self.base,
+            entries={**self.base.entries, **self.motors},
             name=name,
             description=f"{self.base.name} with what its flights lacked: {named}",
             effects=(*kept, *effects, *self.faults.to_mappings()),
@@ -172,7 +187,15 @@ def close_loop(
     declared = Quadrotor.from_file(base).effects
     parameters = base.parameters()
     delay = usual_delay(fit, parameters)
-    found = trace(fit, parameters, delay, progress, declared, checkpoint)
+    speeds = all(log.rotor_speed is not None for log in fit)
+    found = trace(fit, parameters, delay, progress, declared, checkpoint, 1 if speeds else PATIENCE)
+    if found.fit.beside_hold > RULES.far_off:
+        whole = _whole(found, fit, held_out, base, progress)
+        if whole is not None:
+            return whole
+        if found.fit.beside_hold > 1:
+            # That may have been cut short.
+            found = trace(fit, parameters, delay, progress, declared)
     # Biases of the held-out sensors come from their own kinematics; no model is fitted.
     check = replace(check_sensors(held_out, delay, float(parameters.gyro_delay)), faults=found.sensors.faults)
     judge = found.search.beside(held_out, check)
@@ -189,6 +212,65 @@ def close_loop(
     faults = replace(found.sensors.faults, motor_shift=hypothesis.shift)
     after = evaluate(hypothesis.model(parameters), held_out, faults=faults)
     return Outcome(found, base, reported, unconfirmed, hypothesis, faults, before, after, unexplained)
+
+
+def _whole(
+    found: Trace, fit: list[FlightLog], held_out: list[FlightLog], base: ModelFile, progress: Callable[[str], None]
+) -> Outcome | None:
+    """All effects at once; None where that predicts the fit flights hardly better than what the search found."""
+    check = replace(found.sensors, faults=HEALTHY, findings=[])
+    search = Search.start(fit, base.parameters(), found.search.delay, check, found.search.declared, PLANT)
+    whole = fit_together(fit, base, search, progress)
+    if not whole.beside_hold < (1 - RULES.better) * found.fit.beside_hold:
+        return None
+    progress("judging on held-out flights")
+    model = whole.model
+    search = replace(search, parameters=model.parameters, _flights={})
+    before, after = evaluate(Quadrotor.from_file(base), held_out), evaluate(model, held_out)
+    reported, unconfirmed = [], []
+    for part in whole.parts:
+        entry = _reported(search, part, after, held_out)
+        stands = entry.verdict.t >= RULES.sure
+        (reported if stands else unconfirmed).append(entry)
+    if unconfirmed:
+        model = whole.without([item.name for item in unconfirmed])
+        after = evaluate(model, held_out)
+        for item in reported:
+            effect = next(e for e in model.effects if type(e).name == item.name)
+            item.parameters = {key: np.asarray(getattr(effect, key)).tolist() for key in item.parameters}
+    gone = {item.name for item in unconfirmed}
+    hypothesis = search.learned(hypothesis_of(search, model, gone))
+    beside = search.beside(held_out, replace(check_sensors(held_out, *search.delays), faults=HEALTHY))
+    lines = find_lines(residual_rows(search, hypothesis))
+    if len(held_out) >= ENOUGH:
+        again = find_lines(residual_rows(beside, hypothesis))
+        lines = [a for a in lines if any(_same(a, b) for b in again)]
+    left = Unexplained(None, lines) if lines else None
+    traced = replace(found, hypothesis=hypothesis, sensors=check, tried=[*found.tried, *whole.tried], search=search)
+    return Outcome(traced, base, reported, unconfirmed, hypothesis, HEALTHY, before, after, left, whole.motors, whole)
+
+
+def _reported(search: Search, part: Part, after: Evaluation, held_out: list[FlightLog]) -> Reported:
+    """An effect fitted with others, judged by predictions of held-out flights without it."""
+    t, p_value = paired(evaluate(part.without, held_out, keep_diverged=True), after)
+    without = hypothesis_of(search, part.without, {part.name})
+    found = Found(
+        part.name,
+        part.p_value,
+        None,
+        part.buys,
+        part.parameters,
+        part.uncertainty,
+        part.confusable,
+        without,
+    )
+    verdict = Verdict(None, t, p_value)
+    return Reported(part.name, p_value, part.parameters, part.uncertainty, found, verdict, part.at_bound)
+
+
+def _written(entry: Entry) -> dict:
+    std = None if entry.std is None else np.asarray(entry.std).tolist()
+    return {"value": np.asarray(entry.value).tolist(), "std": std}
 
 
 def _borne_out(wide: Search, proposal: Proposal) -> bool:

@@ -36,8 +36,8 @@ class Found:
 
     name: str
     p_value: float
-    gain: float
-    """Nats on blocks left out."""
+    gain: float | None
+    """Nats on blocks left out; None where predictions judged."""
     buys: float
     """Largest share by which a prediction error of the fit flights grows without it."""
     parameters: dict[str, float | list[float]]
@@ -95,6 +95,7 @@ def trace(
     progress: Callable[[str], None] = lambda _: None,
     declared: tuple[Effect, ...] = (),
     checkpoint: Checkpoint | None = None,
+    patience: int = PATIENCE,
 ) -> Trace:
     """Search the catalogue for what a model lacks.
 
@@ -105,6 +106,8 @@ def trace(
         progress: told what happens.
         declared: effects the declared model has already.
         checkpoint: where the search is kept while it runs, and taken up from.
+        patience: so many candidates in a row that lower no error end the search while the model predicts worse than
+            `hold` does; it ends after `PATIENCE` in any case.
     """
     checkpoint = checkpoint or Checkpoint()
     progress("comparing the sensors with each other")
@@ -126,7 +129,7 @@ def trace(
             saved.vain,
             dict.fromkeys(saved.left_out),
         )
-    while len(fit.hypothesis.present) < LARGEST and vain < PATIENCE:
+    while len(fit.hypothesis.present) < LARGEST and vain < (patience if fit.beside_hold > 1 else PATIENCE):
         ranking = rank(search, fit, refused)
         tried.append({"present": list(fit.hypothesis.present), "ranking": [_line(v, e) for e, v in ranking[:8]]})
         passing = [(e, v) for e, v in ranking if significant(e, len(search.names))]

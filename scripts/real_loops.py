@@ -1,0 +1,124 @@
+"""Close the loop on real flights with defaults, one drone after another; write docs/real-loops.md.
+
+    python scripts/real_loops.py NAME=FOLDER,MODEL,MASS_KG ... [--work out/real-loops]
+
+FOLDER holds fit/ and validation/. MODEL is a preset, a model file, or the NAME of a drone before it: then the search
+starts from the model found there. Nothing is fitted to validation/. What lies in the work folder is used again. Only
+aggregate numbers are written; the flights themselves never enter the project.
+"""
+
+import argparse
+import json
+import math
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+from cfb_mjx.cli.runtime import environment
+from cfb_mjx.files import write_text
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "real-loops.md"
+HORIZONS = ("0.05", "0.1", "0.2", "0.5")
+VARIANTS = {
+    "hold": "hold",
+    "commands_in": "commands in",
+    "rotor_speed_in": "rotor speeds in",
+    "commands_in_observer": "commands in, observer",
+    "rotor_speed_in_observer": "rotor speeds in, observer",
+}
+INTRODUCTION = """
+`cfb close-loop` on recordings of real drones, with defaults: no effect, weight or setting is typed in. Each section is
+one drone: the command, the first paragraph of its report, the effects in the order of what each buys, and the errors of
+the corrected model on flights nothing was fitted to. *Buys*: by which share an effect lowers the mean error of the
+fitted flights' predictions (attitude and velocity, 0.1 to 0.5 s ahead, over what hold errs), the others having moved to
+make up for it. *t*: standard deviations by which predictions of the other flights are better with it.
+"""
+
+
+def cfb(*arguments: str) -> None:
+    """Run a command of the library."""
+    subprocess.run([Path(sys.executable).with_name("cfb"), *arguments], check=True)
+
+
+def close(name: str, folder: Path, model: str, mass: str, work: Path) -> tuple[list[str], float | None]:
+    """Close one loop unless it is there; the command's arguments and its processor time in s."""
+    sides = {side: sorted(str(path) for path in (folder / side).iterdir()) for side in ("fit", "validation")}
+    own = work / name
+    arguments = ["--model", model, "--set", f"mass={mass}", "-o", str(own)]
+    if not (own / "report.json").exists():
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        cfb("close-loop", "--fit", *sides["fit"], "--held-out", *sides["validation"], *arguments)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        write_text(own / "seconds.txt", f"{used:.0f}\n")
+    cfb("evaluate", *sides["validation"], "--model", f"{own}/model.yaml", "--observer", "--json", f"{own}/errors.json")
+    seconds = own / "seconds.txt"
+    return sides["fit"], float(seconds.read_text()) if seconds.exists() else None
+
+
+def values(effect: dict) -> str:
+    """The numbers of an effect with their standard deviations."""
+    found = []
+    for key, value in effect["parameters"].items():
+        std = effect["uncertainty"].get(key)
+        several = isinstance(value, list)
+        pairs = zip(value, std, strict=True) if several else [(value, std)]
+        found.append(f"{key} " + ", ".join(f"{v:.4g}" if s is None else f"{v:.4g} ± {s:.1g}" for v, s in pairs))
+    return "; ".join(found)
+
+
+def section(name: str, folder: Path, model: str, mass: str, work: Path, before: dict[str, Path]) -> str:
+    """One drone."""
+    start = str(before[model] / "model.yaml") if model in before else model
+    fit, seconds = close(name, folder, start, mass, work)
+    own = work / name
+    report, errors = (json.loads((own / file).read_text()) for file in ("report.json", "errors.json"))
+    shown = f"{model}/model.yaml" if model in before else model
+    lines = [f"## {name}", "", "```sh"]
+    lines += [f"cfb close-loop --fit fit/* --held-out validation/* --model {shown} --set mass={mass}", "```", ""]
+    cost = "" if seconds is None else f" {seconds / 60:.1f} minutes of processor time."
+    lines += [f"{len(fit)} flights to learn from, {len(errors['logs'])} to be judged on.{cost}", ""]
+    lines += [f"> {report['summary']}", "", "| effect | numbers | buys | t | at a bound |", "|---|---|---:|---:|---|"]
+    for effect in report["effects"]:
+        bound = ", ".join(effect.get("at_bound", []))
+        buys = f"{100 * effect['buys']:.0f} %" if "buys" in effect else ""
+        t = f"{effect['held_out_t']:.1f}" if "held_out_t" in effect else ""
+        lines.append(f"| {effect['name']} | {values(effect)} | {buys} | {t} | {bound} |")
+    gone = ", ".join(effect["name"] for effect in report["unconfirmed"])
+    lines += ["", f"Fitted, but not borne out by the other flights: {gone}." if gone else ""]
+    formula = report["formula"] or []
+    lines += ["", "Formula terms: " + ("; ".join(formula) if formula else "none") + ".", ""]
+    head = " | ".join(f"{1e3 * float(h):.0f} ms" for h in HORIZONS)
+    lines += [f"| mean attitude error, rad / velocity error, m/s | {head} |", "|---|" + "---|" * len(HORIZONS)]
+    for key, words in VARIANTS.items():
+        found = errors[key]
+        cells = [
+            f"{math.radians(found[f'attitude_mean_deg@{h}s']):.3f} / {found[f'velocity_mean_mps@{h}s']:.3f}"
+            for h in HORIZONS
+        ]
+        lines.append(f"| {words} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """All drones, then the page."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("drones", nargs="+", metavar="NAME=FOLDER,MODEL,MASS_KG")
+    parser.add_argument("--work", type=Path, default=ROOT / "out" / "real-loops")
+    options = parser.parse_args()
+    sections, before = [], {}
+    for drone in options.drones:
+        name, _, rest = drone.partition("=")
+        folder, model, mass = rest.split(",")
+        sections.append(section(name, Path(folder), model, mass, options.work, before))
+        before[name] = options.work / name
+    facts = ", ".join(f"{name} {value}" for name, value in environment().items())
+    by = f"Written by `python scripts/real_loops.py`; do not edit. {facts}"
+    head = "# The loop closed by itself on real drones"
+    write_text(PAGE, "\n".join([head, "", by, "", INTRODUCTION.strip(), "", "\n\n".join(sections), ""]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,433 @@
+"""All that a drone lacks at once: for real drones, on which no effect alone makes predictions better.
+
+A search that takes in one effect after another asks of each whether half a second of flight is predicted better with
+it. Where ten effects are missing the answer is no ten times. Here every effect is judged where it acts, and only the
+whole set by predictions:
+
+1. commands to rotor speeds: the motors on their own, from measured rotor speeds;
+2. what a drone in one piece usually lacks (`PLANT`), all at once, by predictions;
+3. what only some drones have (a load, wind): absent effects in the order of what the innovations say for them, each
+   tried beside the rest, kept where predictions gain;
+4. what does not earn its place beside the others goes, the least first.
+
+Effects the model declares already are what is known of the type of drone: they stay as they are, but for those that are
+a drone's own (`OWN`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import norm
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.bench_tables import MotorRecord
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.model.effects import CATALOGUE, BatterySag, CommandDelay, Effect
+from cfb_mjx.parameters import Entry, ModelFile
+from cfb_mjx.sysid.evaluation import Evaluation, LogEvaluation, evaluate
+from cfb_mjx.sysid.metrics import BLOCK
+from cfb_mjx.sysid.refinement import Number, Refinement, plausible_numbers, refine
+from cfb_mjx.sysid.refinement.numbers import PLANT
+from cfb_mjx.sysid.refinement.predictions import kinds_alike
+from cfb_mjx.sysid.rotors.motor_tracks import record_of
+from cfb_mjx.sysid.rotors.supply import SURE, fit_with_sag
+from cfb_mjx.sysid.tracing import columns as cols
+from cfb_mjx.sysid.tracing.acceptance import CLEAR
+from cfb_mjx.sysid.tracing.columns import SHIFT, Column
+from cfb_mjx.sysid.tracing.evidence import Evidence
+from cfb_mjx.sysid.tracing.fits import beside_hold
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.search import Search
+
+OWN = ("cog_offset", "thrust_tilt", "torque_scale", "command_delay", "motor_asymmetry", "battery_sag")
+"""Of `PLANT`, what differs from one drone of a type to the next."""
+OF_MOTORS = ("command_delay", "motor_asymmetry", "battery_sag")
+"""Of `OWN`, what measured rotor speeds tell."""
+MOTORS = (*OF_MOTORS, "motor_gain_mismatch", "motor_time_constant", "motor_second_order", "motor_thermal_drift")
+"""Effects that are not looked for where the motors were fitted to rotor speeds."""
+MOTOR_ENTRIES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
+
+
+@dataclass(frozen=True)
+class Rules:
+    """What is tried and what stays; shares of the loss, an error over what `hold` errs."""
+
+    far_off: float = 1 / 3
+    """A model lacks much if, after half a second, it errs by more than this share of what hold errs."""
+    steps: int = 12
+    """Of a fit at most."""
+    tried: int = 2
+    """Candidates of step 3 tried at a time, the likeliest first."""
+    rounds: int = 3
+    """Of step 3 at most."""
+    trial_steps: int = 5
+    """Of a trial at most."""
+    better: float = 0.2
+    """The whole must lower a search's error beside hold by this share, or the search's own findings stand."""
+    motor_rows: int = 12_000
+    """That the motors are fitted to, about: the middles of flights."""
+    motor_piece: float = 3.0
+    """Seconds of a flight at least, of so many flights evenly spread as that allows."""
+    windows: int = 400
+    """Predicted at most in a fit."""
+    gain: float = 0.05
+    """A candidate must lower the loss by this share, half of it in its first step."""
+    worth: float = 0.005
+    """An effect must lower it by this share beside all others."""
+    confused: float = 0.9
+    """Correlation of two effects' numbers from which they are hardly told apart."""
+    sure: float = 2.3
+    """Standard deviations by which held-out flights must bear an effect out."""
+
+
+RULES = Rules()
+
+
+@dataclass(frozen=True)
+class Part:
+    """One effect of the whole.
+
+    Attributes:
+        name: of the effect.
+        parameters: its numbers by field, and their standard deviations; NaN where one stands at a bound.
+        at_bound: names of numbers that do.
+        without: the drone without it, the others shifted to make up for it.
+        buys: by which share it lowers the mean error of the fit flights' predictions: attitude and velocity, at all
+            horizons, commands and rotor speeds in, each over what hold errs.
+        confusable: effects whose numbers make up for its own.
+        t, p_value: of the fit flights' errors with it against those without.
+    """
+
+    name: str
+    parameters: dict[str, Any]
+    uncertainty: dict[str, Any]
+    at_bound: list[str]
+    without: Quadrotor
+    buys: float
+    confusable: list[str]
+    t: float
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Together:
+    """Outcome of `fit_together`.
+
+    Attributes:
+        model: the drone with everything that stays.
+        fit: of its effects.
+        motors: entries of the model file that the motors' fit replaces.
+        parts: its effects, what buys most first.
+        tried: what was looked at, as in a search.
+        evaluation: of its predictions of the fit flights.
+    """
+
+    model: Quadrotor
+    fit: Refinement
+    motors: dict[str, Entry]
+    parts: list[Part]
+    tried: list[dict]
+    evaluation: Evaluation
+
+    @property
+    def beside_hold(self) -> float:
+        """Of its predictions of the fit flights."""
+        return beside_hold(self.evaluation)
+
+    def without(self, names: Collection[str]) -> Quadrotor:
+        """The drone without some of its parts, the others moved to make up for them."""
+        fitted = set(_fitted(self.fit))
+        model = _bare(self.fit, self.fit.without([name for name in names if name in fitted]).model)
+        for name in set(names) - fitted:
+            model = _neutral(model, name)
+        return model
+
+
+def fit_together(
+    logs: Sequence[FlightLog],
+    base: ModelFile,
+    search: Search,
+    say: Callable[[str], None] = lambda _: None,
+    rules: Rules = RULES,
+) -> Together:
+    """Fit all that a drone lacks at once.
+
+    Args:
+        logs: flights to fit, as recorded; run with x64 enabled.
+        base: the declared model.
+        search: over the same flights, for what the innovations say.
+        say: told what happens.
+        rules: what is tried and what stays.
+    """
+    motors = fitted_motors(logs, base, say, rules)
+    start = _started(base, motors)
+    declared = {mapping["name"] for mapping in base.effects}
+    told = OF_MOTORS if motors.entries else ()
+    names = [name for name in PLANT if name not in told and (name in OWN or name not in declared)]
+    say(f"fitting {len(names)} effects together")
+    fit = partial(_fit, logs, kinds_alike(start, logs), rules)
+    found = fit(start, plausible_numbers(start.parameters, names), rules.steps, {})
+    tried: list[dict] = []
+    refused: set[str] = {SHIFT, *(MOTORS if motors.entries else ())}
+    if "thrust_scale" in names:
+        # No flight tells more mass from less thrust.
+        refused.add("payload")
+    for _ in range(rules.rounds):
+        ranking = ranked(search, found.model, refused)
+        tried.append({"present": _names(found.model), "ranking": [_line(v, e) for e, v in ranking[:8]]})
+        better = None
+        clear = [(evidence, variant) for evidence, variant in ranking if evidence.t > CLEAR]
+        for evidence, variant in clear[: rules.tried]:
+            name = variant[0].effect
+            say(f"trying {name} beside the others")
+            model, numbers = _with(found, variant, evidence)
+            reached = found.foreseen(numbers, model)
+            if reached < (1 - rules.gain / 2) * found.cost[1]:
+                richer = fit(model, (*found.numbers, *numbers), rules.trial_steps, found.trims)
+                reached = richer.cost[1]
+                # What drives another number out of what is plausible stands in for something else.
+                pressed = set(richer.pressed) - set(found.pressed)
+                better = richer if reached < (1 - rules.gain) * found.cost[1] and not pressed else None
+            tried[-1] |= {"tried": name, "drop": {"loss": 1 - reached / found.cost[1]}}
+            if better is not None:
+                break
+            refused.add(name)
+        if better is None:
+            break
+        found = better
+    found = _lean(found, fit, rules, say)
+    model = _bare(found, found.model)
+    return Together(model, found, motors.entries, _parts(found, motors, rules, say), tried, _predicted(model, logs))
+
+
+@dataclass(frozen=True)
+class Motors:
+    """What commands and measured rotor speeds tell.
+
+    Attributes:
+        entries: of a model file.
+        effects: of the motors, each with standard deviations by field.
+    """
+
+    entries: dict[str, Entry] = field(default_factory=dict)
+    effects: tuple[tuple[Effect, dict[str, float]], ...] = ()
+
+
+def fitted_motors(
+    logs: Sequence[FlightLog], base: ModelFile, say: Callable[[str], None], rules: Rules = RULES
+) -> Motors:
+    """Each motor's constants, the dead time of all, and how far they follow the battery; nothing without rotor speeds.
+
+    Args:
+        logs: flights; of long ones the middle is enough.
+        base: the declared model.
+        say: told what happens.
+        rules: how much is enough.
+    """
+    flown = [log for log in logs if log.rotor_speed is not None]
+    if not flown:
+        return Motors()
+    say("fitting the motors to the rotor speeds")
+    least = rules.motor_piece / float(np.median([log.nominal_interval for log in flown]))
+    count = min(len(flown), max(1, round(rules.motor_rows / least)))
+    chosen = [flown[i] for i in np.linspace(0, len(flown) - 1, count).round().astype(int)]
+    records = [_middle(log, rules.motor_rows // count) for log in chosen]
+    fit, sag = fit_with_sag(records, base.parameters(), offset=True)
+    values = {name: fit.values(name) for name in MOTOR_ENTRIES}
+    effects = []
+    if "dead_time" in fit.common.extras and "asymmetric" not in fit.common.extras:
+        # Beside a dead time of its own the lag is the motors' alone, not the one lag that is nearest to both.
+        lag = "motor_time_constant"
+        each = [fit.motors[number].optimum for number in sorted(fit.motors)]
+        values[lag] = np.array([o.value(lag) for o in each]), np.array([o.std(lag) for o in each])
+        late, best = "dead_time", fit.common.optimum
+        delay = float(np.clip(best.value(late), *CommandDelay.prior["delay"]))
+        if delay > SURE * best.std(late):
+            effects.append((CommandDelay(delay), {"delay": best.std(late)}))
+    if sag is not None:
+        effects.append((BatterySag(level=0.0, slope=sag.slope, lag=sag.lag), {"slope": sag.std}))
+    source = f"fitted to the rotor speeds of {len(records)} flights"
+    return Motors({name: Entry(v[0], source, v[1]) for name, v in values.items() if v is not None}, tuple(effects))
+
+
+def _middle(log: FlightLog, rows: int) -> MotorRecord:
+    """The motors in the middle of a flight, with the battery's voltage."""
+    skipped = max(0, (len(log) - rows) // 2)
+    part = log.rows(np.arange(skipped, len(log) - skipped))
+    voltage = part.battery_voltage
+    known = None if voltage is None else np.isfinite(voltage)
+    if known is not None and known.any():
+        voltage = np.interp(part.time, part.time[known], voltage[known])
+    return replace(record_of(part), battery_voltage=voltage)
+
+
+def _started(base: ModelFile, motors: Motors) -> Quadrotor:
+    """The declared model with its motors fitted anew."""
+    model = Quadrotor.from_file(replace(base, entries={**base.entries, **motors.entries}))
+    if not motors.entries:
+        return model
+    kept = tuple(e for e in model.effects if type(e).name not in OF_MOTORS)
+    return Quadrotor(model.parameters, (*kept, *(e for e, _ in motors.effects)), body=model.body)
+
+
+def hypothesis_of(search: Search, model: Quadrotor, absent: Collection[str] = ()) -> Hypothesis:
+    """A model as a search has it: every effect of the catalogue, most of them neutral, as are those ``absent``."""
+    neutral = cols.neutral_effects(search.names)
+    nothing = Hypothesis(neutral, origin=neutral)
+    own = {type(e).name: e for e in model.effects if type(e).name not in absent}
+    return replace(
+        nothing, effects=tuple(own.get(type(e).name, e) for e in nothing.effects), present=tuple(own), lead=0.0
+    )
+
+
+def ranked(search: Search, model: Quadrotor, refused: set[str]) -> list[tuple[Evidence, list[Column]]]:
+    """Absent effects by what the innovations say for each beside the others, the largest gain first."""
+    search = replace(search, parameters=model.parameters, _flights={})
+    hypothesis = search.learned(hypothesis_of(search, model))
+    best = search.probes(hypothesis, search.whole(hypothesis))
+    return sorted((pair for name, pair in best.items() if name not in refused), key=lambda pair: -pair[0].gain)
+
+
+def paired(poorer: Evaluation, better: Evaluation) -> tuple[float, float]:
+    """How surely the second predicts the same flights better: t over blocks of windows, and its one-sided p."""
+    pairs = zip(poorer.logs, better.logs, strict=True)
+    return _surely([_losses(less) - _losses(more) for less, more in pairs if len(less.windows)])
+
+
+def _surely(gains: Sequence[np.ndarray]) -> tuple[float, float]:
+    """t and p of gains (W,) of windows in the order they were flown, several flights or kinds of prediction."""
+    blocks = np.array([each[i : i + BLOCK].sum() for each in gains for i in range(0, len(each), BLOCK)])
+    spread = np.sqrt(len(blocks) / max(len(blocks) - 1, 1) * np.sum((blocks - blocks.mean()) ** 2))
+    t = float(blocks.sum() / max(spread, 1e-300))
+    return t, float(norm.sf(t))
+
+
+def _losses(one: LogEvaluation) -> np.ndarray:
+    """(W,) of each window: errors of attitude and velocity at the last horizon over the flight's mean of hold."""
+    errors, still = one.errors["commands_in"], one.errors["hold"]
+    parts = [errors[q][:, -1] / still[q][:, -1].mean() for q in ("attitude", "velocity")]
+    return np.minimum(np.nan_to_num(np.sum(parts, axis=0), nan=1e3), 1e3)
+
+
+def _predicted(model: Quadrotor, logs: Sequence[FlightLog]) -> Evaluation:
+    return evaluate(model, logs, keep_diverged=True)
+
+
+def _names(model: Quadrotor) -> list[str]:
+    return [type(e).name for e in model.effects]
+
+
+def _line(variant: list[Column], found: Evidence) -> dict:
+    return {"name": variant[0].effect, "gain": found.gain, "t": found.t, "p_value": found.p_value}
+
+
+def _fit(
+    logs: Sequence[FlightLog],
+    weights: Mapping[str, float],
+    rules: Rules,
+    model: Quadrotor,
+    numbers: Sequence[Number],
+    steps: int,
+    trims: Mapping[str, np.ndarray],
+) -> Refinement:
+    return refine(model, logs, numbers, weights=weights, trims=trims, iterations=steps, most_windows=rules.windows)
+
+
+def _with(found: Refinement, variant: list[Column], evidence: Evidence) -> tuple[Quadrotor, tuple[Number, ...]]:
+    """The model with one more effect at a tenth of what the innovations give it, and the effect's numbers.
+
+    All of it at once might be far off, for what they see of an effect and what predictions ask of it may differ.
+    """
+    kind = CATALOGUE[variant[0].effect]
+    effect: Effect = kind.neutral()
+    for key, value in variant[0].probe:
+        effect = eqx.tree_at(lambda e, k=key: getattr(e, k), effect, jnp.full_like(getattr(effect, key), value))
+    for column, value in zip(variant, evidence.values, strict=True):
+        old, by = getattr(effect, column.field), 0.1 * float(value) * column.scale
+        new = old + by if column.index is None else old.at[column.index].add(by)
+        effect = eqx.tree_at(lambda e, f=column.field: getattr(e, f), effect, new)
+    model = Quadrotor(found.model.parameters, (*found.model.effects, effect), body=found.model.body)
+    return model, plausible_numbers(model.parameters, [kind.name])
+
+
+def _lean(found: Refinement, fit: Callable[..., Refinement], rules: Rules, say: Callable[[str], None]) -> Refinement:
+    """The fit with what does not earn its place held at neutral, the least first, fitted anew until all else does."""
+    while True:
+        gone: list[str] = []
+        while rest := [name for name in _fitted(found) if name not in gone]:
+            growth = {name: found.growth([*gone, name]) for name in rest}
+            least = min(rest, key=growth.get)
+            if growth[least] > rules.worth * found.cost[1] * (1 + len(gone)):
+                break
+            gone.append(least)
+        if not gone:
+            return found
+        say(f"leaving out {', '.join(gone)}")
+        numbers = [n.held_at_neutral if n.effect in gone else n for n in found.numbers]
+        found = fit(found.without(gone).model, numbers, rules.trial_steps, found.trims)
+
+
+def _fitted(found: Refinement) -> list[str]:
+    """Names of the effects whose numbers may move."""
+    return list(dict.fromkeys(n.effect for n in found.numbers if not n.held))
+
+
+def _bare(found: Refinement, model: Quadrotor) -> Quadrotor:
+    """A model without the effects that a fit held at neutral."""
+    held = {n.effect for n in found.numbers} - set(_fitted(found))
+    effects = tuple(e for e in model.effects if type(e).name not in held)
+    return Quadrotor(model.parameters, effects, body=model.body)
+
+
+def _parts(found: Refinement, motors: Motors, rules: Rules, say: Callable[[str], None]) -> list[Part]:
+    say("leaving out one effect after another")
+    whole = found.left
+    error = _mean(whole.errors)
+    told = {type(e).name: std for e, std in motors.effects}
+    parts = []
+    for name in [*_fitted(found), *told]:
+        less = found.judged(_neutral(found.model, name)) if name in told else found.without([name])
+        gains = [(a - b).sum(axis=(1, 2)) for a, b in zip(less.losses, whole.losses, strict=True)]
+        t, p_value = _surely(gains)
+        effect = next(e for e in found.model.effects if type(e).name == name)
+        std = told.get(name) or found.uncertainty(name)
+        parts.append(
+            Part(
+                name,
+                {key: np.asarray(getattr(effect, key)).tolist() for key in std},
+                std,
+                [n.name for n in found.numbers if n.effect == name and found.at_bound(n)],
+                _bare(found, less.model),
+                1 - error / _mean(less.errors),
+                [] if name in told else _confusable(found, name, rules.confused),
+                t,
+                p_value,
+            )
+        )
+    return sorted(parts, key=lambda part: -part.buys)
+
+
+def _neutral(model: Quadrotor, name: str) -> Quadrotor:
+    effects = tuple(type(e).neutral() if type(e).name == name else e for e in model.effects)
+    return Quadrotor(model.parameters, effects, body=model.body)
+
+
+def _mean(errors: list[np.ndarray]) -> float:
+    """Over all windows, horizons and quantities."""
+    return float(np.concatenate([each.ravel() for each in errors]).mean())
+
+
+def _confusable(found: Refinement, name: str, limit: float) -> list[str]:
+    """Effects of which a number goes with one of this effect's."""
+    # Numbers at a bound go with none.
+    correlation = np.nan_to_num(np.abs(found.correlation))
+    effects = np.array([n.effect for n in found.numbers])
+    most = correlation[effects == name].max(axis=0)
+    return [other for other in dict.fromkeys(effects[effects != name]) if most[effects == other].max() > limit]
