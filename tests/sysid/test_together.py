@@ -9,15 +9,17 @@ import pytest
 
 from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.model.effects import effect_to_mapping
-from cfb_mjx.parameters import load_model_file
+from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.refinement.numbers import PLANT
 from cfb_mjx.sysid.sensor_faults import HEALTHY
-from cfb_mjx.sysid.tracing.fits import beside_hold
+from cfb_mjx.sysid.tracing import outcome
+from cfb_mjx.sysid.tracing.fits import Fit, beside_hold
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
-from cfb_mjx.sysid.tracing.together import Rules, fit_together, paired
+from cfb_mjx.sysid.tracing.together import Rules, fit_together, names_to_fit, paired
+from cfb_mjx.sysid.tracing.trace import Trace
+from cfb_mjx.view.closing_words import verdict
 
 pytestmark = pytest.mark.xdist_group("together")
 
@@ -68,14 +70,59 @@ def test_motors_come_from_their_own_rotor_speeds(campaign, whole):
     assert not {"motor_gain_mismatch", "motor_time_constant"} & {part.name for part in whole.parts}
 
 
-def test_effects_that_the_model_declares_stay_as_they_are(campaign, whole):
+def test_effects_that_the_model_declares_stay_as_they_are():
     """What is known of the type is not fitted again; a drone's own place of the centre of gravity is."""
-    known = next(e for e in whole.model.effects if type(e).name == "blade_flapping")
-    base = replace(GUARDS, effects=(effect_to_mapping(known), {"name": "cog_offset", "parameters": {"offset": [0, 0]}}))
-    check = replace(check_sensors(campaign.fit, 0.008, 0.0), faults=HEALTHY, findings=[])
-    search = Search.start(campaign.fit, base.parameters(), 0.008, check, Quadrotor.from_file(base).effects, PLANT)
-    again = fit_together(campaign.fit, base, search, rules=replace(RULES, steps=2, rounds=0, trial_steps=1))
-    kept = next(e for e in again.model.effects if type(e).name == "blade_flapping")
-    assert float(kept.coefficient) == float(known.coefficient)
-    assert "blade_flapping" not in [part.name for part in again.parts]
-    assert "cog_offset" in [part.name for part in again.parts]
+    declared = tuple({"name": name, "parameters": {}} for name in ("blade_flapping", "thrust_scale", "cog_offset"))
+    known = names_to_fit(replace(GUARDS, effects=declared), motors_told=False)
+    assert set(PLANT) - set(known) == {"blade_flapping", "thrust_scale"}
+    told = names_to_fit(GUARDS, motors_told=True)
+    assert set(PLANT) - set(told) == {"command_delay", "motor_asymmetry", "battery_sag"}
+
+
+@pytest.fixture(scope="module")
+def closed(campaign, whole):
+    """What `close_loop` makes of it, the search having found nothing."""
+    check = check_sensors(campaign.fit, 0.008, 0.0)
+    search = Search.start(campaign.fit, GUARDS.parameters(), 0.008, check, (), PLANT)
+    fit = Fit(search.nothing(), None, np.ones(8), np.ones((1, 8)), beside_hold=9.0)
+    found = Trace(search.nothing(), check, [], [], search, np.ones(8), np.ones(8), fit)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(outcome, "fit_together", lambda *_: whole)
+        return outcome._whole(found, campaign.fit, campaign.held_out, GUARDS, lambda _: None)
+
+
+def test_the_corrected_model_predicts_what_the_report_says(campaign, closed, tmp_path):
+    path = tmp_path / "model.yaml"
+    save_model_file(closed.model_file("much-closed", {}), path)
+    again = evaluate(Quadrotor.from_file(load_model_file(str(path))), campaign.held_out).metrics("commands_in")
+    said = closed.to_json()["held_out"]["after"]
+    for key, value in said.items():
+        assert again[key] == pytest.approx(value, rel=1e-6), key
+
+
+def test_effects_are_reported_in_the_order_of_what_they_buy(closed):
+    found = closed.to_json()
+    names = [effect["name"] for effect in found["effects"]]
+    assert set(LACKS) <= set(names)
+    assert set(names[:3]) <= set(LACKS)
+    buys = [effect["buys"] for effect in found["effects"]]
+    assert buys == sorted(buys, reverse=True)
+    assert not found["unexplained"]
+    assert set(found["motors"]) == {"motor_gain", "motor_speed_offset", "motor_time_constant"}
+    for effect in found["unconfirmed"]:
+        assert effect["name"] not in [item["name"] for item in closed.model_file("x", {}).effects]
+
+
+def test_the_first_paragraph_says_what_the_drone_has_what_it_buys_and_what_to_do(closed):
+    text = verdict(closed)
+    has, buys, do = text.split(". ", 2)[0], text, text.rsplit(". ", 1)[-1]
+    assert has.startswith(f"The drone flies with {len(closed.reported)} effects the model lacks")
+    assert "0.5 s ahead goes from" in buys
+    assert do.startswith("Fly and train with model.yaml")
+
+
+def test_a_whole_that_is_hardly_better_than_the_search_does_not_replace_it(campaign, closed, whole):
+    found = replace(closed.trace, fit=replace(closed.trace.fit, beside_hold=whole.beside_hold))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(outcome, "fit_together", lambda *_: whole)
+        assert outcome._whole(found, campaign.fit, campaign.held_out, GUARDS, lambda _: None) is None

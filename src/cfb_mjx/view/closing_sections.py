@@ -61,7 +61,9 @@ TOGETHER = (
     "No single effect made predictions better than holding velocity and body rate, so all that a drone usually lacks "
     "was fitted together, what only some drones have was tried beside it, and what did not earn its place was taken "
     "out again. Motors come from commands and measured rotor speeds; everything else from predictions, commands in and "
-    "rotor speeds in. How much an error grows without an effect: the others have moved to make up for it."
+    "rotor speeds in. How much an error grows without an effect: the others have moved to make up for it. Standard "
+    "deviations come from the scatter between stretches of flight; what the model declares, its mass above all, is "
+    "taken as exact."
 )
 
 
@@ -77,7 +79,7 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
         return Section("What was found", [text])
     paragraphs, rows = [], []
     for item in outcome.reported:
-        paragraphs.append(_sentence(item))
+        paragraphs.append(_sentence(item, "the mean" if outcome.together is not None else "one"))
         for number in numbers(item):
             low, high = number.value - 1.96 * number.std, number.value + 1.96 * number.std
             plausible = "" if number.plausible is None else "{:g} to {:g}".format(*number.plausible)
@@ -100,14 +102,14 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
     return Section("What was found", paragraphs, [(caption, head, rows)], shown)
 
 
-def _sentence(item: Reported) -> str:
+def _sentence(item: Reported, which: str) -> str:
     text = f"{item.name}: {meaning(item.name)}; {strength(item)}."
     if is_fault(item.name):
         text += " A fault of the recording, not of the drone: it is taken out before the physics is judged."
     elif documented(item.name) not in ("", meaning(item.name)):
         text += f" In the model: {documented(item.name)}."
     if item.found is not None:
-        text += f" Without it one prediction error of the fit flights grows by {_grows(item.found.buys)}."
+        text += f" Without it {which} prediction error of the fit flights grows by {_grows(item.found.buys)}."
         if item.found.confusable:
             names = ", ".join([item.name, *item.found.confusable])
             text += f" These flights cannot tell which of this set it is: {names}."

@@ -168,9 +168,7 @@ def fit_together(
     """
     motors = fitted_motors(logs, base, say, rules)
     start = _started(base, motors)
-    declared = {mapping["name"] for mapping in base.effects}
-    told = OF_MOTORS if motors.entries else ()
-    names = [name for name in PLANT if name not in told and (name in OWN or name not in declared)]
+    names = names_to_fit(base, bool(motors.entries))
     say(f"fitting {len(names)} effects together")
     fit = partial(_fit, logs, kinds_alike(start, logs), rules)
     found = fit(start, plausible_numbers(start.parameters, names), rules.steps, {})
@@ -205,6 +203,13 @@ def fit_together(
     found = _lean(found, fit, rules, say)
     model = _bare(found, found.model)
     return Together(model, found, motors.entries, _parts(found, motors, rules, say), tried, _predicted(model, logs))
+
+
+def names_to_fit(base: ModelFile, motors_told: bool) -> list[str]:
+    """Effects to fit together: what a model declares is known of the type, but for what is a drone's own."""
+    declared = {mapping["name"] for mapping in base.effects}
+    told = OF_MOTORS if motors_told else ()
+    return [name for name in PLANT if name not in told and (name in OWN or name not in declared)]
 
 
 @dataclass(frozen=True)
