@@ -77,7 +77,11 @@ def section(name: str, folder: Path, model: str, mass: str, work: Path, before: 
     report, errors = (json.loads((own / file).read_text()) for file in ("report.json", "errors.json"))
     shown = f"{model}/model.yaml" if model in before else model
     lines = [f"## {name}", "", "```sh"]
-    lines += [f"cfb close-loop --fit fit/* --held-out validation/* --model {shown} --set mass={mass}", "```", ""]
+    lines += [
+        f"cfb close-loop --fit fit/* --held-out validation/* --model {shown} --set mass={mass} -o {name}",
+        "```",
+        "",
+    ]
     cost = "" if seconds is None else f" {seconds / 60:.1f} minutes of processor time."
     lines += [f"{len(fit)} flights to learn from, {len(errors['logs'])} to be judged on.{cost}", ""]
     lines += [f"> {report['summary']}", "", "| effect | numbers | buys | t | at a bound |", "|---|---|---:|---:|---|"]

@@ -102,7 +102,7 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
     return Section("What was found", paragraphs, [(caption, head, rows)], shown)
 
 
-def _sentence(item: Reported, which: str) -> str:
+def _sentence(item: Reported, which: str = "one") -> str:
     text = f"{item.name}: {meaning(item.name)}; {strength(item)}."
     if is_fault(item.name):
         text += " A fault of the recording, not of the drone: it is taken out before the physics is judged."
