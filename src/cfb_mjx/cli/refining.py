@@ -129,12 +129,11 @@ def by_predictions(
     faults = SensorFaults.from_mappings(base.effects, f"model {base.name}")
     # What a predictor is for is the next flight, and nobody knows that one's trim.
     found = refine(start, logs, numbers, faults, weights=weights, trimmed=not predictor, progress=progress)
-    rows, uncertainty = {}, {}
+    rows = {}
     for number, value, std in zip(found.numbers, found.values, found.deviations, strict=True):
         known = float(std) if np.isfinite(std) else None
         rows[number.name] = {"value": float(value), "std": known, "at_bound": found.at_bound(number)}
-        own = uncertainty.setdefault(number.effect, {})
-        own[number.field] = known if number.index is None else [*own.get(number.field, []), known]
+    uncertainty = {number.effect: found.uncertainty(number.effect) for number in numbers}
     kind = "predictor" if predictor else base.kind
     effects = (*_mappings(found.model.effects, _kept(base, names) | uncertainty), *faults.to_mappings())
     report = {

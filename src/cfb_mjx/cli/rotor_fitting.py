@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from cfb_mjx.sysid.rotors.steady import SteadyFit
     from cfb_mjx.sysid.rotors.thrust_in_flight import ThrustInFlight
 
-_FILE_NAMES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
 _COLUMN = {"thrust": "force", "torque": "torque"}
 _FOUR_LEAST = 2.5
 _LIMIT = "the model file has one time constant per motor and no dead time"
@@ -229,6 +228,7 @@ def _fit_maps(tables: list[MapTable], base: ModelFile, per_motor: bool, robust: 
 def _corrected(base: ModelFile, motors, steady, maps, output: Path, paths: list[Path]) -> tuple[ModelFile, list[str]]:
     """The model with what was identified, and the names of what changed."""
     from cfb_mjx.parameters import Entry
+    from cfb_mjx.sysid.rotors.motors import ENTRIES
 
     source = f"cfb fit-rotors on {len(paths)} file(s), {date.today().isoformat()}"
     entries, written = dict(base.entries), []
@@ -237,7 +237,7 @@ def _corrected(base: ModelFile, motors, steady, maps, output: Path, paths: list[
         entries[key] = Entry(np.asarray(value, dtype=float), source, std)
         written.append(key)
 
-    for name in _FILE_NAMES if motors else ():
+    for name in ENTRIES if motors else ():
         found = motors.values(name)
         if found is not None:
             put(name, *found)

@@ -78,7 +78,7 @@ class Refinement:
         low, high, scale = bounds(every)
         values = np.clip([n.of(model) for n in every], low, high)
         model = with_values(model, every, values)
-        trims = np.array(list(self.trims.values()))
+        trims = self._trims
         data = self.data.started(model)
         normal = data.normal_equations(model, every, values, trims, self.normal.trimmed)
         change, turn = normal.step(1e-2, np.zeros(len(every)), trims / TRIM, values, low, high)
@@ -87,11 +87,8 @@ class Refinement:
 
     def growth(self, effects: Sequence[str]) -> float:
         """By how much the mean loss grows without some effects, as far as its curvature at the optimum tells."""
-        change, free, answer = self._answer(effects)
-        matrix = self.normal.weighed(np.ones(len(free), dtype=bool))
-        at = np.searchsorted(self.normal.chosen(np.ones(len(free), dtype=bool)), self.normal.chosen(free))
-        whole = np.concatenate([change, np.zeros(len(matrix) - len(change))])
-        whole[at] = answer
+        matrix, change, answer = self._answer(effects)
+        whole = change + answer
         return float(0.5 * whole @ matrix @ whole / self.data.count)
 
     def without(self, effects: Sequence[str]) -> Left:
@@ -100,25 +97,18 @@ class Refinement:
         The other numbers make up for them as far as the curvature of the loss at the optimum tells; not at all if that
         predicts worse.
         """
-        change, free, answer = self._answer(effects)
+        _, change, answer = self._answer(effects)
         low, high, scale = bounds(self.numbers)
+        count = len(self.numbers)
         out = np.array([n.effect in effects for n in self.numbers])
-        model = _trimmed(self.model)
-        trims = np.array(list(self.trims.values()))
         found = []
         for share in (1.0, 0.0):
-            moved = change.copy()
-            moved[free] = share * answer[: free.sum()]
-            turn = share * answer[free.sum() :].reshape(-1, 3) * TRIM if self.normal.trimmed else 0.0
-            values = self.values + moved * scale
-            tried = with_values(model, self.numbers, np.where(out, values, np.clip(values, low, high)))
-            found.append((tried, self.data.started(tried), trims + turn))
-        tried, data, trims = min(found, key=lambda one: one[1].cost(one[0], one[2]))
-        return Left(
-            Quadrotor(tried.parameters, tried.effects[:-1], body=tried.body),
-            data.errors(tried, trims),
-            data.losses(tried, trims),
-        )
+            step = change + share * answer
+            values = self.values + step[:count] * scale
+            values = np.where(out, values, np.clip(values, low, high))
+            turn = step[count:].reshape(-1, 3) * TRIM if self.normal.trimmed else 0.0
+            found.append(self._left(with_values(self.model, self.numbers, values), self._trims + turn))
+        return min(found, key=lambda pair: pair[1])[0]
 
     @property
     def left(self) -> Left:
@@ -127,23 +117,38 @@ class Refinement:
 
     def judged(self, model: Quadrotor) -> Left:
         """What another model leaves of the same predictions, each flight with the trim that was found."""
-        trims = np.array(list(self.trims.values()))
+        return self._left(model, self._trims)[0]
+
+    @property
+    def _trims(self) -> np.ndarray:
+        return np.array(list(self.trims.values()))
+
+    def _left(self, model: Quadrotor, trims: np.ndarray) -> tuple[Left, float]:
+        """What a model leaves with some trims, and its mean loss."""
         trimmed = _trimmed(model)
         data = self.data.started(trimmed)
-        return Left(model, data.errors(trimmed, trims), data.losses(trimmed, trims))
+        errors = data.errors(trimmed, trims)
+        losses = data.losses(errors)
+        return Left(model, errors, losses), data.mean(losses, trims)
 
     def _answer(self, effects: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Change (N,) of the numbers of some effects to neutral, in their scales; which others are free (N,); and how
-        these, and the trims behind them, move to make up for it."""
+        """How the fit answers to some effects' absence, all in scales: numbers first, then the trims if estimated.
+
+        Returns:
+            The weighed matrix, the change of the effects' numbers to neutral, and the move of the others that makes up
+            for it.
+        """
         out = np.array([n.effect in effects for n in self.numbers])
         _, _, scale = bounds(self.numbers)
         neutral = np.array([n.of_neutral() for n in self.numbers])
-        change = np.where(out, neutral - self.values, 0.0) / scale
-        free = ~out & np.array([not self.at_bound(n) for n in self.numbers])
         every = np.ones(len(out), dtype=bool)
-        at = np.searchsorted(self.normal.chosen(every), self.normal.chosen(free))
         matrix = self.normal.weighed(every)
-        return change, free, -np.linalg.solve(matrix[np.ix_(at, at)], matrix[at, : len(out)] @ change)
+        change, answer = np.zeros(len(matrix)), np.zeros(len(matrix))
+        change[: len(out)] = np.where(out, neutral - self.values, 0.0) / scale
+        free = ~out & np.array([not self.at_bound(n) for n in self.numbers])
+        at = np.searchsorted(self.normal.chosen(every), self.normal.chosen(free))
+        answer[at] = -np.linalg.solve(matrix[np.ix_(at, at)], matrix[at] @ change)
+        return matrix, change, answer
 
 
 @dataclass(frozen=True)

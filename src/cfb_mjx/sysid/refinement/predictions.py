@@ -175,11 +175,11 @@ class Predictions:
             found.append(np.linalg.norm(np.concatenate(chunks)[: len(part.flight)], axis=-1))
         return found
 
-    def losses(self, model: Quadrotor, trims: np.ndarray) -> list[np.ndarray]:
-        """Of every part: (W, H, 2), weighted."""
-        errors = zip(self.parts, self.errors(model, trims), strict=True)
+    def losses(self, errors: list[np.ndarray]) -> list[np.ndarray]:
+        """Of `errors`: (W, H, 2) of every part, weighted."""
+        pairs = zip(self.parts, errors, strict=True)
         return [
-            part.weight[:, None, None] * np.where(e < HUBER, 0.5 * e**2 / HUBER, e - 0.5 * HUBER) for part, e in errors
+            part.weight[:, None, None] * np.where(e < HUBER, 0.5 * e**2 / HUBER, e - 0.5 * HUBER) for part, e in pairs
         ]
 
     @property
@@ -189,7 +189,11 @@ class Predictions:
 
     def cost(self, model: Quadrotor, trims: np.ndarray) -> float:
         """Mean loss of a window and horizon; the trims' prior belongs to it."""
-        total = sum(np.sum(loss) for loss in self.losses(model, trims))
+        return self.mean(self.losses(self.errors(model, trims)), trims)
+
+    def mean(self, losses: list[np.ndarray], trims: np.ndarray) -> float:
+        """`cost` of losses that are known."""
+        total = sum(np.sum(loss) for loss in losses)
         prior = np.sum((trims / TRIM) ** 2) + NO_MEAN * np.sum((self.share @ trims / TRIM / len(trims)) ** 2)
         mean = float((total + 0.5 * prior) / self.count)
         return mean if np.isfinite(mean) else np.inf

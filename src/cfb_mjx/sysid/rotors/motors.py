@@ -32,6 +32,8 @@ UNITS = {
     "spin_down_time_constant": "s",
     "dead_time": "s",
 }
+ENTRIES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
+"""What a model file holds of the motors."""
 SIGNIFICANT = 0.01
 _INNER = frozenset({"asymmetric", "dead_time"})
 """Extras tested whether asked for or not: left out where they are real, they bend all other constants."""

@@ -45,8 +45,7 @@ def fit_under_supply(
         return each_motor(fit, nominal, progress) if per_motor else fit
 
     plain = fit_motors(records, nominal, **extras)
-    voltages = [r.battery_voltage for r in records]
-    if any(v is None or not np.isfinite(v).all() for v in voltages) or np.std(np.concatenate(voltages)) < VARIES:
+    if not _voltage_tells(records):
         return finished(plain), []
     scaled = [replace(r, command=r.command * r.battery_voltage[:, None] / NOMINAL_VOLTAGE) for r in records]
     followed = fit_motors(scaled, nominal, **extras)
@@ -95,8 +94,7 @@ def fit_with_sag(records: Sequence[MotorRecord], nominal: Parameters, **extras: 
         CfbError: as `fit_motors`.
     """
     fit = fit_motors(records, nominal, **extras)
-    voltages = [r.battery_voltage for r in records]
-    if any(v is None or not np.isfinite(v).all() for v in voltages) or np.std(np.concatenate(voltages)) < VARIES:
+    if not _voltage_tells(records):
         return each_motor(fit, nominal), None
 
     def divided(slope: float, lag: float) -> tuple[MotorFit, float]:
@@ -121,6 +119,13 @@ def fit_with_sag(records: Sequence[MotorRecord], nominal: Parameters, **extras: 
     if best is None:
         return each_motor(fit, nominal), None
     return each_motor(best[0], nominal), best[1]
+
+
+def _voltage_tells(records: Sequence[MotorRecord]) -> bool:
+    """Whether all records have a voltage, and it changes enough."""
+    voltages = [r.battery_voltage for r in records]
+    known = all(v is not None and np.isfinite(v).all() for v in voltages)
+    return bool(known and np.std(np.concatenate(voltages)) >= VARIES)
 
 
 def _felt(record: MotorRecord, lag: float) -> np.ndarray:

@@ -17,27 +17,23 @@ a drone's own (`OWN`).
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from scipy.stats import norm
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.logs.bench_tables import MotorRecord
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.model.effects import CATALOGUE, BatterySag, CommandDelay, Effect
+from cfb_mjx.model.effects import CATALOGUE, Effect
 from cfb_mjx.parameters import Entry, ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, LogEvaluation, evaluate
 from cfb_mjx.sysid.metrics import BLOCK
 from cfb_mjx.sysid.refinement import Number, Refinement, plausible_numbers, refine
 from cfb_mjx.sysid.refinement.numbers import PLANT
 from cfb_mjx.sysid.refinement.predictions import kinds_alike
-from cfb_mjx.sysid.rotors.motor_tracks import record_of
-from cfb_mjx.sysid.rotors.supply import SURE, fit_with_sag
+from cfb_mjx.sysid.rotors.flown_motors import Motors, flown_motors
 from cfb_mjx.sysid.tracing import columns as cols
 from cfb_mjx.sysid.tracing.acceptance import CLEAR
 from cfb_mjx.sysid.tracing.columns import SHIFT, Column
@@ -45,6 +41,7 @@ from cfb_mjx.sysid.tracing.evidence import Evidence
 from cfb_mjx.sysid.tracing.fits import beside_hold
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 from cfb_mjx.sysid.tracing.search import Search
+from cfb_mjx.sysid.tracing.trace import line_of
 
 OWN = ("cog_offset", "thrust_tilt", "torque_scale", "command_delay", "motor_asymmetry", "battery_sag")
 """Of `PLANT`, what differs from one drone of a type to the next."""
@@ -52,7 +49,6 @@ OF_MOTORS = ("command_delay", "motor_asymmetry", "battery_sag")
 """Of `OWN`, what measured rotor speeds tell."""
 MOTORS = (*OF_MOTORS, "motor_gain_mismatch", "motor_time_constant", "motor_second_order", "motor_thermal_drift")
 """Effects that are not looked for where the motors were fitted to rotor speeds."""
-MOTOR_ENTRIES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
 
 
 @dataclass(frozen=True)
@@ -166,7 +162,9 @@ def fit_together(
         say: told what happens.
         rules: what is tried and what stays.
     """
-    motors = fitted_motors(logs, base, say, rules)
+    if any(log.rotor_speed is not None for log in logs):
+        say("fitting the motors to the rotor speeds")
+    motors = flown_motors(logs, base.parameters(), rules.motor_rows, rules.motor_piece)
     start = _started(base, motors)
     names = names_to_fit(base, bool(motors.entries))
     say(f"fitting {len(names)} effects together")
@@ -179,7 +177,7 @@ def fit_together(
         refused.add("payload")
     for _ in range(rules.rounds):
         ranking = ranked(search, found.model, refused)
-        tried.append({"present": _names(found.model), "ranking": [_line(v, e) for e, v in ranking[:8]]})
+        tried.append({"present": _names(found.model), "ranking": [line_of(v, e) for e, v in ranking[:8]]})
         better = None
         clear = [(evidence, variant) for evidence, variant in ranking if evidence.t > CLEAR]
         for evidence, variant in clear[: rules.tried]:
@@ -210,67 +208,6 @@ def names_to_fit(base: ModelFile, motors_told: bool) -> list[str]:
     declared = {mapping["name"] for mapping in base.effects}
     told = OF_MOTORS if motors_told else ()
     return [name for name in PLANT if name not in told and (name in OWN or name not in declared)]
-
-
-@dataclass(frozen=True)
-class Motors:
-    """What commands and measured rotor speeds tell.
-
-    Attributes:
-        entries: of a model file.
-        effects: of the motors, each with standard deviations by field.
-    """
-
-    entries: dict[str, Entry] = field(default_factory=dict)
-    effects: tuple[tuple[Effect, dict[str, float]], ...] = ()
-
-
-def fitted_motors(
-    logs: Sequence[FlightLog], base: ModelFile, say: Callable[[str], None], rules: Rules = RULES
-) -> Motors:
-    """Each motor's constants, the dead time of all, and how far they follow the battery; nothing without rotor speeds.
-
-    Args:
-        logs: flights; of long ones the middle is enough.
-        base: the declared model.
-        say: told what happens.
-        rules: how much is enough.
-    """
-    flown = [log for log in logs if log.rotor_speed is not None]
-    if not flown:
-        return Motors()
-    say("fitting the motors to the rotor speeds")
-    least = rules.motor_piece / float(np.median([log.nominal_interval for log in flown]))
-    count = min(len(flown), max(1, round(rules.motor_rows / least)))
-    chosen = [flown[i] for i in np.linspace(0, len(flown) - 1, count).round().astype(int)]
-    records = [_middle(log, rules.motor_rows // count) for log in chosen]
-    fit, sag = fit_with_sag(records, base.parameters(), offset=True)
-    values = {name: fit.values(name) for name in MOTOR_ENTRIES}
-    effects = []
-    if "dead_time" in fit.common.extras and "asymmetric" not in fit.common.extras:
-        # Beside a dead time of its own the lag is the motors' alone, not the one lag that is nearest to both.
-        lag = "motor_time_constant"
-        each = [fit.motors[number].optimum for number in sorted(fit.motors)]
-        values[lag] = np.array([o.value(lag) for o in each]), np.array([o.std(lag) for o in each])
-        late, best = "dead_time", fit.common.optimum
-        delay = float(np.clip(best.value(late), *CommandDelay.prior["delay"]))
-        if delay > SURE * best.std(late):
-            effects.append((CommandDelay(delay), {"delay": best.std(late)}))
-    if sag is not None:
-        effects.append((BatterySag(level=0.0, slope=sag.slope, lag=sag.lag), {"slope": sag.std}))
-    source = f"fitted to the rotor speeds of {len(records)} flights"
-    return Motors({name: Entry(v[0], source, v[1]) for name, v in values.items() if v is not None}, tuple(effects))
-
-
-def _middle(log: FlightLog, rows: int) -> MotorRecord:
-    """The motors in the middle of a flight, with the battery's voltage."""
-    skipped = max(0, (len(log) - rows) // 2)
-    part = log.rows(np.arange(skipped, len(log) - skipped))
-    voltage = part.battery_voltage
-    known = None if voltage is None else np.isfinite(voltage)
-    if known is not None and known.any():
-        voltage = np.interp(part.time, part.time[known], voltage[known])
-    return replace(record_of(part), battery_voltage=voltage)
 
 
 def _started(base: ModelFile, motors: Motors) -> Quadrotor:
@@ -329,10 +266,6 @@ def _names(model: Quadrotor) -> list[str]:
     return [type(e).name for e in model.effects]
 
 
-def _line(variant: list[Column], found: Evidence) -> dict:
-    return {"name": variant[0].effect, "gain": found.gain, "t": found.t, "p_value": found.p_value}
-
-
 def _fit(
     logs: Sequence[FlightLog],
     weights: Mapping[str, float],
@@ -352,12 +285,8 @@ def _with(found: Refinement, variant: list[Column], evidence: Evidence) -> tuple
     """
     kind = CATALOGUE[variant[0].effect]
     effect: Effect = kind.neutral()
-    for key, value in variant[0].probe:
-        effect = eqx.tree_at(lambda e, k=key: getattr(e, k), effect, jnp.full_like(getattr(effect, key), value))
     for column, value in zip(variant, evidence.values, strict=True):
-        old, by = getattr(effect, column.field), 0.1 * float(value) * column.scale
-        new = old + by if column.index is None else old.at[column.index].add(by)
-        effect = eqx.tree_at(lambda e, f=column.field: getattr(e, f), effect, new)
+        effect = cols.moved(effect, column, 0.1 * float(value) * column.scale, False)
     model = Quadrotor(found.model.parameters, (*found.model.effects, effect), body=found.model.body)
     return model, plausible_numbers(model.parameters, [kind.name])
 

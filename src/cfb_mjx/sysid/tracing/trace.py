@@ -131,7 +131,7 @@ def trace(
         )
     while len(fit.hypothesis.present) < LARGEST and vain < (patience if fit.beside_hold > 1 else PATIENCE):
         ranking = rank(search, fit, refused)
-        tried.append({"present": list(fit.hypothesis.present), "ranking": [_line(v, e) for e, v in ranking[:8]]})
+        tried.append({"present": list(fit.hypothesis.present), "ranking": [line_of(v, e) for e, v in ranking[:8]]})
         passing = [(e, v) for e, v in ranking if significant(e, len(search.names))]
         if not passing:
             break
@@ -311,5 +311,6 @@ def summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
     return Found(name, p_value, gain, buys, parameters, uncertainty, list(rivals), less.fit.hypothesis)
 
 
-def _line(variant: list[Column], found: Evidence) -> dict:
+def line_of(variant: list[Column], found: Evidence) -> dict:
+    """A candidate as reports list it."""
     return {"name": variant[0].effect, "gain": found.gain, "t": found.t, "p_value": found.p_value}

@@ -1,0 +1,74 @@
+"""The motors of a drone from its flights: constants of each, their dead time, and how far they follow the battery."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.bench_tables import MotorRecord
+from cfb_mjx.model.effects import BatterySag, CommandDelay, Effect
+from cfb_mjx.parameters import Entry, Parameters
+from cfb_mjx.sysid.rotors.motor_tracks import record_of
+from cfb_mjx.sysid.rotors.motors import ENTRIES
+from cfb_mjx.sysid.rotors.supply import SURE, fit_with_sag
+
+
+@dataclass(frozen=True)
+class Motors:
+    """What commands and measured rotor speeds tell.
+
+    Attributes:
+        entries: of a model file.
+        effects: of the motors, each with standard deviations by field.
+    """
+
+    entries: dict[str, Entry] = field(default_factory=dict)
+    effects: tuple[tuple[Effect, dict[str, float]], ...] = ()
+
+
+def flown_motors(logs: Sequence[FlightLog], nominal: Parameters, rows: int, piece: float) -> Motors:
+    """Each motor's constants, the dead time of all, and how far they follow the battery; nothing without rotor speeds.
+
+    Args:
+        logs: flights; of long ones the middle is enough.
+        nominal: where to start.
+        rows: that are fitted to, about: the middles of flights.
+        piece: seconds of a flight at least, of so many flights evenly spread as that allows.
+    """
+    flown = [log for log in logs if log.rotor_speed is not None]
+    if not flown:
+        return Motors()
+    least = piece / float(np.median([log.nominal_interval for log in flown]))
+    count = min(len(flown), max(1, round(rows / least)))
+    chosen = [flown[i] for i in np.linspace(0, len(flown) - 1, count).round().astype(int)]
+    records = [_middle(log, rows // count) for log in chosen]
+    fit, sag = fit_with_sag(records, nominal, offset=True)
+    values = {name: fit.values(name) for name in ENTRIES}
+    effects = []
+    if "dead_time" in fit.common.extras and "asymmetric" not in fit.common.extras:
+        # Beside a dead time of its own the lag is the motors' alone, not the one lag that is nearest to both.
+        lag = "motor_time_constant"
+        each = [fit.motors[number].optimum for number in sorted(fit.motors)]
+        values[lag] = np.array([o.value(lag) for o in each]), np.array([o.std(lag) for o in each])
+        late, best = "dead_time", fit.common.optimum
+        delay = float(np.clip(best.value(late), *CommandDelay.prior["delay"]))
+        if delay > SURE * best.std(late):
+            effects.append((CommandDelay(delay), {"delay": best.std(late)}))
+    if sag is not None:
+        effects.append((BatterySag(level=0.0, slope=sag.slope, lag=sag.lag), {"slope": sag.std}))
+    source = f"fitted to the rotor speeds of {len(records)} flights"
+    return Motors({name: Entry(v[0], source, v[1]) for name, v in values.items() if v is not None}, tuple(effects))
+
+
+def _middle(log: FlightLog, rows: int) -> MotorRecord:
+    """The motors in the middle of a flight, with the battery's voltage."""
+    skipped = max(0, (len(log) - rows) // 2)
+    part = log.rows(np.arange(skipped, len(log) - skipped))
+    voltage = part.battery_voltage
+    known = None if voltage is None else np.isfinite(voltage)
+    if known is not None and known.any():
+        voltage = np.interp(part.time, part.time[known], voltage[known])
+    return replace(record_of(part), battery_voltage=voltage)
