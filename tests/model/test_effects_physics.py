@@ -38,6 +38,7 @@ from cfb_mjx.model.effects import (
     Payload,
     PayloadSwing,
     PositionMoment,
+    RateDamping,
     Reading,
     RotorDrag,
     ThrustScale,
@@ -69,6 +70,7 @@ AIR = {
     "parasitic_drag": ParasiticDrag(0.0, 0.01),
     "blade_flapping": BladeFlapping(8e-4, [0.3, -0.2], 0.2, 1.7),
     "wind": Wind([2.0, -1.0, 0.5], 0.03),
+    "rate_damping": RateDamping(1.5e-4),
     "position_moment": PositionMoment([4e-4, -3e-4]),
     "gust": Gust([2.0, 1.0, 0.5], time_scale=0.05, seed=3.0),
     "jet": Jet(5.0, origin=[0.2, -0.5, 0.15], direction=[0.6, 0.1, 0.2], width=0.2),
@@ -127,6 +129,8 @@ def _wrench(constants, y, on, time, conductance=0.03):
         along_x, along_y = np.exp(np.array([0.3, -0.2]) * v[2])
         hub = np.array([-0.8 * v[1] * along_y, 1.2 * v[0] * along_x, 0.0])
         torque += 8e-4 * (speed.mean() / 1594) ** 1.7 * hub
+    if "rate_damping" in on:
+        torque -= 1.5e-4 * speed.mean() / 1594 * rate * [1.0, 1.0, 0.0]
     if "wind" in on:
         force += conductance * matrix.T @ [2.0, -1.0, 0.5]
     if "position_moment" in on:

@@ -15,7 +15,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.model.effects import CATALOGUE, RotorDrag
+from cfb_mjx.model.effects import CATALOGUE, Inertia, RateDamping, RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.flight import prepare_flight
@@ -31,6 +31,7 @@ from cfb_mjx.sysid.tracing.outcome import close_loop
 from cfb_mjx.sysid.tracing.residuals import residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors, lags
+from cfb_mjx.sysid.tracing.together import asked
 from cfb_mjx.sysid.tracing.trace import trace
 
 # One worker: every program is compiled once.
@@ -44,6 +45,7 @@ CASES = [
     Case("filtered", 9005, (("sensor_gyro_lowpass", 1.0),)),
     Case("periodic", 9006, (("outside_periodic", 1.0),)),
     Case("limited", 98012, (("esc_rate_limit", 1.0),)),
+    Case("nicked", 9008, (("prop_damage", 1.0),)),
 ]
 
 
@@ -318,7 +320,7 @@ def test_what_no_search_looks_for_takes_part_where_it_is_named_or_declared(campa
         return Search.start(campaigns["clean"].fit[:1], base.parameters(), 0.008, sensors, *given).names
 
     sensors = check_sensors(campaigns["clean"].fit, 0.008, 0.0)
-    assert set(CATALOGUE) - set(names()) == {"position_moment", "gust", "jet"}
+    assert set(CATALOGUE) - set(names()) == {"position_moment", "rate_damping", "gust", "jet"}
     assert "position_moment" in names((), ["position_moment"])
     assert "position_moment" in names((CATALOGUE["position_moment"].neutral(),))
 
@@ -369,3 +371,35 @@ def test_a_sensor_fault_has_no_parameters_but_its_own():
 def test_an_unknown_sensor_fault_is_refused(base):
     with pytest.raises(CfbError, match="unknown effect 'sensor_mood'"):
         Quadrotor.from_file(dataclasses.replace(base, effects=({"name": "sensor_mood"},)))
+
+
+def test_a_damaged_propeller_is_named_with_its_motor(campaigns, base):
+    campaign = campaigns["nicked"]
+    truth = campaign.truth["effects"]["prop_damage"]
+    sensors = check_sensors(campaign.fit, 0.008, 0.0)
+    search = Search.start(campaign.fit, base.parameters(), 0.008, sensors)
+    hypothesis = search.learned(search.nothing())
+    best = search.probes(hypothesis, search.whole(hypothesis))
+    gains = {name: found.gain for name, (found, _) in best.items()}
+    assert max(gains, key=gains.get) == "prop_damage"
+    found, variant = best["prop_damage"]
+    assert dict(variant[0].probe)["motor"] == truth["motor"]
+    damaged = [1 + value * column.scale for value, column in zip(found.values, variant, strict=True)]
+    np.testing.assert_allclose(damaged, np.array(truth["blades"])[:, truth["motor"] - 1], atol=0.01)
+
+
+def test_the_innovations_contradict_what_predictions_only_wish_for(campaigns, base):
+    """A clean drone has its declared inertia and no brake, whatever a model pretends."""
+    sensors = check_sensors(campaigns["clean"].fit, 0.008, 0.0)
+    search = Search.start(campaigns["clean"].fit, base.parameters(), 0.008, sensors, (), ["rate_damping"])
+    model = Quadrotor(base.parameters(), (Inertia([0.25, 0.25, 0.25]), RateDamping(8e-5), RotorDrag(0.0)))
+    found = asked(search, model, ["inertia", "rate_damping"])
+    for number in found["inertia"][:2]:
+        assert number.value == pytest.approx(0.0, abs=0.06)
+        assert number.contradicts
+    (brake,) = found["rate_damping"]
+    assert brake.name == "rate_damping.coefficient"
+    assert brake.contradicts
+    assert abs(brake.value) < 3e-5
+    honest = asked(search, Quadrotor(base.parameters(), (Inertia([0.0, 0.0, 0.0]),)), ["inertia"])
+    assert not any(number.contradicts for number in honest["inertia"][:2])

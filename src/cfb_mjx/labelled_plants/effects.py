@@ -273,3 +273,12 @@ def outside_wall(rng, drone, strength):
         wall_x=rng.uniform(1.2, 2.0),
         wall_depth=rng.uniform(0.35, 0.6),
     )
+
+
+# Last: seeds of studies count the effects before.
+@effect
+def prop_damage(rng, drone, strength):
+    """A nicked propeller: less thrust, and more torque where the nick is rough, less where much is gone."""
+    motor, blades = int(rng.integers(4)), drone["blades"].copy()
+    blades[:, motor] *= 1 + strength * np.array([-rng.uniform(0.04, 0.1), sign(rng) * rng.uniform(0.05, 0.2)])
+    return put(drone, blades=blades) | {"motor": motor + 1}

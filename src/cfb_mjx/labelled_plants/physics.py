@@ -18,6 +18,7 @@ NOMINAL: dict[str, object] = {
     "thrust_scale": 1.0,
     "thrust_bend": 0.0,  # how much the scale changes per unit of Omega / SPEED_SCALE
     "torque_scale": 1.0,
+    "blades": np.ones((2, 4)),  # thrust and torque of each propeller over those of a sound one
     "rotor_drag": (0.0, 0.0),  # N s/m of one rotor at hover thrust along body x and y
     "rotor_drag_speed": 8.0,  # m/s at which it saturates
     "body_drag": (0.0, 0.0, 0.0),  # N s^2/m^2

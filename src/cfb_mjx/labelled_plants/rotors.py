@@ -53,6 +53,8 @@ def rotor_wrench(p: SimpleNamespace, height, rotation, body_velocity, w, speed, 
         thrust = thrust * (p.thrust_scale + p.thrust_bend * (speed / c.SPEED_SCALE - 0.55))
     if "torque_scale" in p.on:
         drag = drag * p.torque_scale
+    if "blades" in p.on:
+        thrust, drag = thrust * p.blades[0], drag * p.blades[1]
     hub = None
     if p.on & HUB_EFFECTS:
         hub = (

@@ -190,6 +190,10 @@ def _many(outcome: Outcome, physics: list[Reported]) -> str:
     do = "Fly and train with model.yaml"
     if bound:
         do += f"; do not trust as physics what stands at the edge of what is plausible ({', '.join(bound)})"
+    other = [item.name for item in outcome.reported if any(each.contradicts for each in item.asked)]
+    if other:
+        no = ", nor" if bound else "; do not trust as physics"
+        do += f"{no} what the accelerations contradict ({', '.join(other)})"
     return f"{has} On held-out flights {errors}. {do}."
 
 

@@ -30,6 +30,8 @@ from cfb_mjx.model.effects.parasitic_drag import ParasiticDrag
 from cfb_mjx.model.effects.payload import Payload
 from cfb_mjx.model.effects.payload_swing import PayloadSwing
 from cfb_mjx.model.effects.position_moment import PositionMoment
+from cfb_mjx.model.effects.prop_damage import PropDamage
+from cfb_mjx.model.effects.rate_damping import RateDamping
 from cfb_mjx.model.effects.regression_dilution import RegressionDilution
 from cfb_mjx.model.effects.rotor_drag import RotorDrag
 from cfb_mjx.model.effects.thrust_scale import ThrustScale
@@ -65,6 +67,8 @@ __all__ = [
     "Payload",
     "PayloadSwing",
     "PositionMoment",
+    "PropDamage",
+    "RateDamping",
     "Reading",
     "RegressionDilution",
     "ResidualFormula",

@@ -40,6 +40,8 @@ from cfb_mjx.model.effects.parasitic_drag import ParasiticDrag
 from cfb_mjx.model.effects.payload import Payload
 from cfb_mjx.model.effects.payload_swing import PayloadSwing
 from cfb_mjx.model.effects.position_moment import PositionMoment
+from cfb_mjx.model.effects.prop_damage import PropDamage
+from cfb_mjx.model.effects.rate_damping import RateDamping
 from cfb_mjx.model.effects.regression_dilution import RegressionDilution
 from cfb_mjx.model.effects.rotor_drag import RotorDrag
 from cfb_mjx.model.effects.thrust_scale import ThrustScale
@@ -53,6 +55,7 @@ _PHYSICS: dict[str, type[Effect]] = {
     for effect in (
         ThrustScale,
         TorqueScale,
+        PropDamage,
         Inertia,
         CogOffset,
         Payload,
@@ -75,6 +78,7 @@ _PHYSICS: dict[str, type[Effect]] = {
         Gust,
         Jet,
         PositionMoment,
+        RateDamping,
         PayloadSwing,
     )
 }
@@ -175,7 +179,7 @@ def effect_from_mapping(item: Mapping[str, Any], where: str, parameters: Paramet
     if not isinstance(values, Mapping):
         raise CfbError(f"{where}: effects.{name}.parameters must be a mapping, found {told(values)}.")
     for key in item:
-        if key not in ("name", "parameters", "source", "uncertainty", "p_value"):
+        if key not in ("name", "parameters", "source", "uncertainty", "spread", "p_value"):
             raise CfbError(f"{where}: unknown key 'effects.{name}.{key}'.")
     try:
         values = kind.migrated(values, parameters)

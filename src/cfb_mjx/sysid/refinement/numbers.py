@@ -16,8 +16,8 @@ from cfb_mjx.model.effects import KNOWN, Effect, RegressionDilution
 from cfb_mjx.parameters import Parameters
 
 PLANT = (
-    *("blade_flapping", "inflow_thrust", "rotor_drag", "thrust_scale", "inertia", "cog_offset", "torque_scale"),
-    *("thrust_tilt", "position_moment", "command_delay", "motor_asymmetry", "battery_sag"),
+    *("blade_flapping", "inflow_thrust", "rate_damping", "rotor_drag", "thrust_scale", "inertia", "cog_offset"),
+    *("torque_scale", "thrust_tilt", "position_moment", "command_delay", "motor_asymmetry", "battery_sag"),
 )
 """What a drone in one piece lacks beside the paper's model, all at once: one by one none of them predicts better.
 Loads, wind and what only some drones have are for where there is a reason."""
@@ -25,8 +25,8 @@ INERTIA = 0.25
 """Largest plausible change of a moment of inertia, as a share: what decks and another battery bring about."""
 HELD = 1e-12
 """By so much a number that is held may move: its scale must not be nothing."""
-RATE_DAMPING = 2.0
-"""Largest plausible damping of roll and pitch by axial inflow, 1/s: measured ones are about 1 to 2."""
+AIR = 1.2
+"""Density, kg/m^3."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Number:
 
 
 def plausible_numbers(parameters: Parameters, effects: Sequence[str]) -> tuple[Number, ...]:
-    """Every number of some effects within its prior range; inertia and rate damping within `INERTIA`, `RATE_DAMPING`.
+    """Every number of some effects within its prior range; inertia within `INERTIA`, inflow within momentum theory.
 
     Fields that no flight tells (`Effect.assumed`) stay as the model has them.
 
@@ -87,10 +87,11 @@ def plausible_numbers(parameters: Parameters, effects: Sequence[str]) -> tuple[N
     """
     if RegressionDilution.name in effects:
         raise CfbError(f"{RegressionDilution.name} is no physics: it is for predictors only (--predictor).")
-    # Four rotors half a spacing from the axis: a rolling drone is damped by coefficient * spacing^2 / inertia.
-    spacing, inertia = float(parameters.rotor_spacing), float(jnp.min(parameters.inertia[:2]))
-    damping = RATE_DAMPING * inertia / spacing**2
-    bounds = {("inertia", "relative"): (-INERTIA, INERTIA), ("inflow_thrust", "coefficient"): (0.0, damping)}
+    # A disc of area A at hover loses at most dT/dv = 2 rho A v_h of its thrust T = 2 rho A v_h^2 to a climb (Leishman,
+    # Principles of Helicopter Aerodynamics, ch. 2), and discs side by side are no wider than the rotors' spacing.
+    area = np.pi * float(parameters.rotor_spacing) ** 2 / 4
+    lost = float(np.sqrt(2 * AIR * area * float(parameters.mass * parameters.gravity) / 4))
+    bounds = {("inertia", "relative"): (-INERTIA, INERTIA), ("inflow_thrust", "coefficient"): (0.0, lost)}
     return _numbers(effects, bounds)
 
 

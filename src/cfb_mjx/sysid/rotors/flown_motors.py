@@ -17,16 +17,38 @@ from cfb_mjx.sysid.rotors.supply import SURE, fit_with_sag
 
 
 @dataclass(frozen=True)
+class Told:
+    """An effect of the motors.
+
+    Attributes:
+        effect: with its number.
+        number: that number's name.
+        std: its standard deviation.
+        at_bound: whether it stands at the end of what is plausible.
+    """
+
+    effect: Effect
+    number: str
+    std: float
+    at_bound: bool
+
+    @property
+    def t(self) -> float:
+        """Standard deviations that the number is away from nothing."""
+        return float(getattr(self.effect, self.number)) / self.std
+
+
+@dataclass(frozen=True)
 class Motors:
     """What commands and measured rotor speeds tell.
 
     Attributes:
         entries: of a model file.
-        effects: of the motors, each with standard deviations by field.
+        effects: of the motors.
     """
 
     entries: dict[str, Entry] = field(default_factory=dict)
-    effects: tuple[tuple[Effect, dict[str, float]], ...] = ()
+    effects: tuple[Told, ...] = ()
 
 
 def flown_motors(logs: Sequence[FlightLog], nominal: Parameters, rows: int, piece: float) -> Motors:
@@ -54,11 +76,13 @@ def flown_motors(logs: Sequence[FlightLog], nominal: Parameters, rows: int, piec
         each = [fit.motors[number].optimum for number in sorted(fit.motors)]
         values[lag] = np.array([o.value(lag) for o in each]), np.array([o.std(lag) for o in each])
         late, best = "dead_time", fit.common.optimum
-        delay = float(np.clip(best.value(late), *CommandDelay.prior["delay"]))
-        if delay > SURE * best.std(late):
-            effects.append((CommandDelay(delay), {"delay": best.std(late)}))
+        most = CommandDelay.prior["delay"][1]
+        delay, std = float(min(best.value(late), most)), best.std(late)
+        if delay > SURE * std:
+            effects.append(Told(CommandDelay(delay), "delay", std, delay == most))
     if sag is not None:
-        effects.append((BatterySag(level=0.0, slope=sag.slope, lag=sag.lag), {"slope": sag.std}))
+        effect = BatterySag(level=0.0, slope=sag.slope, lag=sag.lag)
+        effects.append(Told(effect, "slope", sag.std, sag.slope == BatterySag.prior["slope"][1]))
     source = f"fitted to the rotor speeds of {len(records)} flights"
     return Motors({name: Entry(v[0], source, v[1]) for name, v in values.items() if v is not None}, tuple(effects))
 

@@ -26,7 +26,7 @@ from cfb_mjx.sysid.tracing.rare import with_rare
 from cfb_mjx.sysid.tracing.residuals import residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
-from cfb_mjx.sysid.tracing.together import RULES, Part, Together, fit_together, hypothesis_of, paired
+from cfb_mjx.sysid.tracing.together import RULES, Asked, Part, Together, asked, fit_together, hypothesis_of, paired
 from cfb_mjx.sysid.tracing.trace import PATIENCE, Found, Trace, numbers_of, trace
 
 ENOUGH, SAME_LINE = 3, 0.1
@@ -48,6 +48,8 @@ class Reported:
     verdict: Verdict | None = None
     at_bound: list[str] = field(default_factory=list)
     """Names of its numbers that stand where they may not go further."""
+    asked: list[Asked] = field(default_factory=list)
+    """What the innovations make of its numbers, where predictions decided."""
 
     def to_json(self) -> dict:
         """The layout of ``report.json``."""
@@ -60,6 +62,9 @@ class Reported:
             more |= {} if self.verdict.gain is None else {"held_out_gain_nats": self.verdict.gain}
         if self.at_bound:
             more |= {"at_bound": self.at_bound}
+        if self.asked:
+            keys = ("value", "std", "contradicts")
+            more |= {"innovations": {each.name: {key: getattr(each, key) for key in keys} for each in self.asked}}
         return {
             "name": self.name,
             "p_value": self.p_value,
@@ -230,7 +235,7 @@ def _whole(
     reported, unconfirmed = [], []
     for part in whole.parts:
         entry = _reported(search, part, after, held_out)
-        stands = entry.verdict.t >= RULES.sure
+        stands = entry.verdict.t >= (-RULES.sure if part.told else RULES.sure)
         (reported if stands else unconfirmed).append(entry)
     if unconfirmed:
         model = whole.without([item.name for item in unconfirmed])
@@ -238,6 +243,11 @@ def _whole(
         for item in reported:
             effect = next(e for e in model.effects if type(e).name == item.name)
             item.parameters = {key: np.asarray(getattr(effect, key)).tolist() for key in item.parameters}
+    told = {part.name for part in whole.parts if part.told}
+    beside_rotors = [item for item in reported if item.name not in told]
+    others = asked(search, model, [item.name for item in beside_rotors]) if beside_rotors else {}
+    for item in beside_rotors:
+        item.asked = others[item.name]
     gone = {item.name for item in unconfirmed}
     hypothesis = search.learned(hypothesis_of(search, model, gone))
     beside = search.beside(held_out, replace(check_sensors(held_out, *search.delays), faults=HEALTHY))
@@ -251,7 +261,10 @@ def _whole(
 
 
 def _reported(search: Search, part: Part, after: Evaluation, held_out: list[FlightLog]) -> Reported:
-    """An effect fitted with others, judged by predictions of held-out flights without it."""
+    """An effect fitted with others, judged by predictions of held-out flights without it.
+
+    Of one that the rotor speeds tell the p-value is theirs: in predictions other effects may hide what it buys.
+    """
     t, p_value = paired(evaluate(part.without, held_out, keep_diverged=True), after)
     without = hypothesis_of(search, part.without, {part.name})
     found = Found(
@@ -265,6 +278,7 @@ def _reported(search: Search, part: Part, after: Evaluation, held_out: list[Flig
         without,
     )
     verdict = Verdict(None, t, p_value)
+    p_value = part.p_value if part.told else p_value
     return Reported(part.name, p_value, part.parameters, part.uncertainty, found, verdict, part.at_bound)
 
 

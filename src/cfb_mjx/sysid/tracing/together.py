@@ -37,7 +37,7 @@ from cfb_mjx.sysid.rotors.flown_motors import Motors, flown_motors
 from cfb_mjx.sysid.tracing import columns as cols
 from cfb_mjx.sysid.tracing.acceptance import CLEAR
 from cfb_mjx.sysid.tracing.columns import SHIFT, Column
-from cfb_mjx.sysid.tracing.evidence import Evidence
+from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
 from cfb_mjx.sysid.tracing.fits import beside_hold
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 from cfb_mjx.sysid.tracing.search import Search
@@ -81,6 +81,10 @@ class Rules:
     """Correlation of two effects' numbers from which they are hardly told apart."""
     sure: float = 2.3
     """Standard deviations by which held-out flights must bear an effect out."""
+    contradicts: float = 4.0
+    """Standard deviations from which innovations contradict predictions, if they differ by ``differs`` at least."""
+    differs: float = 0.5
+    """As a share of the larger of both."""
 
 
 RULES = Rules()
@@ -98,7 +102,9 @@ class Part:
         buys: by which share it lowers the mean error of the fit flights' predictions: attitude and velocity, at all
             horizons, commands and rotor speeds in, each over what hold errs.
         confusable: effects whose numbers make up for its own.
-        t, p_value: of the fit flights' errors with it against those without.
+        t, p_value: of the fit flights' errors with it against those without; of one that the rotor speeds tell, of
+            its number against nothing.
+        told: whether the rotor speeds tell it: then it need not make predictions better, only not worse.
     """
 
     name: str
@@ -110,6 +116,7 @@ class Part:
     confusable: list[str]
     t: float
     p_value: float
+    told: bool = False
 
 
 @dataclass(frozen=True)
@@ -216,7 +223,7 @@ def _started(base: ModelFile, motors: Motors) -> Quadrotor:
     if not motors.entries:
         return model
     kept = tuple(e for e in model.effects if type(e).name not in OF_MOTORS)
-    return Quadrotor(model.parameters, (*kept, *(e for e, _ in motors.effects)), body=model.body)
+    return Quadrotor(model.parameters, (*kept, *(told.effect for told in motors.effects)), body=model.body)
 
 
 def hypothesis_of(search: Search, model: Quadrotor, absent: Collection[str] = ()) -> Hypothesis:
@@ -235,6 +242,48 @@ def ranked(search: Search, model: Quadrotor, refused: set[str]) -> list[tuple[Ev
     hypothesis = search.learned(hypothesis_of(search, model))
     best = search.probes(hypothesis, search.whole(hypothesis))
     return sorted((pair for name, pair in best.items() if name not in refused), key=lambda pair: -pair[0].gain)
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What the innovations make of one number: accelerations from row to row, beside a disturbance that wanders.
+
+    Predictions fly on the commands alone, and under a controller these answer what the model does not feel: inertia and
+    damping come out too large. The innovations are free of that. Where both tell, and differ, a number stands in for
+    something.
+
+    Attributes:
+        name: of the number.
+        value: that they ask for.
+        std: its standard deviation.
+        contradicts: whether that is not what predictions ask for.
+    """
+
+    name: str
+    value: float
+    std: float
+    contradicts: bool
+
+
+def asked(search: Search, model: Quadrotor, names: Collection[str], rules: Rules = RULES) -> dict[str, list[Asked]]:
+    """What the innovations ask of the strengths of some effects of a model, all together, by effect."""
+    search = replace(search, parameters=model.parameters, _flights={})
+    hypothesis = search.learned(hypothesis_of(search, model))
+    columns = [column for name in names for variant in cols.strengths(name)[:1] for column in variant]
+    columns = [replace(column, probe=()) for column in columns]
+    linear = search.linearise(hypothesis, columns)
+    index = linear.index(columns)
+    steps = solve(linear.blocks.sum(0), index, linear.scale)
+    deviations = np.sqrt(np.diag(covariance(linear.blocks, index, linear.scale, steps)))
+    found: dict[str, list[Asked]] = {name: [] for name in names}
+    for column, step, deviation in zip(columns, steps, deviations, strict=True):
+        at = "" if column.index is None else f"[{column.index}]"
+        value = np.asarray(getattr(hypothesis.effect(column.effect), column.field))
+        now = float(value if column.index is None else value[column.index])
+        other, std = now + float(step) * column.scale, float(deviation) * column.scale
+        differs = abs(other - now) > max(rules.contradicts * std, rules.differs * max(abs(now), abs(other)))
+        found[column.effect].append(Asked(f"{column.effect}.{column.field}{at}", other, std, differs))
+    return found
 
 
 def paired(poorer: Evaluation, better: Evaluation) -> tuple[float, float]:
@@ -324,27 +373,26 @@ def _parts(found: Refinement, motors: Motors, rules: Rules, say: Callable[[str],
     say("leaving out one effect after another")
     whole = found.left
     error = _mean(whole.errors)
-    told = {type(e).name: std for e, std in motors.effects}
+    told = {type(each.effect).name: each for each in motors.effects}
     parts = []
     for name in [*_fitted(found), *told]:
-        less = found.judged(_neutral(found.model, name)) if name in told else found.without([name])
-        gains = [(a - b).sum(axis=(1, 2)) for a, b in zip(less.losses, whole.losses, strict=True)]
-        t, p_value = _surely(gains)
+        own = told.get(name)
+        less = found.without([name]) if own is None else found.judged(_neutral(found.model, name))
         effect = next(e for e in found.model.effects if type(e).name == name)
-        std = told.get(name) or found.uncertainty(name)
-        parts.append(
-            Part(
-                name,
-                {key: np.asarray(getattr(effect, key)).tolist() for key in std},
-                std,
+        if own is None:
+            std, at_bound = (
+                found.uncertainty(name),
                 [n.name for n in found.numbers if n.effect == name and found.at_bound(n)],
-                _bare(found, less.model),
-                1 - error / _mean(less.errors),
-                [] if name in told else _confusable(found, name, rules.confused),
-                t,
-                p_value,
             )
-        )
+            confusable = _confusable(found, name, rules.confused)
+            t, p_value = _surely([(a - b).sum(axis=(1, 2)) for a, b in zip(less.losses, whole.losses, strict=True)])
+        else:
+            std, at_bound, confusable = {own.number: own.std}, [own.number] if own.at_bound else [], []
+            t, p_value = own.t, float(norm.sf(own.t))
+        values = {key: np.asarray(getattr(effect, key)).tolist() for key in std}
+        buys = 1 - error / _mean(less.errors)
+        without = _bare(found, less.model)
+        parts.append(Part(name, values, std, at_bound, without, buys, confusable, t, p_value, own is not None))
     return sorted(parts, key=lambda part: -part.buys)
 
 
