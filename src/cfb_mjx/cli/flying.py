@@ -89,8 +89,8 @@ def run_fly(
     from cfb_mjx.devices import Devices
     from cfb_mjx.envs import Noise, TargetTask
     from cfb_mjx.envs.episode import QUIET, with_room
-    from cfb_mjx.model import Quadrotor
-    from cfb_mjx.parameters import load_model_file, load_randomisation, require_possible
+    from cfb_mjx.model import Quadrotor, require_possible
+    from cfb_mjx.parameters import load_model_file, load_randomisation
     from cfb_mjx.train import flying
     from cfb_mjx.train.flips import FLIPS, flips
 
@@ -99,7 +99,7 @@ def run_fly(
     described = load_model_file(model)
     nominal = Quadrotor.from_file(described)
     spread = load_randomisation(randomisation)
-    require_possible(nominal.parameters, spread, magnitude, "--magnitude")
+    require_possible(nominal, spread, magnitude, "--magnitude")
     # Scaled for the model that was named, whatever it is flown on.
     pilot = find_pilot(controller, nominal)
     course = TargetTask(

@@ -21,10 +21,11 @@ from cfb_mjx.envs.observation import Estimate, Layout, Memory
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
+from cfb_mjx.model.randomised import require_possible, sample_drone
 from cfb_mjx.model.rotors import steady_command
 from cfb_mjx.model.state import AnyArray, Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec, exponential, multiply
-from cfb_mjx.parameters import Parameters, Randomisation, require_possible, sample_parameters
+from cfb_mjx.parameters import Parameters, Randomisation
 
 
 @dataclass(frozen=True)
@@ -257,7 +258,7 @@ def reset(
         setpoint: what is asked for beside the target; drawn by default.
 
     Raises:
-        CfbError: ranges that allow impossible drones (`cfb_mjx.parameters.require_possible`); or the task has no room
+        CfbError: ranges that allow impossible drones (`cfb_mjx.model.require_possible`); or the task has no room
             for the delays that can be drawn, or they are not known as the model is traced.
     """
     room = _room_s(task, nominal, magnitude)
@@ -266,10 +267,9 @@ def reset(
     if task.randomisation is not None:
         factor = task.magnitude if magnitude is None else magnitude
         # Asked of the whole magnitude: whether a drone can be must not depend on the grade that this key draws.
-        require_possible(nominal.parameters, task.randomisation, factor)
+        require_possible(nominal, task.randomisation, factor)
         factor = factor * mildness(task, streams.mildness)
-        drawn = sample_parameters(streams.drone, nominal.parameters, task.randomisation, factor)
-        model = eqx.tree_at(lambda m: m.parameters, nominal, drawn)
+        model = sample_drone(streams.drone, nominal, task.randomisation, factor)
     target = jnp.asarray(target, model.parameters.mass.dtype)
     drawn = task.draw_setpoint(streams.setpoint) if setpoint is None else setpoint
     setpoint = jnp.asarray(drawn, target.dtype)

@@ -20,7 +20,8 @@ from cfb_mjx.envs.episode import Episode, Task, choose, observe, reset, step
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
-from cfb_mjx.parameters import SPECIFICATIONS, require_possible
+from cfb_mjx.model.randomised import require_possible
+from cfb_mjx.parameters import SPECIFICATIONS
 
 try:
     import gymnasium
@@ -106,7 +107,7 @@ class TargetVectorEnv(VectorEnv):
         self.nominal = model if isinstance(model, Quadrotor) else Quadrotor.from_file(model)
         self.task.hold(self.nominal)
         if self.task.randomisation is not None:
-            require_possible(self.nominal.parameters, self.task.randomisation, self.task.magnitude)
+            require_possible(self.nominal, self.task.randomisation, self.task.magnitude)
         begin = jax.vmap(partial(reset, self.task, self.nominal))
         look, truth = jax.vmap(partial(observe, self.task)), jax.vmap(_truth)
 

@@ -4,6 +4,7 @@ from cfb_mjx.model.bodies import Body, RigidBody
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.effects import CATALOGUE, Condition, Effect, ParasiticDrag, Wrench, register
 from cfb_mjx.model.quadrotor import Quadrotor, begin, specific_force, step
+from cfb_mjx.model.randomised import require_possible, sample_drone
 from cfb_mjx.model.rollout import in_chunks, rollout, rollout_final
 from cfb_mjx.model.rotors import hover_command, hover_rotor_speed, rotor_speed_history, thrust, torque
 from cfb_mjx.model.state import State
@@ -25,9 +26,11 @@ __all__ = [
     "hover_rotor_speed",
     "in_chunks",
     "register",
+    "require_possible",
     "rollout",
     "rollout_final",
     "rotor_speed_history",
+    "sample_drone",
     "specific_force",
     "step",
     "thrust",

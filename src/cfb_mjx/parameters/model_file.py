@@ -19,16 +19,25 @@ from cfb_mjx.parameters.parameters import DEFAULTS, SPECIFICATIONS, Parameters, 
 FORMAT = "cfb_mjx model 1"
 _TOP_LEVEL = {"format", "kind", "name", "description", "parameters", "effects", "provenance"}
 _KINDS = ("plant", "predictor")
-_ENTRY_KEYS = {"value", "unit", "std", "source"}
+_ENTRY_KEYS = {"value", "unit", "std", "spread", "source"}
+_SPREADS = ("std", "spread")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One constant: ``value`` in SI, its ``source`` and its standard deviation ``std`` (None where unknown)."""
+    """One constant.
+
+    Attributes:
+        value: in SI.
+        source: where it comes from.
+        std: its standard deviation; None where unknown.
+        spread: of a type of drone, the standard deviation between its drones; None where unknown.
+    """
 
     value: np.ndarray
     source: str
     std: np.ndarray | None = None
+    spread: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -143,8 +152,7 @@ def save_model_file(model: ModelFile, path: str | Path) -> None:
     parameters = {}
     for key, entry in model.entries.items():
         item = {"value": _plain(entry.value), "unit": SPECIFICATIONS[key].unit, "source": entry.source}
-        if entry.std is not None:
-            item["std"] = _plain(entry.std)
+        item |= {key: _plain(found) for key in _SPREADS if (found := getattr(entry, key)) is not None}
         parameters[key] = item
     document = {"format": FORMAT} | ({} if model.kind == "plant" else {"kind": model.kind})
     document |= {"name": model.name, "description": model.description, "parameters": parameters}
@@ -168,10 +176,13 @@ def _entry(key: str, raw: Any, path: Path) -> Entry:
         raise CfbError(f"{path}: parameters.{key} has no value.")
     if not raw.get("source"):
         raise CfbError(f"{path}: parameters.{key} has no source; say where the number comes from.")
-    std = None if raw.get("std") is None else _numbers(key, raw["std"], path, "std")
-    if std is not None and np.any(std < 0):
-        raise CfbError(f"{path}: parameters.{key}.std must be zero or positive.")
-    return Entry(_value(key, raw["value"], path), str(raw["source"]), std)
+    spreads = {}
+    for what in _SPREADS:
+        if raw.get(what) is not None:
+            spreads[what] = _numbers(key, raw[what], path, what)
+            if np.any(spreads[what] < 0):
+                raise CfbError(f"{path}: parameters.{key}.{what} must be zero or positive.")
+    return Entry(_value(key, raw["value"], path), str(raw["source"]), **spreads)
 
 
 def _value(key: str, raw: Any, path) -> np.ndarray:

@@ -1,4 +1,7 @@
-"""Domain randomisation: ranges read from YAML, and parameter draws as a pure function of a PRNG key."""
+"""Domain randomisation: ranges read from YAML, and parameter draws as a pure function of a PRNG key.
+
+A model of a type of drone carries measured ranges itself: the ``spread`` of its numbers between drones.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cfb_mjx.documents import load_named, refuse_unknown, told
+from cfb_mjx.documents import load_named, load_yaml, refuse_unknown, told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters.limits import concrete
+from cfb_mjx.parameters.model_file import FORMAT as MODEL_FORMAT
+from cfb_mjx.parameters.model_file import ModelFile, load_model_file, preset_names
 from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters, current_names
 
 FORMAT = "cfb_mjx randomisation 1"
+UNIFORM = math.sqrt(3)
+"""Half-width of a uniform draw over its standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -35,18 +42,27 @@ class Range:
 
 @dataclass(frozen=True)
 class Randomisation:
-    """Which parameters vary, and how far at magnitude 1. Hashable, so it can be closed over under ``jit``."""
+    """What varies, and how far at magnitude 1. Hashable, so it can be closed over under ``jit``.
+
+    Attributes:
+        name: for messages.
+        ranges: of parameters, by name.
+        effects: of effects: effect, field, range. Drawn by `cfb_mjx.model.sample_drone`.
+    """
 
     name: str
     ranges: tuple[tuple[str, Range], ...]
+    effects: tuple[tuple[str, str, Range], ...] = ()
 
 
 def load_randomisation(name_or_path: str | Path = "paper") -> Randomisation:
-    """Read a shipped randomisation (``paper``, ``identification``) or a YAML file.
+    """Read a shipped randomisation (``paper``, ``identification``), a YAML file, or a model with spreads.
 
     Raises:
-        CfbError: no such file, unknown keys or impossible widths, named.
+        CfbError: no such file, unknown keys or impossible widths, named; a model whose numbers have no ``spread``.
     """
+    if _is_model(name_or_path):
+        return _between_drones(load_model_file(name_or_path))
     path, document = load_named(name_or_path, "randomisation", FORMAT, "randomisation")
     refuse_unknown(document, {"format", "name", "description", "ranges"}, path, "")
     ranges = document.get("ranges") or {}
@@ -58,6 +74,30 @@ def load_randomisation(name_or_path: str | Path = "paper") -> Randomisation:
         name=str(document.get("name", path.stem)),
         ranges=tuple((key, _range(key, raw, path)) for key, raw in ranges.items()),
     )
+
+
+def _is_model(name_or_path: str | Path) -> bool:
+    if Path(name_or_path).suffix in (".yaml", ".yml"):
+        return load_yaml(name_or_path).get("format") == MODEL_FORMAT
+    return str(name_or_path) in preset_names()
+
+
+def _between_drones(model: ModelFile) -> Randomisation:
+    """Uniform draws as far from the type's value as has the measured spread for standard deviation."""
+    ranges, effects = [], []
+    for key, entry in model.entries.items():
+        if entry.spread is not None:
+            width = UNIFORM * np.abs(entry.spread / entry.value)
+            ranges.append((key, Range(tuple(width.ravel().tolist()), True, False)))
+    for item in model.effects:
+        for key, spread in (item.get("spread") or {}).items():
+            width = UNIFORM * np.atleast_1d(np.asarray(spread, dtype=np.float64))
+            effects.append((item["name"], key, Range(tuple(width.tolist()), False, False)))
+    if not ranges and not effects:
+        raise CfbError(
+            f"model {model.name}: no number has a spread between drones; take cfb-fleet, paper or a YAML file."
+        )
+    return Randomisation(model.name, tuple(ranges), tuple(effects))
 
 
 def _range(key: str, raw, path: Path) -> Range:
@@ -103,13 +143,17 @@ def sample_parameters(
         magnitude: factor on every range; 0 returns the nominal drone. May be traced.
 
     Raises:
-        CfbError: ranges whose draws could lie beyond what can be (`require_possible`).
+        CfbError: ranges whose draws could lie beyond what can be (`require_possible`), or that vary effects.
 
     Where ``nominal`` or ``magnitude`` is traced, nothing can be refused: there a number drawn beyond what can be is
     NaN, and so is every state of that drone. A drawn inertia that no rigid body can have (the paper's independent
     +-20 % allows some) has its largest moment reduced to the sum of the other two.
     """
     randomisation = load_randomisation() if randomisation is None else randomisation
+    if randomisation.effects:
+        raise CfbError(
+            f"randomisation '{randomisation.name}' varies effects, which are no parameters; draw with sample_drone."
+        )
     require_possible(nominal, randomisation, magnitude)
     drawn = {}
     for name, spread in randomisation.ranges:

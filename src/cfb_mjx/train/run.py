@@ -27,8 +27,9 @@ from cfb_mjx.hosts import as_first, first, from_first
 from cfb_mjx.model.effects import KNOWN
 from cfb_mjx.model.effects.catalogue import outside, written
 from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.randomised import require_possible
 from cfb_mjx.model.rotors import hover_command
-from cfb_mjx.parameters import ModelFile, load_model_file, load_randomisation, require_possible
+from cfb_mjx.parameters import ModelFile, load_model_file, load_randomisation
 from cfb_mjx.train.algorithm import Algorithm
 from cfb_mjx.train.checkpoint import load_state, read_about, save_checkpoint
 from cfb_mjx.train.config import TrainingConfig
@@ -80,7 +81,9 @@ class Training:
         """
         described = load_model_file(config.model)
         ranges = load_randomisation(config.randomisation.ranges)
-        require_possible(described.parameters(), ranges, config.randomisation.magnitude, "randomisation.magnitude")
+        require_possible(
+            Quadrotor.from_file(described), ranges, config.randomisation.magnitude, "randomisation.magnitude"
+        )
         if not force:
             described.require_plant("training", "--force")
         policy = None if start is None else load_policy(start)

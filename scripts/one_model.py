@@ -1,0 +1,343 @@
+"""One model for every drone of a type, from drones whose loops were closed; write cfb-fleet and docs/one-model.md.
+
+    python scripts/one_model.py NAME=FOLDER,MODEL,MASS_KG ... --loops out/real-loops [--bench TABLE.csv ...]
+
+As `real_loops.py`, which has to run first: FOLDER holds fit/ and validation/, MODEL is a preset or the NAME of a drone
+before it, and LOOPS/NAME/model.yaml is where the fit of a drone starts. Every drone is fitted with the same numbers,
+what it alone carries (a load) beside them; `cfb_mjx.sysid.fleet` says what they have in common. Then every drone is
+judged by the type without it. BENCH tables have rotor speeds (rpm) and the thrust of four rotors (g). Only aggregate
+numbers are written; the flights themselves never enter the project.
+"""
+
+import argparse
+import csv
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+
+from cfb_mjx.cli.evaluating import changed_model
+from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.files import write_text
+from cfb_mjx.logs import FlightLog, read_log
+from cfb_mjx.model import Quadrotor, thrust
+from cfb_mjx.model.effects import KNOWN
+from cfb_mjx.parameters import Entry, ModelFile, load_model_file, save_model_file
+from cfb_mjx.sysid import evaluate
+from cfb_mjx.sysid.fleet import Fleet, OfDrone, fleet
+from cfb_mjx.sysid.observer import Observer
+from cfb_mjx.sysid.refinement import Number, Refinement, plausible_numbers, refine
+from cfb_mjx.sysid.refinement.numbers import PLANT
+from cfb_mjx.sysid.refinement.predictions import ALIKE, kinds_alike
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE, FIGURE = ROOT / "docs" / "one-model.md", ROOT / "docs" / "one-model.png"
+PRESET = ROOT / "configs" / "parameters" / "cfb-fleet.yaml"
+OWN = ("cog_offset", "thrust_tilt", "position_moment")
+"""A drone's own: the type has none of them, and a spread."""
+OF_MOTORS = ("command_delay", "motor_asymmetry", "battery_sag")
+COMMON = tuple(name for name in PLANT if name not in OF_MOTORS)
+MOTORS = ("motor_gain", "motor_speed_offset", "motor_time_constant")
+VARIANTS = ("commands_in", "rotor_speed_in", "commands_in_observer", "rotor_speed_in_observer")
+HORIZON, WINDOWS, STEPS = 0.5, 400, 15
+BODY = "cfb"
+"""The preset whose body the type has."""
+CURVE = (800.0, 2600.0)
+"""Rotor speeds over which thrust curves are compared, rad/s."""
+
+
+@dataclass(frozen=True)
+class Drone:
+    """A drone, its flights, what was declared of it and what its closed loop found."""
+
+    name: str
+    folder: Path
+    declared: ModelFile
+    found: ModelFile
+
+    def _flights(self, side: str) -> list[FlightLog]:
+        return [read_log(path) for path in sorted((self.folder / side).iterdir())]
+
+    @cached_property
+    def fit_logs(self) -> list[FlightLog]:
+        return self._flights("fit")
+
+    @cached_property
+    def judged(self) -> list[FlightLog]:
+        return self._flights("validation")
+
+    @cached_property
+    def extras(self) -> tuple[str, ...]:
+        """What it alone carries."""
+        return tuple(item["name"] for item in self.found.effects if item["name"] not in PLANT)
+
+    def refined(self, model: Quadrotor, names: tuple[str, ...]) -> Refinement:
+        numbers = plausible_numbers(model.parameters, names)
+        weights = kinds_alike(model, self.fit_logs)
+        return refine(model, self.fit_logs, numbers, weights=weights, iterations=STEPS, most_windows=WINDOWS)
+
+    @cached_property
+    def fit(self) -> Refinement:
+        print(f"{self.name}: fitting it", flush=True)
+        return self.refined(Quadrotor.from_file(self.found), (*COMMON, *self.extras))
+
+    @cached_property
+    def of_drone(self) -> OfDrone:
+        """What it says of the type: no load, and how far its motors follow the battery."""
+        whole = OfDrone.fitted(self.name, self.fit)
+        kept = [i for i, n in enumerate(whole.numbers) if n.effect in COMMON]
+        numbers, values = [whole.numbers[i] for i in kept], [whole.values[i] for i in kept]
+        covariance = whole.covariance[np.ix_(kept, kept)]
+        for item in self.found.effects:
+            if item["name"] == "battery_sag":
+                numbers.append(Number("battery_sag", "slope", None, *KNOWN["battery_sag"].prior["slope"]))
+                values.append(item["parameters"]["slope"])
+                std = item.get("uncertainty", {}).get("slope") or 0.0
+                covariance = np.block([[covariance, np.zeros((len(kept), 1))], [np.zeros((1, len(kept))), std**2]])
+        return OfDrone(self.name, tuple(numbers), np.array(values), covariance)
+
+
+def of_motors(drones: list[Drone]) -> dict[str, Entry]:
+    """Constants of the type's motors: spread over all motors of all drones."""
+    found = {}
+    for name in MOTORS:
+        each = np.array([np.broadcast_to(d.found.entries[name].value, 4) for d in drones])
+        spread = np.sqrt(each.mean(axis=1).var(ddof=1) + each.var(axis=1, ddof=1).mean())
+        std = each.mean(axis=1).std(ddof=1) / np.sqrt(len(drones))
+        source = f"mean over the motors of {len(drones)} drones fitted to their rotor speeds"
+        found[name] = Entry(np.full(4, each.mean()), source, np.full(4, std), np.full(4, spread))
+    return found
+
+
+def type_of(drones: list[Drone], name: str) -> tuple[ModelFile, Fleet]:
+    """The model of a type from some drones."""
+    common = fleet([drone.of_drone for drone in drones], OWN)
+    names = ", ".join(drone.name for drone in drones)
+    mappings = common.mappings(f"fitted to flights of {len(drones)} drones ({names}): docs/one-model.md")
+    for item in mappings:
+        item["source"] = f"{KNOWN[item['name']].source}; {item['source']}"
+        if item["name"] == "battery_sag":
+            # What the rotors feel at once, and 3.7 V as the voltage at which the gain holds.
+            item["parameters"] |= {"level": 0.0, "lag": 0.02}
+    body = load_model_file(BODY)
+    file = replace(
+        body,
+        name=name,
+        description="The Crazyflie Brushless as a type: the paper's model, and what all of several laboratories' drones"
+        " lack beside it. `uncertainty` is that of the type's number, `spread` the standard deviation between drones"
+        " (--randomisation cfb-fleet draws such drones). docs/one-model.md says what it is worth.",
+        entries={**body.entries, **of_motors(drones)},
+        effects=tuple(mappings),
+    )
+    return file, common
+
+
+def own_fitted(drone: Drone, of_type: ModelFile) -> Quadrotor:
+    """The type with what is the drone's own fitted to its flights: motors, centre of gravity, tilt, a load."""
+    mass = drone.declared.entries["mass"]
+    motors = {name: drone.found.entries[name] for name in MOTORS}
+    model = Quadrotor.from_file(replace(of_type, entries={**of_type.entries, "mass": mass, **motors}))
+    loads = tuple(e for e in Quadrotor.from_file(drone.found).effects if type(e).name in drone.extras)
+    model = Quadrotor(model.parameters, (*model.effects, *loads), body=model.body)
+    return drone.refined(model, ("cog_offset", "thrust_tilt", *drone.extras)).model
+
+
+def errors(model: Quadrotor, logs: list[FlightLog]) -> dict[str, tuple[float, float]]:
+    """Mean attitude (rad) and velocity (m/s) error after half a second, by variant."""
+    found = evaluate(model, logs, observer=Observer(), keep_diverged=True)
+    told = {name: found.metrics(name) for name in (*VARIANTS, "hold")}
+    key = f"@{HORIZON}s"
+    return {n: (np.radians(m[f"attitude_mean_deg{key}"]), m[f"velocity_mean_mps{key}"]) for n, m in told.items() if m}
+
+
+def gentle(drone: Drone) -> list[FlightLog]:
+    """Flights in which hold errs least, within a factor: of the kind that disturbances, not commands, decide."""
+    each = {log.name: errors(Quadrotor.from_file(drone.declared), [log])["hold"][0] for log in drone.judged}
+    return [log for log in drone.judged if each[log.name] <= ALIKE * min(each.values())]
+
+
+def models(drone: Drone, drones: list[Drone]) -> dict[str, Quadrotor]:
+    """What a drone is predicted with, by what the page calls it."""
+    mass, others = drone.declared.entries["mass"], [other for other in drones if other is not drone]
+    of_type, _ = type_of(others, "others")
+    found = {"the declared model": Quadrotor.from_file(drone.declared)}
+    for other in others:
+        model = replace(other.found, entries={**other.found.entries, "mass": mass})
+        found[f"{other.name}'s model"] = Quadrotor.from_file(model)
+    found["the type without it"] = Quadrotor.from_file(replace(of_type, entries={**of_type.entries, "mass": mass}))
+    found["the same, its own numbers fitted"] = own_fitted(drone, of_type)
+    found["its own model"] = Quadrotor.from_file(drone.found)
+    return found
+
+
+def judged_table(drone: Drone, drones: list[Drone]) -> list[str]:
+    """Lines of the page: errors of all models on a drone's validation flights."""
+    few, rows = gentle(drone), models(drone, drones)
+    lines = [f"### {drone.name}", ""]
+    kinds = {"all validation flights": drone.judged}
+    if len(few) < len(drone.judged):
+        kinds[f"the gentle ones ({', '.join(log.name for log in few)})"] = few
+    for words, logs in kinds.items():
+        print(f"{drone.name}: {words}", flush=True)
+        head = " | ".join(name.replace("_", " ").replace(" observer", ", observer") for name in VARIANTS)
+        lines += [f"{words[0].upper()}{words[1:]}:", "", f"| model | {head} |", "|---|" + "---|" * len(VARIANTS)]
+        still = None
+        for name, model in rows.items():
+            found = errors(model, logs)
+            still = found["hold"]
+            lines.append(f"| {name} | " + " | ".join("{:.3f} / {:.3f}".format(*found[v]) for v in VARIANTS) + " |")
+        lines += ["| hold | " + " | ".join(["{:.3f} / {:.3f}".format(*still)] * len(VARIANTS)) + " |", ""]
+    return lines
+
+
+def bench(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Rotor speed, rad/s, and thrust of a rotor, N, of a table with rpm and grams of four rotors."""
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file, skipinitialspace=True))
+    speeds = [key for key in rows[0] if key.startswith("rpm")]
+    grams = next(key for key in rows[0] if key.endswith("[g]"))
+    each = np.array([[float(row[key]) for key in speeds] for row in rows])
+    # A sensor that saw no rotor says nothing, or next to it.
+    each[each < 0.5 * each.max(axis=1, keepdims=True)] = np.nan
+    return np.nanmean(each, axis=1) * np.pi / 30, np.array([float(row[grams]) for row in rows]) * 9.81e-3 / 4
+
+
+def against_curve(speed: np.ndarray, force: np.ndarray) -> tuple[float, float]:
+    """By which share measured thrust exceeds the paper's curve, in the least-squares mean, and where the rms is."""
+    paper = Quadrotor.from_file(BODY).parameters
+    inside = (speed > CURVE[0]) & (speed < CURVE[1])
+    curve = np.asarray(thrust(paper, np.repeat(speed[inside][:, None], 4, 1)))[:, 0]
+    share = float(curve @ force[inside] / (curve @ curve))
+    return share - 1, float(np.sqrt(np.mean((force[inside] - share * curve) ** 2)) / force[inside].mean())
+
+
+def draw(drones: list[Drone], common: Fleet, tables: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
+    """The numbers of each drone beside the type's, and thrust curves beside the bench's."""
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    shown = [i for i, n in enumerate(common.numbers) if n.effect not in OWN]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 5.5), width_ratios=(3, 2), layout="constrained")
+    for row, i in enumerate(reversed(shown)):
+        number, scale = common.numbers[i], max(abs(common.values[i]), 1e-12)
+        left.errorbar(
+            common.values[i] / scale, row, xerr=common.spread[i] / scale, fmt="k|", ms=12, capsize=3, lw=1.2, zorder=1
+        )
+        for drone, colour in zip(drones, ("#0072B2", "#E69F00", "#009E73", "#CC79A7"), strict=False):
+            for own, value in zip(drone.of_drone.numbers, drone.of_drone.values, strict=True):
+                if (own.effect, own.field, own.index) == (number.effect, number.field, number.index):
+                    left.plot(value / scale, row, "o", color=colour, ms=5, label=drone.name if row == 0 else None)
+    left.set_yticks(range(len(shown)), [common.numbers[i].name for i in reversed(shown)], fontsize=8)
+    left.set_xlabel("over the type's value; bar: spread between drones")
+    left.set_xlim(-3, 5)
+    left.axvline(0, color="0.8", lw=0.8, zorder=0)
+    left.legend(loc="lower right", fontsize=8)
+    speed, paper = np.linspace(*CURVE, 200), Quadrotor.from_file(BODY).parameters
+    curve = np.asarray(thrust(paper, np.repeat(speed[:, None], 4, 1)))[:, 0]
+    for name, (at, force) in tables.items():
+        inside = (at > CURVE[0]) & (at < CURVE[1])
+        right.plot(at[inside], force[inside], ".", ms=2, color="0.6", zorder=0)
+        right.plot([], [], ".", color="0.6", label=f"bench: {name}")
+    place = next(i for i, n in enumerate(common.numbers) if n.name == "thrust_scale.relative")
+    right.plot(speed, curve, "k--", lw=1, label="paper")
+    right.plot(speed, curve * (1 + common.values[place]), "k", label="the type, from flights")
+    low, high = (curve * (1 + common.values[place] + side * common.spread[place]) for side in (-1, 1))
+    right.fill_between(speed, low, high, color="k", alpha=0.15, lw=0)
+    right.set_xlabel("rotor speed, rad/s")
+    right.set_ylabel("thrust of a rotor, N")
+    right.legend(fontsize=8)
+    figure.savefig(FIGURE, dpi=110)
+
+
+def page(drones: list[Drone], common: Fleet, of_type: ModelFile, tables: dict) -> str:
+    """The page."""
+    facts = ", ".join(f"{name} {value}" for name, value in environment().items())
+    lines = ["# One model for every Crazyflie Brushless", ""]
+    lines += [f"Written by `python scripts/one_model.py`; do not edit. {facts}", ""]
+    lines += [
+        f"`cfb-fleet` is a model of the type, from flights of {len(drones)} drones. Use it for a drone that was not",
+        "measured yet (`cfb evaluate my.csv --model cfb-fleet --set mass=0.037`), as the start of a search",
+        "(`cfb close-loop ... --model cfb-fleet`), and as measured domain randomisation (`cfb fly --model cfb-fleet",
+        "--randomisation cfb-fleet`; in a training `model=cfb-fleet randomisation.ranges=cfb-fleet`).",
+        "",
+        "Every drone was fitted on its own to predictions of its flights, all with the same numbers and what it alone",
+        "carries beside them. The spread between drones is the scatter of the fits less what their errors explain; the",
+        "type's numbers are the mean that heeds both. With so few drones a spread is known to about half its size.",
+        "",
+        "![Numbers of the drones and the type; thrust curves](one-model.png)",
+        "",
+        "## Numbers",
+        "",
+        "| number | " + " | ".join(d.name for d in drones) + " | the type | spread between drones |",
+        "|---|" + "---|" * (len(drones) + 2),
+    ]
+    for number, value, std, spread in zip(common.numbers, common.values, common.std, common.spread, strict=True):
+        cells = []
+        for drone in drones:
+            at = [i for i, n in enumerate(drone.of_drone.numbers) if n.name == number.name]
+            error = np.sqrt(np.diag(drone.of_drone.covariance))
+            cells.append(
+                "".join(f"{drone.of_drone.values[i]:.3g} ± {error[i]:.1g}" for i in at).replace(" ± 0", ", at a bound")
+            )
+        kind = "a drone's own" if number.effect in OWN else f"{value:.3g} ± {std:.1g}"
+        lines.append(f"| {number.name} | " + " | ".join(cells) + f" | {kind} | {spread:.2g} |")
+    for name in MOTORS:
+        entry = of_type.entries[name]
+        cells = [f"{np.mean(d.found.entries[name].value):.4g}" for d in drones]
+        lines.append(
+            f"| {name}, mean of four | " + " | ".join(cells) + f" | {entry.value[0]:.4g} ± {entry.std[0]:.1g} |"
+            f" {entry.spread[0]:.2g}, of single motors |"
+        )
+    for drone in drones:
+        for name in drone.extras:
+            own = next(item for item in drone.found.effects if item["name"] == name)["parameters"]
+            told = ", ".join(f"{key} {value:.4g}" for key, value in own.items() if np.ndim(value) == 0)
+            lines += ["", f"{drone.name} alone carries `{name}`: {told}."]
+    if tables:
+        lines += ["", "Thrust on benches over the paper's curve, in the least-squares mean between"]
+        lines[-1] += f" {CURVE[0]:.0f} and {CURVE[1]:.0f} rad/s (not part of the fit, a check of it):"
+        for name, table in tables.items():
+            share, rms = against_curve(*table)
+            lines += ["", f"- {name}: {100 * share:+.1f} %, rms of what is left {100 * rms:.1f} % of the mean thrust"]
+    lines += [
+        "",
+        "## A drone the type has not seen",
+        "",
+        "Mean error of attitude (rad) and velocity (m/s) half a second ahead, on validation flights. *The type without",
+        "it* is fitted to the other drones and told the mass, nothing else. *Its own numbers fitted*: motors, centre",
+        "of gravity, tilt and a load fitted to the drone's fit flights, all that is common held. *Its own model*: what",
+        "`cfb close-loop` found on them from the declared model.",
+        "",
+    ]
+    for drone in drones:
+        lines += judged_table(drone, drones)
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """The type, the page and the figure."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("drones", nargs="+", metavar="NAME=FOLDER,MODEL,MASS_KG")
+    parser.add_argument("--loops", type=Path, default=ROOT / "out" / "real-loops")
+    parser.add_argument("--bench", type=Path, nargs="*", default=[])
+    options = parser.parse_args()
+    configure_jax(x64=True)
+    drones, declared = [], {}
+    for drone in options.drones:
+        name, _, rest = drone.partition("=")
+        folder, model, mass = rest.split(",")
+        preset = declared.get(model, model)
+        declared[name] = preset
+        own = changed_model(preset, [f"mass={mass}"])
+        drones.append(Drone(name, Path(folder), own, load_model_file(options.loops / name / "model.yaml")))
+    of_type, common = type_of(drones, "cfb-fleet")
+    save_model_file(of_type, PRESET)
+    tables = {path.stem: bench(path) for path in options.bench}
+    draw(drones, common, tables)
+    write_text(PAGE, page(drones, common, of_type, tables) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Whole drones drawn from ranges: their parameters and their effects.
+
+For instance ``vmap(lambda key: sample_drone(key, Quadrotor.from_file("cfb-fleet"), load_randomisation("cfb-fleet")))``
+draws drones that differ as measured ones do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from zlib import crc32
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.model.effects import Effect
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.parameters import Randomisation, sample_parameters
+from cfb_mjx.parameters import require_possible as require_possible_parameters
+from cfb_mjx.parameters.limits import concrete
+from cfb_mjx.parameters.randomisation import Range
+
+
+def sample_drone(
+    key: PRNGKeyArray,
+    nominal: Quadrotor,
+    randomisation: Randomisation,
+    magnitude: float | Float[Array, ""] = 1.0,
+) -> Quadrotor:
+    """Draw one drone. ``vmap`` over ``key`` for many; the same key gives the same drone.
+
+    Args:
+        key: PRNG key.
+        nominal: about which to draw (without batch axes).
+        randomisation: ranges of parameters and effects.
+        magnitude: factor on every range; 0 returns the nominal drone. May be traced.
+
+    Raises:
+        CfbError: ranges of an effect that the drone does not have, or whose draws could lie beyond what can be
+            (`require_possible`).
+
+    Where ``nominal`` or ``magnitude`` is traced, a number drawn beyond what can be is NaN, as in `sample_parameters`.
+    """
+    require_possible(nominal, randomisation, magnitude)
+    parameters = sample_parameters(key, nominal.parameters, replace(randomisation, effects=()), magnitude)
+    drone = eqx.tree_at(lambda m: m.parameters, nominal, parameters)
+    for effect, field, spread in randomisation.effects:
+        at, own = _found(nominal, effect, randomisation)
+        value = jnp.asarray(getattr(own, field))
+        # By its name: adding a range never changes the draws of the others.
+        of_field = jax.random.fold_in(key, crc32(f"{effect}.{field}".encode()))
+        unit = jax.random.uniform(of_field, value.shape, value.dtype, -1.0, 1.0)
+        drawn = value + magnitude * _width(spread, value) * unit
+        if field in own.limits:
+            drawn = jnp.where(own.limits[field].holds(drawn), drawn, jnp.nan)
+        drone = eqx.tree_at(lambda m, i=at, f=field: getattr(m.effects[i], f), drone, drawn)
+    return drone
+
+
+def require_possible(
+    nominal: Quadrotor,
+    randomisation: Randomisation,
+    magnitude: float | Float[Array, ""] = 1.0,
+    what: str = "magnitude",
+) -> None:
+    """Refuse ranges whose draws could lie beyond what can be. Nothing is said of what is traced.
+
+    Args:
+        nominal: about which to draw.
+        randomisation: ranges.
+        magnitude: factor on every range.
+        what: the magnitude is called, for messages.
+
+    Raises:
+        CfbError: an effect that the drone does not have, or a number that could be drawn beyond its limits, and the
+            largest magnitude that fits it.
+    """
+    require_possible_parameters(nominal.parameters, randomisation, magnitude, what)
+    asked = concrete(magnitude)
+    for effect, field, spread in randomisation.effects:
+        _, own = _found(nominal, effect, randomisation)
+        center, limits = concrete(getattr(own, field)), own.limits.get(field)
+        if asked is None or center is None or limits is None:
+            continue
+        width = np.broadcast_to(_width(spread, center), center.shape)
+        room = np.minimum(limits.hard_high - center, center - limits.hard_low)
+        fitting = float(np.min(np.where(width > 0, room / np.where(width > 0, width, 1.0), np.inf)))
+        if np.max(np.abs(asked)) > fitting:
+            raise CfbError(
+                f"{what} = {np.max(np.abs(asked)):g}: randomisation '{randomisation.name}' could then draw a "
+                f"{effect}.{field} that does not lie between {limits.hard_low:g} and {limits.hard_high:g} "
+                f"{own.units[field]}; at most {max(np.floor(1e3 * fitting) / 1e3, 0.0):g} fits this drone."
+            )
+
+
+def _found(nominal: Quadrotor, effect: str, randomisation: Randomisation) -> tuple[int, Effect]:
+    for i, own in enumerate(nominal.effects):
+        if type(own).name == effect:
+            return i, own
+    raise CfbError(
+        f"randomisation '{randomisation.name}' varies {effect}, which this drone does not have; take model "
+        f"{randomisation.name}, or one fitted from it."
+    )
+
+
+def _width(spread: Range, value) -> np.ndarray:
+    """Half-width of the draw: a number, or one of each component."""
+    width = spread.half_width if len(spread.half_width) > 1 else spread.half_width[0]
+    return np.asarray(width, value.dtype)

@@ -1,0 +1,119 @@
+"""Drones drawn whole: parameters and effects, from ranges and from the spread that a model's numbers have."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.model import Quadrotor, require_possible, rollout_final, sample_drone
+from cfb_mjx.parameters import (
+    Randomisation,
+    load_model_file,
+    load_randomisation,
+    sample_parameters,
+    save_model_file,
+)
+from cfb_mjx.parameters.model_file import Entry
+
+COUNT = 4000
+
+
+@pytest.fixture(scope="module")
+def of_type(tmp_path_factory):
+    """A type of drone whose drag, hub moment and motors differ from drone to drone, written and read again."""
+    file = load_model_file("cfb")
+    gain = file.entries["motor_gain"]
+    entry = Entry(gain.value, gain.source, spread=0.02 * gain.value)
+    effects = (
+        {"name": "rotor_drag", "parameters": {"coefficient": 0.015}, "spread": {"coefficient": 0.002}},
+        {
+            "name": "blade_flapping",
+            "parameters": {"coefficient": -6e-4, "climb": [-0.2, 0.0], "anisotropy": 0.1, "power": 1.0},
+            "spread": {"coefficient": 5e-5, "climb": [0.1, 0.0]},
+        },
+    )
+    path = tmp_path_factory.mktemp("type") / "type.yaml"
+    save_model_file(replace(file, name="mine", entries={**file.entries, "motor_gain": entry}, effects=effects), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def nominal(of_type):
+    return Quadrotor.from_file(load_model_file(of_type))
+
+
+@pytest.fixture(scope="module")
+def drawn(of_type, nominal):
+    ranges = load_randomisation(of_type)
+    keys = jax.random.split(jax.random.key(0), COUNT)
+    return jax.jit(jax.vmap(lambda key: sample_drone(key, nominal, ranges)))(keys)
+
+
+def test_drones_differ_by_the_spread(drawn, nominal):
+    drag, hub = drawn.effects
+    mean, std = float(nominal.effects[0].coefficient), 0.002
+    assert np.mean(drag.coefficient) == pytest.approx(mean, abs=4 * std / np.sqrt(COUNT))
+    assert np.std(drag.coefficient) == pytest.approx(std, rel=0.05)
+    assert np.std(hub.climb, axis=0) == pytest.approx([0.1, 0.0], rel=0.05)
+    assert np.ptp(hub.power) == 0
+    gain = np.asarray(drawn.parameters.motor_gain)
+    assert gain.std(axis=0) / gain.mean(axis=0) == pytest.approx([0.02] * 4, rel=0.05)
+    # One number says nothing of another, nor one motor of the next.
+    table = np.column_stack([drag.coefficient, hub.coefficient, hub.climb[:, 0], gain])
+    assert np.abs(np.corrcoef(table.T) - np.eye(7)).max() < 5 / np.sqrt(COUNT)
+
+
+def test_a_key_is_a_drone_and_another_range_changes_no_other_draw(of_type, nominal):
+    ranges, key = load_randomisation(of_type), jax.random.key(3)
+    one = sample_drone(key, nominal, ranges)
+    again = sample_drone(key, nominal, replace(ranges, effects=ranges.effects[:1]))
+    assert float(one.effects[0].coefficient) == float(again.effects[0].coefficient)
+    assert float(again.effects[1].coefficient) == float(nominal.effects[1].coefficient)
+    jax.tree.map(np.testing.assert_array_equal, one, sample_drone(key, nominal, ranges))
+    still = sample_drone(key, nominal, ranges, 0.0)
+    jax.tree.map(np.testing.assert_array_equal, still, nominal)
+
+
+def test_drawn_drones_fly_side_by_side_as_they_fly_alone(of_type, nominal):
+    ranges, keys = load_randomisation(of_type), jax.random.split(jax.random.key(1), 3)
+    commands = jnp.tile(nominal.hover_command() * 1.02, (50, 1))
+    state = nominal.hover_state()
+
+    def fly(key):
+        return rollout_final(sample_drone(key, nominal, ranges), state, commands).position
+
+    together = jax.jit(jax.vmap(fly))(keys)
+    alone = jnp.stack([fly(key) for key in keys])
+    np.testing.assert_allclose(together, alone, rtol=1e-5, atol=1e-7)
+    assert np.ptp(np.asarray(together)[:, 2]) > 1e-4
+
+
+def test_parameters_alone_draw_as_before(nominal):
+    paper, key = load_randomisation("paper"), jax.random.key(5)
+    drone = sample_drone(key, nominal, paper)
+    expected = sample_parameters(key, nominal.parameters, paper)
+    jax.tree.map(np.testing.assert_array_equal, drone.parameters, expected)
+
+
+def test_impossible_or_meaningless_ranges_are_refused(of_type, nominal):
+    ranges = load_randomisation(of_type)
+    bare = Quadrotor.from_file("cfb")
+    with pytest.raises(CfbError, match="varies rotor_drag, which this drone does not have; take model mine"):
+        sample_drone(jax.random.key(0), bare, ranges)
+    with pytest.raises(CfbError, match="varies effects, which are no parameters; draw with sample_drone"):
+        sample_parameters(jax.random.key(0), nominal.parameters, ranges)
+    with pytest.raises(CfbError, match=r"--magnitude = 40: randomisation 'mine' could then draw"):
+        require_possible(nominal, ranges, 40.0, "--magnitude")
+    effect, field, spread = ranges.effects[0]
+    wide = Randomisation("wide", (), ((effect, field, replace(spread, half_width=(0.03,))),))
+    with pytest.raises(CfbError, match=r"rotor_drag.coefficient that does not lie between .* at most 0.\d+ fits"):
+        sample_drone(jax.random.key(0), nominal, wide)
+    lost = jax.jit(lambda magnitude: sample_drone(jax.random.key(0), nominal, wide, magnitude))(-100.0)
+    assert np.isnan(lost.effects[0].coefficient)
+    with pytest.raises(CfbError, match="model cfb: no number has a spread between drones"):
+        load_randomisation("cfb")
