@@ -13,7 +13,7 @@ from cfb_mjx.model import MjxBody, Quadrotor
 from cfb_mjx.parameters import load_randomisation, preset_names
 assert "site-packages" in cfb_mjx.__file__ or "target" in cfb_mjx.__file__, cfb_mjx.__file__
 assert str(shipped("assets", "cfb.xml")).startswith(str(pathlib.Path(cfb_mjx.__file__).parent))
-assert preset_names() == ["cf21b-500", "cf2x", "cfb", "cfb-guards", "cfb-idsia", "cfb-idsia-predictor"]
+assert preset_names() == ["cf21b-500", "cf2x", "cfb", "cfb-fleet", "cfb-guards", "cfb-idsia", "cfb-idsia-predictor"]
 load_randomisation()
 Quadrotor.from_file("cf21b-500", body=MjxBody(floor=True))
 from cfb_mjx.control.policy_file import load_policy, shipped_policies

@@ -11,6 +11,7 @@ import pytest
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, require_possible, rollout_final, sample_drone
+from cfb_mjx.model.randomised import differences
 from cfb_mjx.parameters import (
     Randomisation,
     load_model_file,
@@ -91,6 +92,19 @@ def test_drawn_drones_fly_side_by_side_as_they_fly_alone(of_type, nominal):
     alone = jnp.stack([fly(key) for key in keys])
     np.testing.assert_allclose(together, alone, rtol=1e-5, atol=1e-7)
     assert np.ptp(np.asarray(together)[:, 2]) > 1e-4
+
+
+def test_differences_count_in_half_widths(of_type, nominal, drawn):
+    ranges = load_randomisation(of_type)
+    found = np.asarray(jax.vmap(lambda drone: differences(nominal, drone, ranges))(drawn))
+    assert found.shape == (COUNT, 4 + 1 + 1 + 2)
+    assert np.all(np.abs(found) <= 1 + 1e-9)
+    assert found[:, :-1].std(axis=0) == pytest.approx(np.full(7, 1 / np.sqrt(3)), rel=0.05)
+    assert np.all(found[:, -1] == 0)
+    shared = load_randomisation("paper")
+    drone = sample_drone(jax.random.key(2), nominal, shared)
+    change = float(drone.parameters.motor_gain[0] / nominal.parameters.motor_gain[0] - 1) / 0.2
+    assert np.isclose(np.asarray(differences(nominal, drone, shared)), change).sum() == 1
 
 
 def test_parameters_alone_draw_as_before(nominal):

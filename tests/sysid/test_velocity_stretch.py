@@ -155,3 +155,26 @@ def test_a_model_file_names_a_band():
         item = {"name": "sensor_velocity_scale", "parameters": {"scale": 1.1, key: value}}
         with pytest.raises(CfbError, match=f"drone.yaml: effects.sensor_velocity_scale.parameters.{key}"):
             SensorFaults.from_mappings([item], "drone.yaml")
+
+
+@pytest.mark.parametrize(("rise", "fade"), [(0.0, None), (0.3, None), (0.3, 0.7)])
+def test_a_flights_own_stretch_is_learnt_from_its_past_alone(rise, fade):
+    """The flight was stretched otherwise than those the model was fitted to; later rows change nothing before them."""
+    rng, time = np.random.default_rng(0), 0.01 * np.arange(1500)
+    true = np.stack([np.sin(1.3 * time), np.cos(2.1 * time) - 0.5 * np.sin(0.7 * time), 0.2 * np.sin(time)], axis=1)
+    flown = VelocityStretch(np.array([1.4, 1.4, 1.0]), rise, fade)
+    believed = VelocityStretch(np.array([1.1, 1.1, 1.0]), rise, fade)
+    start = np.zeros((1, 2, 3))
+    start[:, 0] = true[0]
+    start[:, 1] = 0.0 if fade is None else true[0]
+    velocity = flown.done(start, np.diff(time), true[None])[0]
+    steps = 0.01 * (true[1:] + true[:-1]) / 2
+    position = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]) + 0.001 * rng.normal(size=true.shape)
+    found = believed.learned(time, velocity, position)
+    assert found[0] == pytest.approx([1.1, 1.1, 1.0])
+    assert found[-1] == pytest.approx([1.4, 1.4, 1.0], abs=0.02)
+    assert np.all(found[:, 2] == 1.0)
+    late = np.arange(1500)[:, None] > 700
+    spoilt = believed.learned(time, np.where(late, 5.0, velocity), np.where(late, -3.0, position))
+    np.testing.assert_array_equal(spoilt[:701], found[:701])
+    assert np.abs(spoilt[-1] - found[-1]).max() > 0.01

@@ -36,7 +36,7 @@ def evaluate(
 
     Args:
         logs: flight logs (MCAP, parquet, csv).
-        model: preset (cfb-guards, cfb, cfb-idsia, cf21b-500, cf2x) or model YAML.
+        model: preset (cfb-guards, cfb, cfb-fleet, cfb-idsia, cf21b-500, cf2x) or model YAML.
         set: parameters to change, for instance mass=0.045.
         json: write the results here.
         figure: draw prediction against measurement here (.png, .svg, .pdf).

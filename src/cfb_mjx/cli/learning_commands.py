@@ -14,6 +14,7 @@ def train(
     output: Output,
     config: Annotated[str | None, tyro.conf.arg(metavar="CONFIG")] = None,
     model: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None,
+    randomise: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
     algorithm: Literal["ppo", "analytic"] | None = None,
     seed: int | None = None,
     set: Pairs = (),
@@ -34,6 +35,8 @@ def train(
         output: folder for the results.
         config: training YAML, or the name of a shipped one; the task's own by default.
         model: preset or model YAML of the drone, with its effects; in place of the configuration's.
+        randomise: ranges from which drones are drawn: a shipped name, a YAML file, or a model whose numbers have a
+            spread (cfb-fleet); in place of the configuration's. How much of them: --set randomisation.magnitude.
         algorithm: ppo (the paper's) or analytic (back-propagation through the model); in place of the configuration's.
         seed: of everything random; in place of the configuration's.
         set: changes to the configuration, for instance randomisation.magnitude=0.5 ppo.steps=2e7.
@@ -51,7 +54,8 @@ def train(
 
     hosts = Hosts.asked(coordinator, processes, process)
     choices = {"model": model, "algorithm": algorithm, "seed": seed}
-    run_train(task, config, output, tuple(flat(set)), choices, start, resume, force, devices, hosts)
+    ranges = () if randomise is None else (f"randomisation.ranges={randomise}",)
+    run_train(task, config, output, (*ranges, *flat(set)), choices, start, resume, force, devices, hosts)
 
 
 def fly(
@@ -60,7 +64,7 @@ def fly(
     model: Annotated[str, tyro.conf.arg(metavar="MODEL")] = "cfb-guards",
     plants: int = 1,
     magnitude: float = 0.0,
-    randomisation: Annotated[str, tyro.conf.arg(metavar="NAME")] = "paper",
+    randomisation: Annotated[str, tyro.conf.arg(metavar="NAME", aliases=["--randomise"])] = "paper",
     on: Annotated[str | None, tyro.conf.arg(metavar="SET")] = None,
     noise: bool = True,
     seed: int = 0,
@@ -90,7 +94,7 @@ def fly(
         model: preset or model YAML of the drone, with its effects.
         plants: number of flights, each on a drone drawn anew.
         magnitude: factor on the randomisation of the drones; 0 flies the model itself.
-        randomisation: which ranges: a shipped name or a YAML file.
+        randomisation: which ranges: a shipped name, a YAML file, or a model whose numbers have a spread (cfb-fleet).
         on: fly the model with each list of effects of a set in turn: off-nominal (shipped) or a YAML file.
         noise: with the noise of state and estimates that policies are trained with.
         seed: of everything random.

@@ -96,6 +96,26 @@ def require_possible(
             )
 
 
+def differences(nominal: Quadrotor, drone: Quadrotor, randomisation: Randomisation) -> Float[Array, " n"]:
+    """How a drawn drone differs from the nominal one, number by number, over the half-widths of the ranges.
+
+    Args:
+        nominal: about which it was drawn.
+        drone: as `sample_drone` drew it.
+        randomisation: from these ranges.
+    """
+    found = [jnp.zeros(0)]
+    for name, spread in randomisation.ranges:
+        mean, drawn = getattr(nominal.parameters, name), getattr(drone.parameters, name)
+        change = (drawn - mean) / (_width(spread, mean) * (mean if spread.relative else 1.0))
+        found.append(jnp.atleast_1d(change[0] if spread.shared and change.ndim else change))
+    for effect, field, spread in randomisation.effects:
+        mean, drawn = (getattr(_found(model, effect, randomisation)[1], field) for model in (nominal, drone))
+        width = _width(spread, mean)
+        found.append(jnp.atleast_1d((drawn - mean) / np.where(width > 0, width, 1.0)))
+    return jnp.concatenate(found)
+
+
 def _found(nominal: Quadrotor, effect: str, randomisation: Randomisation) -> tuple[int, Effect]:
     for i, own in enumerate(nominal.effects):
         if type(own).name == effect:

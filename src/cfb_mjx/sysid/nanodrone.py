@@ -165,13 +165,15 @@ def predict(contestant: Contestant, log: FlightLog, starts: Starts):
     """A contestant's prediction: position, velocity, quaternion and body rate, (W, S, 3 or 4).
 
     A window starts from its row; in the step after row k the rotors turn as row k says. A stretch of the velocity
-    column is taken out of the row, which needs earlier ones at most, and put back into what is predicted; lags of
+    column is taken out of the row, which needs earlier ones at most, and put back into what is predicted; where it
+    moves the position alone, its scale is this flight's own, as earlier rows tell it; lags of
     sensors are left alone, for rows later than a window's start would be needed. An observer adds the disturbance and
     the filtered body rate it knows at that row.
     """
     model, observer, faults = contestant.model, contestant.observer, contestant.faults
     carried = faults.stretch.memory(log.time, log.velocity)[starts.row]
-    log = faults.unstretched(log)
+    at_row, at_window = _stretch_of_flight(faults, log, starts)
+    log = faults.unstretched(log) if at_row is None else log.replace(position=at_row)
     _, _, quaternion, rate = (x[starts.row] for x in starts.truth)
     position, velocity = log.position[starts.row], log.velocity[starts.row]
     began = velocity, carried
@@ -190,8 +192,28 @@ def predict(contestant: Contestant, log: FlightLog, starts: Starts):
         flown = _fly(model, jax.tree.map(lambda x, i=index: x[i], state), inputs[index])
         parts.append(jax.tree.map(lambda x, n=len(starts) - first: np.asarray(x)[:n], flown))
     position, velocity, quaternion, rate = jax.tree.map(lambda *x: np.concatenate(x), *parts)
-    position, velocity = faults.stretched(began, np.full(STEPS, INTERVAL), position, velocity)
+    step = np.full(STEPS, INTERVAL)
+    if at_window is None:
+        position, velocity = faults.stretched(began, step, position, velocity)
+    else:
+        flown = np.concatenate([began[0][:, None], velocity], axis=1)
+        position = at_window.left(position, at_window.carried(carried, step, flown)[:, 1:])
     return position, velocity, quaternion, rate
+
+
+def _stretch_of_flight(faults: SensorFaults, log: FlightLog, starts: Starts) -> tuple:
+    """Positions that move as the logged velocity says, and the stretch of each window, by this flight's own scale.
+
+    Another trajectory or height is another stretch. None where velocity and position were in step, and where the
+    velocity alone is stretched: that changes what the drone does, not only where it is said to be.
+    """
+    stretch = faults.stretch
+    if stretch.none or faults.with_attitude is None:
+        return None, None
+    own = stretch.learned(log.time, log.velocity, log.position)
+    memory = stretch.memory(log.time, log.velocity)
+    followed = dataclasses.replace(stretch, scale=own).followed(log.position, memory)
+    return followed, dataclasses.replace(stretch, scale=own[starts.row][:, None])
 
 
 def _memory(model: Quadrotor, log: FlightLog, rows: np.ndarray) -> tuple:

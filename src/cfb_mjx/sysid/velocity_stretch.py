@@ -6,6 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+LOOK, NOISE = 0.5, 0.015
+"""Over so many seconds a position is held beside a velocity, and so far it errs meanwhile, m."""
+BETWEEN, MOST = 0.1, 0.5
+"""Standard deviation between flights of the share that was never flown, and the most it may be."""
+
 
 @dataclass(frozen=True)
 class VelocityStretch:
@@ -16,7 +21,7 @@ class VelocityStretch:
     lagged by ``rise`` and less the same lagged by ``fade`` once more, was never flown.
 
     Attributes:
-        scale: (3,) along the world's axes, where it is largest.
+        scale: (3,) along the world's axes, where it is largest; or such of every row or window.
         rise: s; 0: at once.
         fade: s; None: never.
     """
@@ -101,6 +106,40 @@ class VelocityStretch:
         if self.fade is None:
             return followed / self.scale + self._share * self.rise * memory[..., 0, :]
         return followed - self._share * self.fade * memory[..., 1, :]
+
+    def learned(self, time: np.ndarray, velocity: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """Horizontal scale of this flight as it is known at every row, (N, 3), from that row and earlier ones.
+
+        Over `LOOK` seconds the position moves less than the velocity says, by the share that was never flown times what
+        the lags carried meanwhile. The scale of other flights is where it begins; how far flights differ and how well
+        a position tells are `BETWEEN` and `NOISE`.
+
+        Args:
+            time: (N,) s.
+            velocity: (N, 3) as logged, world.
+            position: (N, 3) as logged.
+        """
+        steps = np.diff(time)[:, None]
+
+        def travelled(rate):
+            return np.concatenate([np.zeros((1, 3)), np.cumsum(steps * (rate[1:] + rate[:-1]) / 2, axis=0)])
+
+        by_velocity, memory = travelled(velocity), self.memory(time, velocity)
+        if self.fade is not None:
+            never = self.fade * memory[:, 1]
+        else:
+            never = by_velocity - self.rise * memory[:, 0]
+        before = np.searchsorted(time, time - LOOK - 1e-6)
+        # Windows overlap: each row adds what one of them says, in the share that is new.
+        new = np.minimum(np.diff(time, prepend=time[0]) / LOOK, 1.0)[:, None] * (before > 0)[:, None] / NOISE**2
+        x = -(never - never[before])[:, :2]
+        y = (position - position[before] - by_velocity + by_velocity[before])[:, :2]
+        known = np.sum(np.cumsum(new * x * x, axis=0), axis=1) + 1 / BETWEEN**2
+        told = np.sum(np.cumsum(new * x * y, axis=0) + self._share[:2] / (2 * BETWEEN**2), axis=1)
+        share = np.clip(told / known, -MOST, MOST)
+        scale = np.repeat(self.scale[None], len(time), axis=0)
+        scale[:, :2] = 1 / (1 - share[:, None])
+        return scale
 
     @property
     def _share(self) -> np.ndarray:

@@ -23,7 +23,7 @@ from cfb_mjx.devices import Devices
 from cfb_mjx.envs.episode import Episode, Task, choose, observe, reset, step
 from cfb_mjx.envs.observation import Estimate, frame
 from cfb_mjx.model.quadrotor import Quadrotor
-from cfb_mjx.parameters.parameters import SPECIFICATIONS
+from cfb_mjx.model.randomised import differences
 from cfb_mjx.train.algorithm import in_progress, strong
 from cfb_mjx.train.brax_compat import parts
 from cfb_mjx.train.config import PpoSettings
@@ -215,11 +215,7 @@ def hidden(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array, " n
     if task.layout.setpoint_scales:
         parts.append(episode.setpoint / jnp.asarray(task.layout.setpoint_scales))
     if task.randomisation is not None:
-        for name, spread in task.randomisation.ranges:
-            drawn, mean = getattr(parameters, name), getattr(nominal.parameters, name)
-            width = jnp.asarray(spread.half_width if len(spread.half_width) > 1 else spread.half_width[0])
-            change = (drawn - mean) / (jnp.where(spread.relative, mean, 1.0) * width)
-            parts.append(jnp.atleast_1d(change[0] if spread.shared and SPECIFICATIONS[name].shape else change))
+        parts.append(differences(nominal, episode.model, task.randomisation))
     return jnp.concatenate(parts)
 
 
