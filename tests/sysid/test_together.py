@@ -82,9 +82,9 @@ def test_effects_that_the_model_declares_stay_as_they_are():
 @pytest.fixture(scope="module")
 def closed(campaign, whole):
     """What `close_loop` makes of it, the search having found nothing."""
-    check = check_sensors(campaign.fit, 0.008, 0.0)
-    search = Search.start(campaign.fit, GUARDS.parameters(), 0.008, check, (), PLANT)
+    search = _search(campaign)
     fit = Fit(search.nothing(), None, np.ones(8), np.ones((1, 8)), beside_hold=9.0)
+    check = check_sensors(campaign.fit, 0.008, 0.0)
     found = Trace(search.nothing(), check, [], [], search, np.ones(8), np.ones(8), fit)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(outcome, "fit_together", lambda *_: whole)
@@ -100,7 +100,7 @@ def test_the_corrected_model_predicts_what_the_report_says(campaign, closed, tmp
         assert again[key] == pytest.approx(value, rel=1e-6), key
 
 
-def test_effects_are_reported_in_the_order_of_what_they_buy(closed):
+def test_effects_are_reported_in_the_order_of_what_they_buy(campaign, closed):
     found = closed.to_json()
     names = [effect["name"] for effect in found["effects"]]
     assert set(LACKS) <= set(names)
@@ -109,6 +109,12 @@ def test_effects_are_reported_in_the_order_of_what_they_buy(closed):
     assert buys == sorted(buys, reverse=True)
     assert not found["unexplained"]
     assert set(found["motors"]) == {"motor_gain", "motor_speed_offset", "motor_time_constant"}
+    told = {part.name for part in closed.together.parts if part.told}
+    for effect in found["effects"]:
+        assert ("innovations" in effect) == (effect["name"] not in told)
+    lift = found["effects"][names.index("thrust_scale")]["innovations"]["thrust_scale.relative"]
+    assert not lift["contradicts"]
+    assert lift["value"] == pytest.approx(campaign.truth["effects"]["thrust_scale"]["thrust_scale"] - 1, abs=0.03)
     for effect in found["unconfirmed"]:
         assert effect["name"] not in [item["name"] for item in closed.model_file("x", {}).effects]
 
@@ -126,3 +132,22 @@ def test_a_whole_that_is_hardly_better_than_the_search_does_not_replace_it(campa
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(outcome, "fit_together", lambda *_: whole)
         assert outcome._whole(found, campaign.fit, campaign.held_out, GUARDS, lambda _: None) is None
+
+
+def test_what_the_rotor_speeds_tell_stands_unless_predictions_are_worse(campaign, whole, monkeypatch):
+    """Other effects may hide in predictions what a battery does to the motors."""
+    part = replace(whole.parts[0], told=True)
+    found = {}
+    for t in (-1.0, -5.0):
+        monkeypatch.setattr(outcome, "paired", lambda *_, t=t: (t, 0.5))
+        entry = outcome._reported(_search(campaign), part, None, campaign.held_out)
+        found[t] = outcome._stands(entry, part)
+        assert entry.p_value == part.p_value
+    assert found == {-1.0: True, -5.0: False}
+    entry = outcome._reported(_search(campaign), replace(part, told=False), None, campaign.held_out)
+    assert not outcome._stands(entry, replace(part, told=False))
+
+
+def _search(campaign):
+    check = check_sensors(campaign.fit, 0.008, 0.0)
+    return Search.start(campaign.fit, GUARDS.parameters(), 0.008, check, (), PLANT)

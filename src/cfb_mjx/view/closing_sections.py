@@ -63,7 +63,10 @@ TOGETHER = (
     "out again. Motors come from commands and measured rotor speeds; everything else from predictions, commands in and "
     "rotor speeds in. How much an error grows without an effect: the others have moved to make up for it. Standard "
     "deviations come from the scatter between stretches of flight; what the model declares, its mass above all, is "
-    "taken as exact."
+    "taken as exact. No flight tells more mass from less thrust: where thrust_scale is fitted, payload is not looked "
+    "for; where it is declared, one per cent of thrust is one per cent of the drone's weight in a load. Predictions "
+    "under a controller ask for too much inertia and damping. Accelerations, from row to row, do not, and where the "
+    "two contradict each other a number stands in for something else."
 )
 
 
@@ -90,7 +93,7 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
         "(of a sensor fault: from comparing the sensors with each other, without any model)."
     )
     if outcome.together is not None:
-        paragraphs.insert(0, TOGETHER)
+        paragraphs.insert(0, TOGETHER + _held(outcome))
     head = ["effect", "parameter", "value", "95 % interval", "plausible", "p"]
     shown = [figure for item in outcome.reported for figure in figures.get(key_of(item.name), [])]
     if shown:
@@ -102,6 +105,14 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
     return Section("What was found", paragraphs, [(caption, head, rows)], shown)
 
 
+def _held(outcome: Outcome) -> str:
+    """Which declared effects a fit of all at once left as they were."""
+    judged = {item.name for item in (*outcome.reported, *outcome.unconfirmed)}
+    present = set(outcome.hypothesis.present)
+    held = [item["name"] for item in outcome.base.effects if item["name"] in present - judged]
+    return f" Held as the model declares them: {', '.join(held)}." if held else ""
+
+
 def _sentence(item: Reported, which: str = "one") -> str:
     text = f"{item.name}: {meaning(item.name)}; {strength(item)}."
     if is_fault(item.name):
@@ -110,6 +121,9 @@ def _sentence(item: Reported, which: str = "one") -> str:
         text += f" In the model: {documented(item.name)}."
     if item.found is not None:
         text += f" Without it {which} prediction error of the fit flights grows by {_grows(item.found.buys)}."
+        if item.asked:
+            told = (f"{a.name} {with_error(a.value, a.std)}{' (a contradiction)' * a.contradicts}" for a in item.asked)
+            text += f" Accelerations alone ask for {', '.join(told)}."
         if item.found.confusable:
             names = ", ".join([item.name, *item.found.confusable])
             text += f" These flights cannot tell which of this set it is: {names}."

@@ -235,8 +235,7 @@ def _whole(
     reported, unconfirmed = [], []
     for part in whole.parts:
         entry = _reported(search, part, after, held_out)
-        stands = entry.verdict.t >= (-RULES.sure if part.told else RULES.sure)
-        (reported if stands else unconfirmed).append(entry)
+        (reported if _stands(entry, part) else unconfirmed).append(entry)
     if unconfirmed:
         model = whole.without([item.name for item in unconfirmed])
         after = evaluate(model, held_out)
@@ -258,6 +257,11 @@ def _whole(
     left = Unexplained(None, lines) if lines else None
     traced = replace(found, hypothesis=hypothesis, sensors=check, tried=[*found.tried, *whole.tried], search=search)
     return Outcome(traced, base, reported, unconfirmed, hypothesis, HEALTHY, before, after, left, whole.motors, whole)
+
+
+def _stands(entry: Reported, part: Part) -> bool:
+    """Whether held-out flights bear an effect out; one that the rotor speeds tell must only not be refuted by them."""
+    return entry.verdict.t >= (-RULES.sure if part.told else RULES.sure)
 
 
 def _reported(search: Search, part: Part, after: Evaluation, held_out: list[FlightLog]) -> Reported:
