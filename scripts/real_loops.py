@@ -33,7 +33,9 @@ INTRODUCTION = """
 one drone: the command, the first paragraph of its report, the effects in the order of what each buys, and the errors of
 the corrected model on flights nothing was fitted to. *Buys*: by which share an effect lowers the mean error of the
 fitted flights' predictions (attitude and velocity, 0.1 to 0.5 s ahead, over what hold errs), the others having moved to
-make up for it. *t*: standard deviations by which predictions of the other flights are better with it.
+make up for it. *t*: standard deviations by which predictions of the other flights are better with it. *Accelerations
+ask for*: the same numbers from one-step innovations, which a controller's answers to disturbances do not bias; bold
+where they contradict what predictions ask for: such a number stands in for something else.
 """
 
 
@@ -69,6 +71,15 @@ def values(effect: dict) -> str:
     return "; ".join(found)
 
 
+def asked(effect: dict) -> str:
+    """What the innovations make of its strengths; bold where that contradicts what predictions do."""
+    found = []
+    for name, each in effect.get("innovations", {}).items():
+        text = f"{name.split('.', 1)[1]} {each['value']:.3g} ± {each['std']:.1g}"
+        found.append(f"**{text}**" if each["contradicts"] else text)
+    return "; ".join(found)
+
+
 def section(name: str, folder: Path, model: str, mass: str, work: Path, before: dict[str, Path]) -> str:
     """One drone."""
     start = str(before[model] / "model.yaml") if model in before else model
@@ -84,12 +95,17 @@ def section(name: str, folder: Path, model: str, mass: str, work: Path, before: 
     ]
     cost = "" if seconds is None else f" {seconds / 60:.1f} minutes of processor time."
     lines += [f"{len(fit)} flights to learn from, {len(errors['logs'])} to be judged on.{cost}", ""]
-    lines += [f"> {report['summary']}", "", "| effect | numbers | buys | t | at a bound |", "|---|---|---:|---:|---|"]
+    lines += [
+        f"> {report['summary']}",
+        "",
+        "| effect | numbers | accelerations ask for | buys | t | at a bound |",
+        "|---|---|---|---:|---:|---|",
+    ]
     for effect in report["effects"]:
         bound = ", ".join(effect.get("at_bound", []))
         buys = f"{100 * effect['buys']:.0f} %" if "buys" in effect else ""
         t = f"{effect['held_out_t']:.1f}" if "held_out_t" in effect else ""
-        lines.append(f"| {effect['name']} | {values(effect)} | {buys} | {t} | {bound} |")
+        lines.append(f"| {effect['name']} | {values(effect)} | {asked(effect)} | {buys} | {t} | {bound} |")
     gone = ", ".join(effect["name"] for effect in report["unconfirmed"])
     lines += ["", f"Fitted, but not borne out by the other flights: {gone}." if gone else ""]
     formula = report["formula"] or []
