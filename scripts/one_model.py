@@ -24,6 +24,7 @@ from cfb_mjx.files import write_text
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.model import Quadrotor, thrust
 from cfb_mjx.model.effects import KNOWN
+from cfb_mjx.model.effects.fields import HOVER_SPEED
 from cfb_mjx.parameters import Entry, ModelFile, load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.fleet import Fleet, OfDrone, fleet
@@ -100,14 +101,19 @@ class Drone:
 
 
 def of_motors(drones: list[Drone]) -> dict[str, Entry]:
-    """Constants of the type's motors: spread over all motors of all drones."""
+    """Constants of the type's motors: those of the drone whose hover command is the middle one.
+
+    What a command of 1 means differs between laboratories (firmware, batteries), so gain and offset go together and a
+    mean of two laws is nobody's. The spread is that between the motors of one drone.
+    """
+    each = {n: np.array([np.broadcast_to(d.found.entries[n].value, 4) for d in drones]) for n in MOTORS}
+    hover = (HOVER_SPEED - each["motor_speed_offset"].mean(axis=1)) / each["motor_gain"].mean(axis=1)
+    middle = int(np.argsort(hover)[len(drones) // 2])
+    source = f"mean of the four motors of {drones[middle].name}, whose hover command is the middle one of {len(drones)}"
     found = {}
-    for name in MOTORS:
-        each = np.array([np.broadcast_to(d.found.entries[name].value, 4) for d in drones])
-        spread = np.sqrt(each.mean(axis=1).var(ddof=1) + each.var(axis=1, ddof=1).mean())
-        std = each.mean(axis=1).std(ddof=1) / np.sqrt(len(drones))
-        source = f"mean over the motors of {len(drones)} drones fitted to their rotor speeds"
-        found[name] = Entry(np.full(4, each.mean()), source, np.full(4, std), np.full(4, spread))
+    for name, values in each.items():
+        spread = np.sqrt(values.var(axis=1, ddof=1).mean())
+        found[name] = Entry(np.full(4, values[middle].mean()), source, None, np.full(4, spread))
     return found
 
 
@@ -127,7 +133,7 @@ def type_of(drones: list[Drone], name: str) -> tuple[ModelFile, Fleet]:
         name=name,
         description="The Crazyflie Brushless as a type: the paper's model, and what all of several laboratories' drones"
         " lack beside it. `uncertainty` is that of the type's number, `spread` the standard deviation between drones"
-        " (--randomisation cfb-fleet draws such drones). docs/one-model.md says what it is worth.",
+        " (--randomise cfb-fleet draws such drones). docs/one-model.md says what it is worth.",
         entries={**body.entries, **of_motors(drones)},
         effects=tuple(mappings),
     )
@@ -233,7 +239,7 @@ def draw(drones: list[Drone], common: Fleet, tables: dict[str, tuple[np.ndarray,
     left.set_xlabel("over the type's value; bar: spread between drones")
     left.set_xlim(-3, 5)
     left.axvline(0, color="0.8", lw=0.8, zorder=0)
-    left.legend(loc="lower right", fontsize=8)
+    left.legend(loc="upper right", fontsize=8)
     speed, paper = np.linspace(*CURVE, 200), Quadrotor.from_file(BODY).parameters
     curve = np.asarray(thrust(paper, np.repeat(speed[:, None], 4, 1)))[:, 0]
     for name, (at, force) in tables.items():
@@ -259,12 +265,14 @@ def page(drones: list[Drone], common: Fleet, of_type: ModelFile, tables: dict) -
     lines += [
         f"`cfb-fleet` is a model of the type, from flights of {len(drones)} drones. Use it for a drone that was not",
         "measured yet (`cfb evaluate my.csv --model cfb-fleet --set mass=0.037`), as the start of a search",
-        "(`cfb close-loop ... --model cfb-fleet`), and as measured domain randomisation (`cfb fly --model cfb-fleet",
-        "--randomisation cfb-fleet`; in a training `model=cfb-fleet randomisation.ranges=cfb-fleet`).",
+        "(`cfb close-loop ... --model cfb-fleet`), and as measured domain randomisation (`cfb fly pid --model cfb-fleet",
+        "--magnitude 1 --randomise cfb-fleet`, `cfb train target --model cfb-fleet --randomise cfb-fleet -o out`).",
         "",
         "Every drone was fitted on its own to predictions of its flights, all with the same numbers and what it alone",
         "carries beside them. The spread between drones is the scatter of the fits less what their errors explain; the",
-        "type's numbers are the mean that heeds both. With so few drones a spread is known to about half its size.",
+        "type's numbers are the mean that heeds both. With so few drones a spread is known to about half its size, and",
+        "where all stand at one bound it is nothing. Predictions of flights under a controller ask for more inertia",
+        "and more damping than accelerations do ([real loops](real-loops.md) names where); the type has both.",
         "",
         "![Numbers of the drones and the type; thrust curves](one-model.png)",
         "",
@@ -278,17 +286,16 @@ def page(drones: list[Drone], common: Fleet, of_type: ModelFile, tables: dict) -
         for drone in drones:
             at = [i for i, n in enumerate(drone.of_drone.numbers) if n.name == number.name]
             error = np.sqrt(np.diag(drone.of_drone.covariance))
-            cells.append(
-                "".join(f"{drone.of_drone.values[i]:.3g} ± {error[i]:.1g}" for i in at).replace(" ± 0", ", at a bound")
-            )
+            texts = [f"± {e:.1g}" if e > 0 else "at a bound" for e in error]
+            cells.append("".join(f"{drone.of_drone.values[i]:.3g} {texts[i]}" for i in at))
         kind = "a drone's own" if number.effect in OWN else f"{value:.3g} ± {std:.1g}"
         lines.append(f"| {number.name} | " + " | ".join(cells) + f" | {kind} | {spread:.2g} |")
     for name in MOTORS:
         entry = of_type.entries[name]
         cells = [f"{np.mean(d.found.entries[name].value):.4g}" for d in drones]
         lines.append(
-            f"| {name}, mean of four | " + " | ".join(cells) + f" | {entry.value[0]:.4g} ± {entry.std[0]:.1g} |"
-            f" {entry.spread[0]:.2g}, of single motors |"
+            f"| {name}, mean of four | " + " | ".join(cells) + f" | {entry.value[0]:.4g}, of the middle drone |"
+            f" {entry.spread[0]:.2g}, between motors of one drone |"
         )
     for drone in drones:
         for name in drone.extras:

@@ -131,3 +131,18 @@ def test_impossible_or_meaningless_ranges_are_refused(of_type, nominal):
     assert np.isnan(lost.effects[0].coefficient)
     with pytest.raises(CfbError, match="model cfb: no number has a spread between drones"):
         load_randomisation("cfb")
+
+
+def test_the_shipped_type_draws_drones_that_fly():
+    nominal, ranges = Quadrotor.from_file("cfb-fleet"), load_randomisation("cfb-fleet")
+    require_possible(nominal, ranges)
+    keys = jax.random.split(jax.random.key(4), 500)
+    drones = jax.jit(jax.vmap(lambda key: sample_drone(key, nominal, ranges)))(keys)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(drones))
+    effects = {type(effect).name: effect for effect in drones.effects}
+    assert np.all(np.asarray(effects["blade_flapping"].coefficient) < 0)
+    assert np.all(np.asarray(effects["rotor_drag"].coefficient) > 0)
+    hover = np.asarray(jax.vmap(lambda drone: drone.hover_command())(drones))
+    assert np.all((hover > 0.2) & (hover < 0.9))
+    assert np.ptp(hover.mean(axis=1)) > 0.02
+    assert np.ptp(np.asarray(effects["cog_offset"].offset), axis=0).min() > 1e-5
