@@ -265,8 +265,9 @@ def page(drones: list[Drone], common: Fleet, of_type: ModelFile, tables: dict) -
     lines += [
         f"`cfb-fleet` is a model of the type, from flights of {len(drones)} drones. Use it for a drone that was not",
         "measured yet (`cfb evaluate my.csv --model cfb-fleet --set mass=0.037`), as the start of a search",
-        "(`cfb close-loop ... --model cfb-fleet`), and as measured domain randomisation (`cfb fly pid --model cfb-fleet",
-        "--magnitude 1 --randomise cfb-fleet`, `cfb train target --model cfb-fleet --randomise cfb-fleet -o out`).",
+        "(`cfb close-loop ... --model cfb-fleet`), and as measured domain randomisation (`cfb fly pid",
+        "--model cfb-fleet --magnitude 1 --randomise cfb-fleet`, `cfb train target --model cfb-fleet --randomise",
+        "cfb-fleet -o out`).",
         "",
         "Every drone was fitted on its own to predictions of its flights, all with the same numbers and what it alone",
         "carries beside them. The spread between drones is the scatter of the fits less what their errors explain; the",
