@@ -17,8 +17,9 @@ from cfb_mjx.sysid.tracing import outcome
 from cfb_mjx.sysid.tracing.fits import Fit, beside_hold
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
-from cfb_mjx.sysid.tracing.together import Rules, fit_together, names_to_fit, paired
+from cfb_mjx.sysid.tracing.together import Rules, fit_together, names_to_fit, of_type, paired
 from cfb_mjx.sysid.tracing.trace import Trace
+from cfb_mjx.view import closing_sections
 from cfb_mjx.view.closing_words import verdict
 
 pytestmark = pytest.mark.xdist_group("together")
@@ -151,3 +152,48 @@ def test_what_the_rotor_speeds_tell_stands_unless_predictions_are_worse(campaign
 def _search(campaign):
     check = check_sensors(campaign.fit, 0.008, 0.0)
     return Search.start(campaign.fit, GUARDS.parameters(), 0.008, check, (), PLANT)
+
+
+def test_numbers_of_a_type_move_within_what_its_drones_differ():
+    effects = (
+        {
+            "name": "thrust_scale",
+            "parameters": {"relative": -0.12},
+            "uncertainty": {"relative": 0.01},
+            "spread": {"relative": 0.02},
+        },
+        {
+            "name": "blade_flapping",
+            "parameters": {"coefficient": -6e-4, "climb": [-0.2, 0.1]},
+            "uncertainty": {"coefficient": None, "climb": [None, None]},
+            "spread": {"coefficient": 2e-5, "climb": [0.1, 0.0]},
+        },
+        {"name": "cog_offset", "parameters": {"offset": [0.0, 0.0]}, "spread": {"offset": [2e-4, 2e-4]}},
+        {"name": "rotor_drag", "parameters": {"coefficient": 0.01}},
+    )
+    base = replace(GUARDS, effects=effects)
+    found = {n.name: (n.low, n.high) for n in of_type(base, 2.0)}
+    assert set(found) == {"thrust_scale.relative", "blade_flapping.coefficient", "blade_flapping.climb[0]"}
+    reach = 2 * np.hypot(0.02, 0.01)
+    assert found["thrust_scale.relative"] == pytest.approx((-0.12 - reach, -0.12 + reach))
+    assert found["blade_flapping.climb[0]"] == pytest.approx((-0.4, 0.0))
+    assert "cog_offset" in names_to_fit(base, motors_told=True)
+    assert not {"thrust_scale", "blade_flapping", "rotor_drag"} & set(names_to_fit(base, motors_told=True))
+
+
+def test_what_moved_within_the_type_is_written_with_its_own_number(closed, whole):
+    """It is no effect the model lacks, and keeps the spread for the next drone."""
+    declared = {"name": "thrust_scale", "parameters": {"relative": 0.0}, "spread": {"relative": 0.2}}
+    typed = replace(
+        closed,
+        base=replace(GUARDS, effects=(declared,)),
+        together=replace(whole, typical=frozenset({"thrust_scale"})),
+        reported=[item for item in closed.reported if item.name != "thrust_scale"],
+        unconfirmed=[],
+    )
+    (item,) = [e for e in typed.model_file("x", {}).effects if e["name"] == "thrust_scale"]
+    own = next(part for part in whole.parts if part.name == "thrust_scale")
+    assert item["parameters"]["relative"] == pytest.approx(own.parameters["relative"], abs=0.01)
+    assert item["spread"] == {"relative": 0.2}
+    assert item["uncertainty"]["relative"] > 0
+    assert "Moved within the spread of the type: thrust_scale." in closing_sections._held(typed)

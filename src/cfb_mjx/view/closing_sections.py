@@ -106,11 +106,16 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
 
 
 def _held(outcome: Outcome) -> str:
-    """Which declared effects a fit of all at once left as they were."""
+    """Which declared effects a fit of all at once left as they were, or within what drones of the type differ."""
     judged = {item.name for item in (*outcome.reported, *outcome.unconfirmed)}
-    present = set(outcome.hypothesis.present)
-    held = [item["name"] for item in outcome.base.effects if item["name"] in present - judged]
-    return f" Held as the model declares them: {', '.join(held)}." if held else ""
+    present, typical = set(outcome.hypothesis.present), outcome.together.typical
+    declared = [item["name"] for item in outcome.base.effects if item["name"] in present - judged]
+    held, moved = ([n for n in declared if (n in typical) == which] for which in (False, True))
+    fit = outcome.together.fit
+    edge = [n.name for n in fit.numbers if n.effect in moved and fit.at_bound(n)]
+    text = f" Held as the model declares them: {', '.join(held)}." if held else ""
+    text += f" Moved within the spread of the type: {', '.join(moved)}." if moved else ""
+    return text + (f" At the edge of it, so that this drone is unlike the type: {', '.join(edge)}." if edge else "")
 
 
 def _sentence(item: Reported, which: str = "one") -> str:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -161,7 +162,7 @@ class Outcome:
         replaced = {item["name"] for item in effects} | {item.name for item in self.unconfirmed} | set(SENSOR_FAULTS)
         kept = [item for item in self.base.effects if item["name"] not in replaced]
         if self.together is not None:
-            kept = [item for item in kept if item["name"] in self.hypothesis.present]
+            kept = [self._moved(item) for item in kept if item["name"] in self.hypothesis.present]
         named = ", ".join(item.name for item in self.reported) or "nothing"
         return replace(
             self.base,
@@ -171,6 +172,13 @@ class Outcome:
             effects=(*kept, *effects, *self.faults.to_mappings()),
             provenance=provenance,
         )
+
+    def _moved(self, item: Mapping[str, Any]) -> Mapping[str, Any]:
+        """A declared effect as the drone has it: where the type's spread let it move, with its own numbers."""
+        if item["name"] not in self.together.typical:
+            return item
+        own = effect_to_mapping(self.hypothesis.effect(item["name"]))
+        return {**item, "parameters": own["parameters"], "uncertainty": self.together.fit.uncertainty(item["name"])}
 
 
 def close_loop(

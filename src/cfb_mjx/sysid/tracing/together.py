@@ -11,7 +11,7 @@ whole set by predictions:
 4. what does not earn its place beside the others goes, the least first.
 
 Effects the model declares already are what is known of the type of drone: they stay as they are, but for those that are
-a drone's own (`OWN`).
+a drone's own (`OWN`). Where the model says how far drones of the type differ (``spread``), they move within that.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cfb_mjx.parameters import Entry, ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, LogEvaluation, evaluate
 from cfb_mjx.sysid.metrics import BLOCK
 from cfb_mjx.sysid.refinement import Number, Refinement, plausible_numbers, refine
-from cfb_mjx.sysid.refinement.numbers import PLANT
+from cfb_mjx.sysid.refinement.numbers import HELD, PLANT
 from cfb_mjx.sysid.refinement.predictions import kinds_alike
 from cfb_mjx.sysid.rotors.flown_motors import Motors, flown_motors
 from cfb_mjx.sysid.tracing import columns as cols
@@ -79,6 +79,8 @@ class Rules:
     """An effect must lower it by this share beside all others."""
     confused: float = 0.9
     """Correlation of two effects' numbers from which they are hardly told apart."""
+    spreads: float = 2.0
+    """Standard deviations between drones that a declared number may move."""
     sure: float = 2.3
     """Standard deviations by which held-out flights must bear an effect out."""
     contradicts: float = 4.0
@@ -138,6 +140,8 @@ class Together:
     parts: list[Part]
     tried: list[dict]
     evaluation: Evaluation
+    typical: frozenset[str] = frozenset()
+    """Declared effects that moved within the spread of the type: no parts."""
 
     @property
     def beside_hold(self) -> float:
@@ -174,9 +178,11 @@ def fit_together(
     motors = flown_motors(logs, base.parameters(), rules.motor_rows, rules.motor_piece)
     start = _started(base, motors)
     names = names_to_fit(base, bool(motors.entries))
+    known = of_type(base, rules.spreads)
     say(f"fitting {len(names)} effects together")
     fit = partial(_fit, logs, kinds_alike(start, logs), rules)
-    found = fit(start, plausible_numbers(start.parameters, names), rules.steps, {})
+    numbers = tuple(n for n in plausible_numbers(start.parameters, names) if n.effect not in {k.effect for k in known})
+    found = fit(start, (*numbers, *known), rules.steps, {})
     tried: list[dict] = []
     refused: set[str] = {SHIFT, *(MOTORS if motors.entries else ())}
     if "thrust_scale" in names:
@@ -205,9 +211,11 @@ def fit_together(
         if better is None:
             break
         found = better
-    found = _lean(found, fit, rules, say)
+    typical = {k.effect for k in known}
+    found = _lean(found, fit, rules, say, typical)
     model = _bare(found, found.model)
-    return Together(model, found, motors.entries, _parts(found, motors, rules, say), tried, _predicted(model, logs))
+    parts = _parts(found, motors, rules, say, typical)
+    return Together(model, found, motors.entries, parts, tried, _predicted(model, logs), frozenset(typical))
 
 
 def names_to_fit(base: ModelFile, motors_told: bool) -> list[str]:
@@ -215,6 +223,29 @@ def names_to_fit(base: ModelFile, motors_told: bool) -> list[str]:
     declared = {mapping["name"] for mapping in base.effects}
     told = OF_MOTORS if motors_told else ()
     return [name for name in PLANT if name not in told and (name in OWN or name not in declared)]
+
+
+def of_type(base: ModelFile, spreads: float) -> tuple[Number, ...]:
+    """Numbers of declared effects that have a ``spread`` between drones, within so many of it about the declared value.
+
+    How far the type's own value is unsure (``uncertainty``) counts too. A drone's own effects are free of it.
+    """
+    found = []
+    for item in base.effects:
+        spread, std = item.get("spread") or {}, item.get("uncertainty") or {}
+        if item["name"] in OWN:
+            continue
+        for field, each in spread.items():
+            values = np.atleast_1d(np.asarray(item["parameters"][field], dtype=float))
+            errors = np.nan_to_num(np.atleast_1d(np.asarray(std.get(field) or 0.0, dtype=float)))
+            reach = spreads * np.hypot(np.atleast_1d(np.asarray(each, dtype=float)), errors)
+            several = isinstance(each, list)
+            found += [
+                Number(item["name"], field, i if several else None, float(v - r), float(v + r))
+                for i, (v, r) in enumerate(zip(values, reach, strict=True))
+                if r > HELD
+            ]
+    return tuple(found)
 
 
 def _started(base: ModelFile, motors: Motors) -> Quadrotor:
@@ -244,6 +275,10 @@ def ranked(search: Search, model: Quadrotor, refused: set[str]) -> list[tuple[Ev
     return sorted((pair for name, pair in best.items() if name not in refused), key=lambda pair: -pair[0].gain)
 
 
+ASKED_STEPS = 3
+"""Steps towards what the innovations ask for: one from far off goes too far for what divides (inertia)."""
+
+
 @dataclass(frozen=True)
 class Asked:
     """What the innovations make of one number: accelerations from row to row, beside a disturbance that wanders.
@@ -271,16 +306,23 @@ def asked(search: Search, model: Quadrotor, names: Collection[str], rules: Rules
     hypothesis = search.learned(hypothesis_of(search, model))
     columns = [column for name in names for variant in cols.strengths(name)[:1] for column in variant]
     columns = [replace(column, probe=()) for column in columns]
-    linear = search.linearise(hypothesis, columns)
-    index = linear.index(columns)
-    steps = solve(linear.blocks.sum(0), index, linear.scale)
-    deviations = np.sqrt(np.diag(covariance(linear.blocks, index, linear.scale, steps)))
+
+    def values(of):
+        every = [np.asarray(getattr(of.effect(c.effect), c.field)) for c in columns]
+        return np.array([v if c.index is None else v[c.index] for c, v in zip(columns, every, strict=True)])
+
+    predicted, scale = values(hypothesis), np.array([c.scale for c in columns])
+    for step in range(ASKED_STEPS):
+        linear = search.linearise(hypothesis, columns)
+        index = linear.index(columns)
+        steps = solve(linear.blocks.sum(0), index, linear.scale)
+        deviations = np.sqrt(np.diag(covariance(linear.blocks, index, linear.scale, steps))) * scale
+        others = values(hypothesis) + steps * scale
+        if step + 1 < ASKED_STEPS:
+            hypothesis = search.moved(hypothesis, columns, np.append(0.0, steps * scale))
     found: dict[str, list[Asked]] = {name: [] for name in names}
-    for column, step, deviation in zip(columns, steps, deviations, strict=True):
+    for column, now, other, std in zip(columns, *map(np.ndarray.tolist, (predicted, others, deviations)), strict=True):
         at = "" if column.index is None else f"[{column.index}]"
-        value = np.asarray(getattr(hypothesis.effect(column.effect), column.field))
-        now = float(value if column.index is None else value[column.index])
-        other, std = now + float(step) * column.scale, float(deviation) * column.scale
         differs = abs(other - now) > max(rules.contradicts * std, rules.differs * max(abs(now), abs(other)))
         found[column.effect].append(Asked(f"{column.effect}.{column.field}{at}", other, std, differs))
     return found
@@ -340,11 +382,20 @@ def _with(found: Refinement, variant: list[Column], evidence: Evidence) -> tuple
     return model, plausible_numbers(model.parameters, [kind.name])
 
 
-def _lean(found: Refinement, fit: Callable[..., Refinement], rules: Rules, say: Callable[[str], None]) -> Refinement:
-    """The fit with what does not earn its place held at neutral, the least first, fitted anew until all else does."""
+def _lean(
+    found: Refinement,
+    fit: Callable[..., Refinement],
+    rules: Rules,
+    say: Callable[[str], None],
+    typical: Collection[str] = (),
+) -> Refinement:
+    """The fit with what does not earn its place held at neutral, the least first, fitted anew until all else does.
+
+    What is ``typical`` stays.
+    """
     while True:
         gone: list[str] = []
-        while rest := [name for name in _fitted(found) if name not in gone]:
+        while rest := [name for name in _fitted(found) if name not in gone and name not in typical]:
             growth = {name: found.growth([*gone, name]) for name in rest}
             least = min(rest, key=growth.get)
             if growth[least] > rules.worth * found.cost[1] * (1 + len(gone)):
@@ -369,13 +420,15 @@ def _bare(found: Refinement, model: Quadrotor) -> Quadrotor:
     return Quadrotor(model.parameters, effects, body=model.body)
 
 
-def _parts(found: Refinement, motors: Motors, rules: Rules, say: Callable[[str], None]) -> list[Part]:
+def _parts(
+    found: Refinement, motors: Motors, rules: Rules, say: Callable[[str], None], typical: Collection[str] = ()
+) -> list[Part]:
     say("leaving out one effect after another")
     whole = found.left
     error = _mean(whole.errors)
     told = {type(each.effect).name: each for each in motors.effects}
     parts = []
-    for name in [*_fitted(found), *told]:
+    for name in [*(name for name in _fitted(found) if name not in typical), *told]:
         own = told.get(name)
         less = found.without([name]) if own is None else found.judged(_neutral(found.model, name))
         effect = next(e for e in found.model.effects if type(e).name == name)
