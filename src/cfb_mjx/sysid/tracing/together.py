@@ -181,8 +181,9 @@ def fit_together(
     known = of_type(base, rules.spreads)
     say(f"fitting {len(names)} effects together")
     fit = partial(_fit, logs, kinds_alike(start, logs), rules)
-    numbers = tuple(n for n in plausible_numbers(start.parameters, names) if n.effect not in {k.effect for k in known})
-    found = fit(start, (*numbers, *known), rules.steps, {})
+    typical = {k.effect for k in known}
+    numbers = tuple(n for n in plausible_numbers(start.parameters, names) if n.effect not in typical)
+    found = fit(start, numbers, rules.steps, {})
     tried: list[dict] = []
     refused: set[str] = {SHIFT, *(MOTORS if motors.entries else ())}
     if "thrust_scale" in names:
@@ -211,7 +212,10 @@ def fit_together(
         if better is None:
             break
         found = better
-    typical = {k.effect for k in known}
+    if known:
+        # Last: free from the start, they would make up for what only this drone has.
+        say("moving what the type declares within its spread")
+        found = fit(found.model, (*found.numbers, *known), rules.trial_steps, found.trims)
     found = _lean(found, fit, rules, say, typical)
     model = _bare(found, found.model)
     parts = _parts(found, motors, rules, say, typical)
