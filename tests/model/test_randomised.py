@@ -146,3 +146,12 @@ def test_the_shipped_type_draws_drones_that_fly():
     assert np.all((hover > 0.2) & (hover < 0.9))
     assert np.ptp(hover.mean(axis=1)) > 0.02
     assert np.ptp(np.asarray(effects["cog_offset"].offset), axis=0).min() > 1e-5
+
+
+def test_a_spread_about_zero_is_drawn_in_the_numbers_own_unit(tmp_path):
+    file = load_model_file("cfb")
+    place = Entry(np.zeros(3), "by symmetry", spread=np.array([1e-3, 1e-3, 0.0]))
+    save_model_file(replace(file, entries={**file.entries, "center_of_gravity": place}), tmp_path / "type.yaml")
+    ((name, spread),) = load_randomisation(tmp_path / "type.yaml").ranges
+    assert (name, spread.relative) == ("center_of_gravity", False)
+    assert spread.half_width == pytest.approx((np.sqrt(3) * 1e-3, np.sqrt(3) * 1e-3, 0.0))

@@ -21,7 +21,7 @@ from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters import Randomisation, sample_parameters
 from cfb_mjx.parameters import require_possible as require_possible_parameters
 from cfb_mjx.parameters.limits import concrete
-from cfb_mjx.parameters.randomisation import Range
+from cfb_mjx.parameters.randomisation import largest_magnitude
 
 
 def sample_drone(
@@ -53,7 +53,7 @@ def sample_drone(
         # By its name: adding a range never changes the draws of the others.
         of_field = jax.random.fold_in(key, crc32(f"{effect}.{field}".encode()))
         unit = jax.random.uniform(of_field, value.shape, value.dtype, -1.0, 1.0)
-        drawn = value + magnitude * _width(spread, value) * unit
+        drawn = value + magnitude * spread.width.astype(value.dtype) * unit
         if field in own.limits:
             drawn = jnp.where(own.limits[field].holds(drawn), drawn, jnp.nan)
         drone = eqx.tree_at(lambda m, i=at, f=field: getattr(m.effects[i], f), drone, drawn)
@@ -85,9 +85,8 @@ def require_possible(
         center, limits = concrete(getattr(own, field)), own.limits.get(field)
         if asked is None or center is None or limits is None:
             continue
-        width = np.broadcast_to(_width(spread, center), center.shape)
         room = np.minimum(limits.hard_high - center, center - limits.hard_low)
-        fitting = float(np.min(np.where(width > 0, room / np.where(width > 0, width, 1.0), np.inf)))
+        fitting = largest_magnitude(room, spread.reach(center))
         if np.max(np.abs(asked)) > fitting:
             raise CfbError(
                 f"{what} = {np.max(np.abs(asked)):g}: randomisation '{randomisation.name}' could then draw a "
@@ -107,11 +106,11 @@ def differences(nominal: Quadrotor, drone: Quadrotor, randomisation: Randomisati
     found = [jnp.zeros(0)]
     for name, spread in randomisation.ranges:
         mean, drawn = getattr(nominal.parameters, name), getattr(drone.parameters, name)
-        change = (drawn - mean) / (_width(spread, mean) * (mean if spread.relative else 1.0))
+        change = (drawn - mean) / (spread.width.astype(mean.dtype) * (mean if spread.relative else 1.0))
         found.append(jnp.atleast_1d(change[0] if spread.shared and change.ndim else change))
     for effect, field, spread in randomisation.effects:
         mean, drawn = (getattr(_found(model, effect, randomisation)[1], field) for model in (nominal, drone))
-        width = _width(spread, mean)
+        width = spread.width.astype(mean.dtype)
         found.append(jnp.atleast_1d((drawn - mean) / np.where(width > 0, width, 1.0)))
     return jnp.concatenate(found)
 
@@ -124,9 +123,3 @@ def _found(nominal: Quadrotor, effect: str, randomisation: Randomisation) -> tup
         f"randomisation '{randomisation.name}' varies {effect}, which this drone does not have; take model "
         f"{randomisation.name}, or one fitted from it."
     )
-
-
-def _width(spread: Range, value) -> np.ndarray:
-    """Half-width of the draw: a number, or one of each component."""
-    width = spread.half_width if len(spread.half_width) > 1 else spread.half_width[0]
-    return np.asarray(width, value.dtype)

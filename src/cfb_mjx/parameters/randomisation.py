@@ -39,6 +39,20 @@ class Range:
     relative: bool
     shared: bool
 
+    @property
+    def width(self) -> np.ndarray:
+        """The half-width: a number, or one of each component."""
+        return np.asarray(self.half_width if len(self.half_width) > 1 else self.half_width[0])
+
+    def reach(self, center: np.ndarray | np.generic) -> np.ndarray:
+        """How far from ``center`` a draw at magnitude 1 can lie."""
+        return np.broadcast_to(np.abs(center) * self.width if self.relative else self.width, center.shape)
+
+
+def largest_magnitude(room: np.ndarray | np.generic, reach: np.ndarray | np.generic) -> float:
+    """Up to which no draw that reaches so far leaves the room there is."""
+    return float(np.min(np.where(reach > 0, room / np.where(reach > 0, reach, 1.0), np.inf)))
+
 
 @dataclass(frozen=True)
 class Randomisation:
@@ -87,8 +101,11 @@ def _between_drones(model: ModelFile) -> Randomisation:
     ranges, effects = [], []
     for key, entry in model.entries.items():
         if entry.spread is not None:
-            width = UNIFORM * np.abs(entry.spread / entry.value)
-            ranges.append((key, Range(tuple(width.ravel().tolist()), True, False)))
+            relative = _only_relative(key)
+            if relative and np.any(entry.value == 0):
+                raise CfbError(f"model {model.name}: parameters.{key} is 0 and has a spread, which would allow less.")
+            width = UNIFORM * (entry.spread / np.abs(entry.value) if relative else entry.spread)
+            ranges.append((key, Range(tuple(width.ravel().tolist()), relative, False)))
     for item in model.effects:
         for key, spread in (item.get("spread") or {}).items():
             width = UNIFORM * np.atleast_1d(np.asarray(spread, dtype=np.float64))
@@ -98,6 +115,11 @@ def _between_drones(model: ModelFile) -> Randomisation:
             f"model {model.name}: no number has a spread between drones; take cfb-fleet, paper or a YAML file."
         )
     return Randomisation(model.name, tuple(ranges), tuple(effects))
+
+
+def _only_relative(key: str) -> bool:
+    """Whether a width in the parameter's unit would allow the wrong sign."""
+    return SPECIFICATIONS[key].limits.hard_low >= 0 or bool(SPECIFICATIONS[key].together)
 
 
 def _range(key: str, raw, path: Path) -> Range:
@@ -115,8 +137,7 @@ def _range(key: str, raw, path: Path) -> Range:
     if len(widths) not in (1, *size):
         raise CfbError(f"{path}: ranges.{key}.half_width must have 1 or {size[0] if size else 1} numbers.")
     relative = raw["unit"] == "relative"
-    specification = SPECIFICATIONS[key]
-    if not relative and (specification.limits.hard_low >= 0 or specification.together):
+    if not relative and _only_relative(key):
         raise CfbError(f"{path}: ranges.{key}.unit must be 'relative': a width in {unit} would allow the wrong sign.")
     if relative and max(widths) >= 1:
         raise CfbError(
@@ -162,8 +183,7 @@ def sample_parameters(
         # fold_in by position in the specification table: adding a range never changes the draws of the others.
         order = list(SPECIFICATIONS).index(name)
         unit = jax.random.uniform(jax.random.fold_in(key, order), shape, value.dtype, -1.0, 1.0)
-        width = jnp.asarray(spread.half_width if len(spread.half_width) > 1 else spread.half_width[0], value.dtype)
-        change = magnitude * width * unit
+        change = magnitude * spread.width.astype(value.dtype) * unit
         drawn[name] = value * (1 + change) if spread.relative else value + change
     if "inertia" in drawn:
         drawn["inertia"] = _physical(drawn["inertia"])
@@ -213,14 +233,12 @@ def require_possible(
 def _largest_magnitude(name: str, center: np.ndarray, spread: Range) -> float:
     """Up to which no draw leaves what can be; below zero where the nominal value does."""
     limits = SPECIFICATIONS[name].limits
-    width = np.asarray(spread.half_width if len(spread.half_width) > 1 else spread.half_width[0])
-    reach = np.broadcast_to(np.abs(center) * width if spread.relative else width, center.shape)
+    reach = spread.reach(center)
     room = np.minimum(limits.hard_high - center, center - limits.hard_low)
     rooms, reaches = [room], [reach]
     if name in _SUMS:
         rooms, reaches = [room, center.sum(-1)], [reach, reach.sum(-1)]
-    found = [np.where(r > 0, x / np.where(r > 0, r, 1.0), np.inf) for x, r in zip(rooms, reaches, strict=True)]
-    return float(min(x.min() for x in found))
+    return min(map(largest_magnitude, rooms, reaches))
 
 
 _SUMS = ("thrust_polynomial", "torque_polynomial")

@@ -234,21 +234,20 @@ def of_type(base: ModelFile, spreads: float) -> tuple[Number, ...]:
 
     How far the type's own value is unsure (``uncertainty``) counts too. A drone's own effects are free of it.
     """
+    model = Quadrotor.from_file(base)
+    items = {item["name"]: item for item in base.effects if item.get("spread") and item["name"] not in OWN}
+
+    def said(number: Number, what: str) -> float:
+        value = (items[number.effect].get(what) or {}).get(number.field)
+        each = np.atleast_1d(np.asarray(0.0 if value is None else value, dtype=float))
+        return float(np.nan_to_num(each)[number.index or 0])
+
     found = []
-    for item in base.effects:
-        spread, std = item.get("spread") or {}, item.get("uncertainty") or {}
-        if item["name"] in OWN:
-            continue
-        for field, each in spread.items():
-            values = np.atleast_1d(np.asarray(item["parameters"][field], dtype=float))
-            errors = np.nan_to_num(np.atleast_1d(np.asarray(std.get(field) or 0.0, dtype=float)))
-            reach = spreads * np.hypot(np.atleast_1d(np.asarray(each, dtype=float)), errors)
-            several = isinstance(each, list)
-            found += [
-                Number(item["name"], field, i if several else None, float(v - r), float(v + r))
-                for i, (v, r) in enumerate(zip(values, reach, strict=True))
-                if r > HELD
-            ]
+    for number in plausible_numbers(model.parameters, list(items)):
+        value = number.of(model)
+        reach = spreads * float(np.hypot(said(number, "spread"), said(number, "uncertainty")))
+        if number.field in items[number.effect]["spread"] and reach > HELD:
+            found.append(replace(number, low=value - reach, high=value + reach))
     return tuple(found)
 
 
