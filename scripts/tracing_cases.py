@@ -67,6 +67,11 @@ FAULTY = [
     ("sensor_gyro_lowpass", "blade_flapping"),
 ]
 """A sensor fault and an effect of half the strength."""
+MANY = (6, 6, 8, 8, 10, 10, 12, 12)
+"""Effects at once, as on real drones: so many, of strengths between these."""
+STRENGTHS = (0.3, 0.8)
+ALIKE = {"payload": ("thrust_scale", "payload_swing"), "motor_time_constant": ("motor_asymmetry",)}
+"""What no flight tells from these is not drawn beside them."""
 
 
 def cases(nulls: int, seed: int) -> list[Case]:
@@ -78,6 +83,7 @@ def cases(nulls: int, seed: int) -> list[Case]:
         Case(f"{name}-{k}", seed + 300 + 10 * i + k, ((name, 1.0),)) for i, name in enumerate(OUTSIDE) for k in (1, 2)
     ]
     found += hard_cases(seed)
+    found += [many(f"many-{count}-{i + 1}", seed + 900 + i, count) for i, count in enumerate(MANY)]
     found += [Case(f"clean-{i}", seed + 1000 + i, ()) for i in range(nulls)]
     return [found[i] for i in np.random.default_rng(seed).permutation(len(found))]
 
@@ -93,6 +99,14 @@ def hard_cases(seed: int) -> list[Case]:
         for k, strength in ((1, 0.6), (2, 0.8))
     ]
     return found + [_mixed("faulty-", seed + 700 + i, names, BESIDE) for i, names in enumerate(FAULTY)]
+
+
+def many(name: str, seed: int, count: int) -> Case:
+    """A drone with so many physical effects at once."""
+    rng = np.random.default_rng([seed, 3000])
+    drawn = [str(effect) for effect in rng.permutation(PHYSICAL)]
+    drawn = [effect for effect in drawn if not set(ALIKE.get(effect, ())) & set(drawn[:count])][:count]
+    return Case(name, seed, tuple((effect, float(rng.uniform(*STRENGTHS))) for effect in drawn))
 
 
 def _mild(name: str, seed: int, strength: float) -> Case:

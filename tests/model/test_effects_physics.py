@@ -22,6 +22,7 @@ from cfb_mjx.model.effects import (
     CommandDelay,
     Condition,
     EscRateLimit,
+    MotorHysteresis,
     GroundEffect,
     Gust,
     Gyroscopic,
@@ -456,6 +457,21 @@ def test_rate_limit_ramps(uneven, guards):
         if dt > 0:
             np.testing.assert_allclose(mean, np.mean(path, axis=0), atol=1e-6)
     assert 0 < reached < commands.size
+
+
+@pytest.mark.parametrize("share", [1.0, 0.4])
+def test_play_encloses_the_area_of_its_parallelogram(guards, share):
+    """A command to and fro by ``size`` drags the output along a loop of area 4 width (size - width)."""
+    size, width, count = np.array([0.05, 0.1, 0.2, 0.3]), 0.08, 4000
+    command = 0.5 + size * np.sin(np.linspace(0, 4 * np.pi, count + 1))[:, None]
+    steps = np.full(count + 1, 1e-3)
+    effect = MotorHysteresis(width, share)
+    output = np.asarray(_received(effect, guards, jnp.full(4, 1450.0), steps, command))[count // 2 :]
+    round_ = command[count // 2 :]
+    area = np.abs(np.sum(0.5 * (output[1:] + output[:-1]) * np.diff(round_, axis=0), axis=0))
+    np.testing.assert_allclose(area, share * 4 * width * np.maximum(size - width, 0), atol=1e-5)
+    # The smallest moves within the play: it is swallowed.
+    np.testing.assert_allclose(np.ptp(output[:, 0]), (1 - share) * 2 * size[0], atol=1e-9)
 
 
 def test_a_limit_of_the_rotors_acceleration_is_that_of_the_equation(guards, fly_fleet):

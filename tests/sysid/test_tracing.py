@@ -46,6 +46,7 @@ CASES = [
     Case("periodic", 9006, (("outside_periodic", 1.0),)),
     Case("limited", 98012, (("esc_rate_limit", 1.0),)),
     Case("nicked", 9008, (("prop_damage", 1.0),)),
+    Case("sticky", 9009, (("motor_hysteresis", 1.0),)),
 ]
 
 
@@ -386,6 +387,15 @@ def test_a_damaged_propeller_is_named_with_its_motor(campaigns, base):
     assert dict(variant[0].probe)["motor"] == truth["motor"]
     damaged = [1 + value * column.scale for value, column in zip(found.values, variant, strict=True)]
     np.testing.assert_allclose(damaged, np.array(truth["blades"])[:, truth["motor"] - 1], atol=0.01)
+
+
+def test_play_of_the_speed_controllers_is_named_with_its_width(campaigns, base):
+    campaign = campaigns["sticky"]
+    found = trace(campaign.fit, base.parameters(), 0.008)
+    assert found.hypothesis.present == ("motor_hysteresis",)
+    truth, play = campaign.truth["effects"]["motor_hysteresis"], found.hypothesis.effect("motor_hysteresis")
+    # The drone has several plays side by side, and half of its commands are not logged.
+    assert float(play.width * play.share) == pytest.approx(truth["play"] * truth["play_share"], rel=0.4)
 
 
 def test_the_innovations_contradict_what_predictions_only_wish_for(campaigns, base):

@@ -282,3 +282,9 @@ def prop_damage(rng, drone, strength):
     motor, blades = int(rng.integers(4)), drone["blades"].copy()
     blades[:, motor] *= 1 + strength * np.array([-rng.uniform(0.04, 0.1), sign(rng) * rng.uniform(0.05, 0.2)])
     return put(drone, blades=blades) | {"motor": motor + 1}
+
+
+@effect
+def motor_hysteresis(rng, drone, strength):
+    """Speed controllers with play."""
+    return put(drone, play=strength * rng.uniform(0.006, 0.015), play_share=rng.uniform(0.6, 1.0))

@@ -39,6 +39,8 @@ NOMINAL: dict[str, object] = {
     "asymmetry_width": 80.0,  # rad/s over which one passes into the other
     "delay_ms": 0,
     "esc_rate": 0.0,  # 1/s; 0: none
+    "play": 0.0,  # half the mean play of a speed controller, of full command
+    "play_share": 0.0,  # of the command that passes through it
     "spin_limit": 0.0,  # rad/s^2 that a rotor's acceleration approaches; 0: none
     "second_lag": 0.0,  # s
     "flapping": 0.0,  # N m s/m of all rotors at hover

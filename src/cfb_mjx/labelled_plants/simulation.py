@@ -23,6 +23,8 @@ HOVER_CURRENT, IDLE_CURRENT, RESISTANCE, DISCHARGE = 4.5, 0.3, 0.045, 6e-4  # A,
 CURRENT_KEEP = np.exp(-c.TICK / 0.03)
 # Beyond these a flight counts as crashed, rad/s and cosine of tilt.
 RATE_LIMIT, TILT_LIMIT = 15.0, np.cos(np.radians(80.0))
+PLAYS = np.array([0.4, 1.0, 1.6])
+"""Widths of the plays of a speed controller over their mean."""
 EXTRA = frozenset({"esc_rate", "second_lag", "bob_mass", "flex"})
 DELAY_RING = 16
 
@@ -99,6 +101,9 @@ class _Loop:
         self.past = [self.x[: W.start]] * c.POSE_TICKS
         self.past_gyro = [self.x[W]] * c.POSE_TICKS
         self.commands = np.full((DELAY_RING, 4, count), c.HOVER_SPEED / c.MOTOR_GAIN)
+        self.driven, self.plays = self.commands, np.tile(self.commands[0], (len(PLAYS), 1, 1))
+        if "play" in p.on:
+            self.driven = self.commands.copy()
         self.wander = np.zeros((8, count))
         self.jolt = _jolts([lane.instruments for lane in lanes])
         self.phase = np.array([lane.rng.uniform(0, 2 * np.pi) for lane in lanes])
@@ -121,7 +126,9 @@ class _Loop:
         voltage = self._battery()
         held = self._held(noise, voltage)
         self.commands[tick % DELAY_RING] = command
-        moved, specific = self._move(tick, command, held)
+        if "play" in self.p.on:
+            self.driven[tick % DELAY_RING] = self._played(command)
+        moved, specific = self._move(tick, held)
         self.pose(tick, late)
         self.inertial(tick, self.low_pass(gyro), specific, voltage[None])
         self.motors(tick, command, self.x[SPEED])
@@ -141,20 +148,26 @@ class _Loop:
         self.memory, command = self.pilot.fly(self.memory, relative(goal, late, late_gyro))
         return np.rint(np.clip(command + goal[DITHER], 0.0, 1.0) * 65535) / 65535
 
-    def _move(self, tick, command, held):
+    def _played(self, command):
+        """What a speed controller with play makes of a command: several plays side by side, and the command itself."""
+        width = PLAYS[:, None, None] * self.p.play
+        self.plays = np.clip(self.plays, command - width, command + width)
+        return command + self.p.play_share * (self.plays.mean(axis=0) - command)
+
+    def _move(self, tick, held):
         x, first, step = self.x, None, c.TICK / c.SUBSTEPS
         for sub in range(c.SUBSTEPS):
             time = tick * c.TICK + sub * step
-            x, specific = advance(self.p, x, self._arrived(tick, sub, command), held, time, step)
+            x, specific = advance(self.p, x, self._arrived(tick, sub), held, time, step)
             first = specific if first is None else first
         return x, first
 
-    def _arrived(self, tick, sub, command):
+    def _arrived(self, tick, sub):
         """Commands as they reach the motors, each lane's own delay (whole substeps) later."""
         if "delay_ms" not in self.p.on:
-            return command
+            return self.driven[tick % DELAY_RING]
         past = (c.SUBSTEPS * tick + sub - self.p.delay_ms.astype(int)) // c.SUBSTEPS
-        return self.commands[past % DELAY_RING, :, np.arange(command.shape[1])].T
+        return self.driven[past % DELAY_RING, :, np.arange(len(self.lanes))].T
 
     def _battery(self):
         """Voltage (F,); drained and pulled down by the rotors' power."""

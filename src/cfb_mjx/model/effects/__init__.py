@@ -23,6 +23,7 @@ from cfb_mjx.model.effects.inflow_thrust import InflowThrust
 from cfb_mjx.model.effects.jet import Jet
 from cfb_mjx.model.effects.motor_asymmetry import MotorAsymmetry
 from cfb_mjx.model.effects.motor_gain_mismatch import MotorGainMismatch
+from cfb_mjx.model.effects.motor_hysteresis import MotorHysteresis
 from cfb_mjx.model.effects.motor_second_order import MotorSecondOrder
 from cfb_mjx.model.effects.motor_thermal_drift import MotorThermalDrift
 from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
@@ -59,6 +60,7 @@ __all__ = [
     "Memory",
     "MotorAsymmetry",
     "MotorGainMismatch",
+    "MotorHysteresis",
     "MotorSecondOrder",
     "MotorThermalDrift",
     "MotorTimeConstant",

@@ -33,6 +33,7 @@ from cfb_mjx.model.effects.inflow_thrust import InflowThrust
 from cfb_mjx.model.effects.jet import Jet
 from cfb_mjx.model.effects.motor_asymmetry import MotorAsymmetry
 from cfb_mjx.model.effects.motor_gain_mismatch import MotorGainMismatch
+from cfb_mjx.model.effects.motor_hysteresis import MotorHysteresis
 from cfb_mjx.model.effects.motor_second_order import MotorSecondOrder
 from cfb_mjx.model.effects.motor_thermal_drift import MotorThermalDrift
 from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
@@ -67,6 +68,7 @@ _PHYSICS: dict[str, type[Effect]] = {
         BatterySag,
         CommandDelay,
         EscRateLimit,
+        MotorHysteresis,
         InflowThrust,
         GroundEffect,
         Gyroscopic,

@@ -1,0 +1,66 @@
+"""A speed controller that does not follow small changes of the command: play, as of a gear.
+
+    y' = min(max(y, u - width), u + width),   u' = u + share (y' - u)
+
+An output ``y`` stays where it is while the command ``u`` moves within ``width`` of it, and is dragged along beyond
+that. The motors receive a mixture of both. Small commands to and fro are swallowed; in large ones the output is late by
+up to ``width`` whichever way they go.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Effect, Memory
+from cfb_mjx.model.effects.fields import number
+from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Parameters
+
+
+class MotorHysteresis(Effect):
+    """Y = min(max(y, u - width), u + width), the motors receive u + share (y - u)."""
+
+    name: ClassVar[str] = "motor_hysteresis"
+    meaning: ClassVar[str] = "the motor controllers do not follow small changes of the command"
+    experiment: ClassVar[str] = "small command steps to and fro about hover, rotor speed logged"
+    units: ClassVar[dict[str, str]] = {"width": "1", "share": "1"}
+    source: ClassVar[str] = (
+        "G. Tao, P. Kokotovic, Adaptive Control of Systems with Actuator and Sensor Nonlinearities, 1996 (backlash)"
+    )
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"width": (0.0, 0.05), "share": (0.0, 1.0)}
+    limits: ClassVar[dict[str, Limits]] = {
+        "width": Limits(0.0, 1.0, 0.0, 0.2),
+        "share": Limits(0.0, 1.0, 0.0, 1.0),
+    }
+    strengths: ClassVar[tuple[str, ...]] = ("width",)
+    # Play narrower than what commands do from row to row hardly shows.
+    coarse: ClassVar[dict[int, float]] = {0: 0.15}
+    # Of commands that have arrived, before their rate is limited.
+    rank: ClassVar[int] = 2
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({"share": 1.0},)
+
+    width: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Half the play, as a share of full command; zero or positive."""
+    share: Float[Array, "*batch"] = eqx.field(converter=number, default=1.0)
+    """Of the motors' command that passes through the play."""
+
+    @classmethod
+    def neutral(cls) -> MotorHysteresis:
+        return cls(width=0.0)
+
+    def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
+        steady = (rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
+        return (steady.map(lambda u: jnp.clip(u, 0.0, 1.0)),)
+
+    def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
+        (last,) = memory
+        # Comparison instead of maximum: at zero the derivative is that of a growing play.
+        width = jnp.where(self.width >= 0, self.width, 0.0)
+        # In this order the command decides where there is no play.
+        output = command.map(lambda u, y: jnp.where(y < u - width, u - width, jnp.where(y > u + width, u + width, y)), last)
+        return command + self.share * (output - command), (output,)
