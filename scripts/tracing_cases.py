@@ -109,6 +109,14 @@ def many(name: str, seed: int, count: int) -> Case:
     return Case(name, seed, tuple((effect, float(rng.uniform(*STRENGTHS))) for effect in drawn))
 
 
+def alone(case: Case) -> dict[str, Case]:
+    """The drone of a case with one of its effects at a time, as strong as there."""
+    return {
+        name: Case(f"{case.name}, {name}", case.seed, tuple((n, s if n == name else 0.0) for n, s in case.effects))
+        for name, _ in case.effects
+    }
+
+
 def _mild(name: str, seed: int, strength: float) -> Case:
     return Case(f"{name}-mild", seed + 400 + PHYSICAL.index(name), ((name, strength),))
 

@@ -16,7 +16,7 @@ from collections import Counter, defaultdict
 from pathlib import Path
 
 import numpy as np
-from tracing_cases import LEAST, MOST, SEED, achievable, cases
+from tracing_cases import LEAST, MOST, SEED, achievable, alone, cases
 
 from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.files import write_text
@@ -29,6 +29,8 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "tracing.jsonl"
 NULLS = 100
 BATCH = 8
+MATTERS = 0.05
+"""Of many effects at once those must be found that alone buy so much."""
 
 
 def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
@@ -74,6 +76,11 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
 
                 twin = evaluate(Quadrotor.from_file(base), perfect[campaign.case.name].held_out)
                 line["perfect"] = _pick(twin.metrics("commands_in"))
+                if _many(line):
+                    line["alone"] = {}
+                    for name, case in alone(campaign.case).items():
+                        one = evaluate(Quadrotor.from_file(base), fly_campaigns([case])[0].held_out)
+                        line["alone"][name] = achievable(_pick(one.metrics("commands_in")), line["perfect"])
             if campaign.case.name in traced(results, again):  # by the other process, meanwhile
                 continue
             with results.open("a") as file:
@@ -130,6 +137,7 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
         "is the share of that improvement the corrected model reaches.",
         "",
         *_summary(lines),
+        *_of_many(lines),
         "",
         "## What was found for what was there (single effects)",
         "",
@@ -145,7 +153,7 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
         "| effects | strengths | buys | found | recovered | unexplained |",
         "|---|---|---|---|---|---|",
     ]
-    text += [_detail(line, ", ".join(line["labels"])) for line in mixed]
+    text += [_detail(line, ", ".join(line["labels"])) for line in mixed if not _many(line)]
     text += ["", "## Confusion (strong and weak single effects)", "", *_confusion(single)]
     for seed, path in again.items():
         lines = read(path)
@@ -177,6 +185,8 @@ def _right(line: dict) -> bool:
     """Whether all that was there was found, and nothing else."""
     outside = line["labels"] == ["outside"]
     names = {item["name"] for item in line["found"]}
+    if _many(line):
+        return _expected(line) <= names <= set(line["labels"]) and line["unexplained"] is None
     return names == (set() if outside else set(line["labels"])) and (line["unexplained"] is not None) == outside
 
 
@@ -197,6 +207,7 @@ def _summary(lines: list[dict]) -> list[str]:
         "*hard:* a strong effect and weak ones": [x for x in mixed if x["name"].startswith("uneven")],
         "*hard:* sensor fault of 0.6 or 0.8": [x for x in single if x["name"][-2:] in ("-1", "-2")],
         "*hard:* sensor fault and an effect": [x for x in mixed if x["name"].startswith("faulty")],
+        "*many:* six to twelve effects": [x for x in mixed if _many(x)],
     }
     for name, group in groups.items():
         if group:
@@ -217,7 +228,44 @@ def _summary(lines: list[dict]) -> list[str]:
 
 
 def _hard(line: dict) -> bool:
-    return line["name"].startswith(("uneven", "faulty"))
+    return line["name"].startswith(("uneven", "faulty", "many"))
+
+
+def _many(line: dict) -> bool:
+    return line["name"].startswith("many")
+
+
+def _expected(line: dict) -> set[str]:
+    """What must be found: everything there, of many effects what matters."""
+    return {name for name in line["labels"] if line.get("alone", {}).get(name, 1.0) >= MATTERS}
+
+
+def _of_many(lines: list[dict]) -> list[str]:
+    """Drones with many effects, one by one."""
+    many = [line for line in lines if _many(line)]
+    if not many:
+        return []
+    text = [
+        "",
+        "## Six to twelve effects at once",
+        "",
+        "As real drones have them. In brackets what an effect buys on a drone that has it alone.",
+        "",
+        "| drone | found | missed | wrong names | recovered | unexplained |",
+        "|---|---|---|---|---:|---|",
+    ]
+    there = found = 0
+    for line in sorted(many, key=lambda x: x["name"]):
+        names, expected = [item["name"] for item in line["found"]], _expected(line)
+        there, found = there + len(expected), found + len(expected & set(names))
+        told = [f"{name} ({line['alone'][name]:.0%})" for name in names if name in line["labels"]]
+        missed = [f"{name} ({line['alone'][name]:.0%})" for name in line["labels"] if name not in names]
+        wrong = [name for name in names if name not in line["labels"]]
+        cells = [line["name"], *(", ".join(each) or "-" for each in (told, missed, wrong))]
+        flag = "" if line["unexplained"] is None else "yes"
+        text.append(f"| {' | '.join(cells)} | {recovered(line):.2f} | {flag} |")
+    said = f"Of {there} effects that buy {MATTERS:.0%} or more, {found} were found ({found / there:.0%})."
+    return [*text[:4], said, *text[4:]]
 
 
 def _sensor(line: dict) -> bool:
@@ -227,7 +275,7 @@ def _sensor(line: dict) -> bool:
 def _row(group: list[dict]) -> str:
     names = [[item["name"] for item in line["found"]] for line in group]
     strongest = [bool(n) and _strongest(line)["name"] in line["labels"] for n, line in zip(names, group, strict=True)]
-    every = [set(line["labels"]) <= set(n) for n, line in zip(names, group, strict=True)]
+    every = [_expected(line) <= set(n) for n, line in zip(names, group, strict=True)]
     wrong = sum(len(set(n) - set(line["labels"])) for n, line in zip(names, group, strict=True))
     shares = [recovered(line) for line in group]
     return (

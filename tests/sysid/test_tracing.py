@@ -26,6 +26,7 @@ from cfb_mjx.sysid.tracing.evidence import evidence
 from cfb_mjx.sysid.tracing.formula import with_library
 from cfb_mjx.sysid.tracing.given import fit_given
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.jointly import beside_each_other, everything, needless
 from cfb_mjx.sysid.tracing.lines import find_lines
 from cfb_mjx.sysid.tracing.outcome import close_loop
 from cfb_mjx.sysid.tracing.residuals import residual_rows
@@ -37,6 +38,15 @@ from cfb_mjx.sysid.tracing.trace import trace
 # One worker: every program is compiled once.
 pytestmark = pytest.mark.xdist_group("tracing")
 
+MANY = (
+    ("prop_damage", 0.8),
+    ("rotor_drag", 0.6),
+    ("thrust_scale", 0.6),
+    ("cog_offset", 0.5),
+    ("motor_time_constant", 1.0),
+    ("gyroscopic", 0.6),
+    ("thrust_tilt", 0.6),
+)
 CASES = [
     Case("clean", 9001, ()),
     Case("drag", 9002, (("rotor_drag", 1.0),)),
@@ -47,6 +57,7 @@ CASES = [
     Case("limited", 98012, (("esc_rate_limit", 1.0),)),
     Case("nicked", 9008, (("prop_damage", 1.0),)),
     Case("sticky", 9009, (("motor_hysteresis", 1.0),)),
+    Case("many", 9010, MANY),
 ]
 
 
@@ -396,6 +407,39 @@ def test_play_of_the_speed_controllers_is_named_with_its_width(campaigns, base):
     truth, play = campaign.truth["effects"]["motor_hysteresis"], found.hypothesis.effect("motor_hysteresis")
     # The drone has several plays side by side, and half of its commands are not logged.
     assert float(play.width * play.share) == pytest.approx(truth["play"] * truth["play_share"], rel=0.4)
+
+
+def test_many_effects_are_taken_in_together(campaigns, base):
+    """More than a search that takes in one after the other would end with, each with its own number."""
+    campaign = campaigns["many"]
+    said = []
+    found = trace(campaign.fit, base.parameters(), 0.008, said.append)
+    assert sorted(found.hypothesis.present) == campaign.case.labels
+    assert any(line.startswith("fitting ") for line in said)
+    truth, model = campaign.truth["effects"], found.hypothesis.effect
+    assert float(model("thrust_scale").relative) == pytest.approx(truth["thrust_scale"]["thrust_scale"] - 1, rel=0.1)
+    np.testing.assert_allclose(model("cog_offset").offset, truth["cog_offset"]["cog"][:2], atol=2e-5)
+    assert float(model("prop_damage").motor) == truth["prop_damage"]["motor"]
+    for item in found.found:
+        assert item.buys > 0.05, item.name
+
+
+def test_what_stands_beside_others_is_told_from_what_stands_in_for_them(campaigns, base):
+    """Of a drone with a drag alone, much gains beside the declared model and nothing beside the drag."""
+    campaign = campaigns["drag"]
+    search = Search.start(campaign.fit, base.parameters(), 0.008, check_sensors(campaign.fit, 0.008, 0.0))
+    nothing = search.learned(search.nothing())
+    linear = search.whole(nothing)
+    alone = {name for name, (found, _) in search.probes(nothing, linear).items() if found.gain > 20 and found.t > 5}
+    assert len(alone) > 3
+    assert [each.name for each in beside_each_other(search, nothing, linear, {"sensor_time_shift"})][:1] == [
+        "rotor_drag"
+    ]
+    found = everything(search).hypothesis
+    assert found.present == ("rotor_drag",)
+    # An effect that is not there is seen to be needless, the one that is not.
+    both = search.settled(found.having(CATALOGUE["thrust_tilt"](tilt=[0.01, 0.0], twist=0.0)))
+    assert set(needless(search, both)) == {"thrust_tilt"}
 
 
 def test_the_innovations_contradict_what_predictions_only_wish_for(campaigns, base):

@@ -22,7 +22,10 @@ MARGIN = 25  # ticks a log starts after the warm-up, so that late columns have a
 
 @dataclass(frozen=True)
 class Case:
-    """A drone to draw: ``effects`` are (name, strength); none for a nominal drone."""
+    """A drone to draw: ``effects`` are (name, strength); none for a nominal drone.
+
+    An effect of strength 0 is not there, and the others are drawn as if it were.
+    """
 
     name: str
     seed: int
@@ -31,7 +34,7 @@ class Case:
     @property
     def labels(self) -> list[str]:
         """Names a perfect diagnosis would give; empty for a nominal drone."""
-        return sorted({effects.label(name) for name, _ in self.effects})
+        return sorted({effects.label(name) for name, strength in self.effects if strength})
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,8 @@ def draw_drone(case: Case) -> tuple[dict[str, np.ndarray], Instruments, dict]:
     truth: dict = {"labels": case.labels, "effects": {}}
     for order, (name, strength) in enumerate(case.effects):
         rng = np.random.default_rng([case.seed, 1000 + order])
-        truth["effects"][name] = effects.apply(name, rng, drone, strength)
+        if strength:
+            truth["effects"][name] = effects.apply(name, rng, drone, strength)
     instruments = draw_instruments(_of_case(case))
     return drone, instruments, truth | {"instruments": vars(instruments)}
 

@@ -62,5 +62,7 @@ class MotorHysteresis(Effect):
         # Comparison instead of maximum: at zero the derivative is that of a growing play.
         width = jnp.where(self.width >= 0, self.width, 0.0)
         # In this order the command decides where there is no play.
-        output = command.map(lambda u, y: jnp.where(y < u - width, u - width, jnp.where(y > u + width, u + width, y)), last)
+        output = command.map(
+            lambda u, y: jnp.where(y < u - width, u - width, jnp.where(y > u + width, u + width, y)), last
+        )
         return command + self.share * (output - command), (output,)

@@ -25,6 +25,8 @@ STRUCTURE_OF_FIRST = 0.05
 CLEAR = 8.0
 """An effect whose statistic is above this need only be material in one flight: what few flights excite (yaw, most of
 all) drowns in the errors of the others, and no chance brings such a statistic about."""
+FAR_OFF = 1 / 3
+"""A model lacks much if, after half a second, it errs by more than this share of what hold errs."""
 SMALLEST_SHIFT = 0.0015
 """Motor columns less late or early than this, s, are commands between rows rather than a fault."""
 
@@ -66,6 +68,17 @@ def material(fit: Fit, richer: Fit, nothing: Fit, clear: bool) -> bool:
     if enough(fit.errors, richer.errors, nothing.errors, *shares):
         return True
     return clear and enough(fit.by_flight, richer.by_flight, nothing.by_flight, *shares)
+
+
+def missed(poorer: Fit, richer: Fit, clear: bool) -> bool:
+    """Whether one effect of many matters beside all others, in all flights or, if ``clear``, twice as much in one.
+
+    What the declared model scores, far off with many effects missing, is no measure of that.
+    """
+    share = MATERIAL
+    if enough(poorer.errors, richer.errors, poorer.errors, share, share):
+        return True
+    return clear and enough(poorer.by_flight, richer.by_flight, poorer.by_flight, 2 * share, 2 * share)
 
 
 def enough(poorer: np.ndarray, better: np.ndarray, first: np.ndarray, share: float, of_first: float) -> bool:

@@ -29,34 +29,54 @@ class Evidence:
     values: np.ndarray
 
 
-def solve(
-    total: np.ndarray, columns: list[int], scale: np.ndarray, pull: tuple[int, float, float] | None = None
-) -> np.ndarray:
-    """Values of some columns (units of their scale) that explain the residual best; ``total`` is (c, c).
+@dataclass(frozen=True)
+class Prior:
+    """What is known of numbers beforehand, in units of their columns' scale: normal, one by one.
 
-    ``pull`` (position, value, precision) holds one of them near a value known beforehand.
+    Attributes:
+        center: (k,).
+        precision: (k,).
     """
+
+    center: np.ndarray
+    precision: np.ndarray
+
+    @classmethod
+    def weak(cls, count: int) -> Prior:
+        """A step not too long, whatever the numbers are now."""
+        return cls(np.zeros(count), np.full(count, RIDGE))
+
+    def pulled(self, at: int, value: float, precision: float) -> Prior:
+        """The same with more known of one number."""
+        center, both = self.center.copy(), self.precision.copy()
+        both[at] += precision
+        center[at] = (self.precision[at] * center[at] + precision * value) / both[at]
+        return Prior(center, both)
+
+    def of(self, positions: list[int]) -> Prior:
+        """Of some of the numbers."""
+        return Prior(self.center[positions], self.precision[positions])
+
+    def __add__(self, other: Prior) -> Prior:
+        pairs = (self.center, other.center), (self.precision, other.precision)
+        return Prior(*(np.concatenate(pair) for pair in pairs))
+
+
+def solve(total: np.ndarray, columns: list[int], scale: np.ndarray, prior: Prior | None = None) -> np.ndarray:
+    """Values of some columns (units of their scale) that explain the residual best; ``total`` is (c, c)."""
+    prior = prior or Prior.weak(len(columns))
     s = scale[columns]
-    a = total[np.ix_(columns, columns)] * np.outer(s, s) + RIDGE * np.eye(len(columns))
-    b = total[columns, 0] * s
-    if pull is not None:
-        at, value, precision = pull
-        a[at, at] += precision
-        b[at] += precision * value
-    return np.linalg.solve(a, b)
+    a = total[np.ix_(columns, columns)] * np.outer(s, s) + np.diag(prior.precision)
+    return np.linalg.solve(a, total[columns, 0] * s + prior.precision * prior.center)
 
 
 def covariance(
-    blocks: np.ndarray, columns: list[int], scale: np.ndarray, values: np.ndarray, precision: float = 0.0
+    blocks: np.ndarray, columns: list[int], scale: np.ndarray, values: np.ndarray, prior: Prior | None = None
 ) -> np.ndarray:
-    """(k, k) covariance of `solve`'s values, from the scatter of the blocks' gradients where that is larger.
-
-    ``precision`` is what is known of the first column beforehand.
-    """
+    """(k, k) covariance of `solve`'s values, from the scatter of the blocks' gradients where that is larger."""
+    prior = prior or Prior.weak(len(columns))
     s = scale[columns]
-    total = blocks.sum(0)
-    a = total[np.ix_(columns, columns)] * np.outer(s, s) + RIDGE * np.eye(len(columns))
-    a[0, 0] += precision
+    a = blocks.sum(0)[np.ix_(columns, columns)] * np.outer(s, s) + np.diag(prior.precision)
     inverse = np.linalg.inv(a)
     gradient = blocks[:, columns, 0] * s - np.einsum(
         "bij,j->bi", blocks[:, columns][:, :, columns] * np.outer(s, s), values
@@ -66,7 +86,9 @@ def covariance(
     return inverse * np.outer(ratio, ratio)
 
 
-def evidence(blocks: np.ndarray, base: list[int], added: list[int], scale: np.ndarray) -> Evidence:
+def evidence(
+    blocks: np.ndarray, base: list[int], added: list[int], scale: np.ndarray, prior: Prior | None = None
+) -> Evidence:
     """Compare a fit of ``base`` with one of ``base`` and ``added`` columns, on blocks left out.
 
     Args:
@@ -74,7 +96,10 @@ def evidence(blocks: np.ndarray, base: list[int], added: list[int], scale: np.nd
         base: columns that are free anyway.
         added: columns in question.
         scale: (c,) unit of each column.
+        prior: of ``base`` and ``added``, in this order.
     """
+    prior = prior or Prior.weak(len(base) + len(added))
+    few = prior.of(list(range(len(base))))
     count = len(blocks)
     fold = np.arange(count) % FOLDS
     total = blocks.sum(0)
@@ -83,8 +108,8 @@ def evidence(blocks: np.ndarray, base: list[int], added: list[int], scale: np.nd
     for f in range(FOLDS):
         test = fold == f
         train = total - blocks[test].sum(0)
-        less = _full(train.shape[0], base, solve(train, base, scale), scale) if base else np.zeros(train.shape[0])
-        more = _full(train.shape[0], both, solve(train, both, scale), scale)
+        less = _full(train.shape[0], base, solve(train, base, scale, few), scale) if base else np.zeros(train.shape[0])
+        more = _full(train.shape[0], both, solve(train, both, scale, prior), scale)
         g = blocks[test]
         r, z = -less, more - less
         r[0] = 1.0  # the residual itself, minus what the base explains
@@ -96,7 +121,7 @@ def evidence(blocks: np.ndarray, base: list[int], added: list[int], scale: np.nd
         white += float(np.sum(zz))
     # Innovations have unit variance; where they scatter more than that between blocks, the scatter counts.
     t = score / np.sqrt(max(noise, white, 1e-30))
-    return Evidence(gain, t, float(norm.sf(t)), solve(total, both, scale)[len(base) :])
+    return Evidence(gain, t, float(norm.sf(t)), solve(total, both, scale, prior)[len(base) :])
 
 
 def _full(size: int, columns: list[int], values: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS
 from cfb_mjx.sysid.tracing.acceptance import STRUCTURE, enough, lowered
 from cfb_mjx.sysid.tracing.columns import FORMULA, Column, term_columns
 from cfb_mjx.sysid.tracing.confirmation import confirm
-from cfb_mjx.sysid.tracing.evidence import covariance, solve
+from cfb_mjx.sysid.tracing.evidence import Prior, covariance, solve
 from cfb_mjx.sysid.tracing.fits import prediction_errors
 from cfb_mjx.sysid.tracing.hypothesis import LEAD_SPREAD, Hypothesis
 from cfb_mjx.sysid.tracing.search import Search
@@ -64,7 +64,8 @@ def fit_formula(search: Search, hypothesis: Hypothesis, terms: list[Column]) -> 
         index = linear.index(own)
         values = solve(linear.blocks.sum(0), index, linear.scale)
         richer = search.moved(richer, own, np.concatenate([[0.0], values * linear.scale[index]]))
-    spread = covariance(linear.blocks, [1, *index], linear.scale, np.concatenate([[0.0], values]), 1 / LEAD_SPREAD**2)
+    prior = Prior.weak(1 + len(index)).pulled(0, 0.0, 1 / LEAD_SPREAD**2)
+    spread = covariance(linear.blocks, [1, *index], linear.scale, np.concatenate([[0.0], values]), prior)
     deviation = np.sqrt(np.diag(spread))[1:] * linear.scale[index]
     return richer, deviation[len(own) - len(terms) :]
 

@@ -16,6 +16,7 @@ from cfb_mjx.sysid.evaluation import Evaluation, evaluate
 from cfb_mjx.sysid.flight import usual_delay
 from cfb_mjx.sysid.refinement.numbers import PLANT
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
+from cfb_mjx.sysid.tracing.acceptance import FAR_OFF
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.columns import FORMULA
 from cfb_mjx.sysid.tracing.confirmation import Verdict, confirm
@@ -202,7 +203,7 @@ def close_loop(
     delay = usual_delay(fit, parameters)
     speeds = all(log.rotor_speed is not None for log in fit)
     found = trace(fit, parameters, delay, progress, declared, checkpoint, 1 if speeds else PATIENCE)
-    if found.fit.beside_hold > RULES.far_off:
+    if found.fit.beside_hold > FAR_OFF:
         whole = _whole(found, fit, held_out, base, progress)
         if whole is not None:
             return whole

@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Array
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import CATALOGUE, Effect
+from cfb_mjx.model.effects import CATALOGUE, KNOWN, Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing import columns as cols
 from cfb_mjx.sysid.tracing.columns import LEAD, Column
-from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, evidence, solve
+from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, evidence, solve
 from cfb_mjx.sysid.tracing.gram import (
     driven_by,
     inner_products,
@@ -187,22 +187,29 @@ class Search:
         hypothesis = self.settled(hypothesis, rounds)
         return hypothesis, self.whole(hypothesis)
 
-    def settled(self, hypothesis: Hypothesis, rounds: int = 5, lead_free: bool = True) -> Hypothesis:
-        """Fit everything that is there together, the lead of the commands too unless it is to stay."""
+    def settled(
+        self, hypothesis: Hypothesis, rounds: int = 5, lead_free: bool = True, shrunk: bool = False
+    ) -> Hypothesis:
+        """Fit everything that is there together, the lead of the commands too unless it is to stay.
+
+        If ``shrunk``, towards where effects vanish, by half the range of what is plausible: of effects that say the
+        same none runs away then.
+        """
         for attempt in range(rounds - 1):
             # With half a limit's strength another shape of it seems to be what is missing.
             own = self.own_columns(hypothesis, guessed=attempt < GUESSED)
             linear = self.linearise(hypothesis, own)
             index = [1, *linear.index(own)]
             lead = linear.scale[1]
-            pull = 0, (LEAD_USUAL - hypothesis.lead) / lead, (lead / LEAD_SPREAD) ** 2
-            values = solve(linear.blocks.sum(0), index, linear.scale, pull)
+            known = Prior.weak(1) + (self.prior(hypothesis, own) if shrunk else Prior.weak(len(own)))
+            prior = known.pulled(0, (LEAD_USUAL - hypothesis.lead) / lead, (lead / LEAD_SPREAD) ** 2)
+            values = solve(linear.blocks.sum(0), index, linear.scale, prior)
             kept = np.clip(hypothesis.lead + lead_free * values[0] * lead, *LEAD_RANGE)
             if kept != hypothesis.lead + values[0] * lead:
                 # What the lead may not take the others have to explain.
-                fixed = 0, (kept - hypothesis.lead) / lead, 1e9
+                fixed = known.pulled(0, (kept - hypothesis.lead) / lead, 1e9)
                 values = solve(linear.blocks.sum(0), index, linear.scale, fixed)
-            deviation = np.sqrt(np.diag(covariance(linear.blocks, index, linear.scale, values, pull[2])))
+            deviation = np.sqrt(np.diag(covariance(linear.blocks, index, linear.scale, values, prior)))
             still = np.max(np.abs(values) / deviation) < STILL and own == self.own_columns(hypothesis)
             if attempt and still:
                 break
@@ -213,6 +220,20 @@ class Search:
                 if still and np.max(np.abs(hypothesis.levels - before)) < SAME_LEVELS:
                     break
         return hypothesis
+
+    def prior(self, hypothesis: Hypothesis, columns: list[Column]) -> Prior:
+        """Of steps: that numbers are not far, by half the range of what is plausible, from where effects vanish."""
+        away = []
+        for column in columns:
+            if column.effect == cols.SHIFT:
+                away.append(-hypothesis.shift / column.scale)
+                continue
+            here, there = (
+                np.asarray(getattr(effect, column.field))[... if column.index is None else column.index]
+                for effect in (hypothesis.effect(column.effect), KNOWN[column.effect].neutral())
+            )
+            away.append(float(there - here) / column.scale)
+        return Prior(np.array(away), np.ones(len(columns)))
 
     def moved(self, hypothesis: Hypothesis, own: list[Column], by: np.ndarray) -> Hypothesis:
         """The hypothesis after a step: the lead's first, then one for each of its columns."""

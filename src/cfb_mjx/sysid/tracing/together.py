@@ -55,8 +55,6 @@ MOTORS = (*OF_MOTORS, "motor_gain_mismatch", "motor_time_constant", "motor_secon
 class Rules:
     """What is tried and what stays; shares of the loss, an error over what `hold` errs."""
 
-    far_off: float = 1 / 3
-    """A model lacks much if, after half a second, it errs by more than this share of what hold errs."""
     steps: int = 12
     """Of a fit at most."""
     tried: int = 2

@@ -11,14 +11,15 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import KNOWN, Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.sensor_faults import SensorFaults
-from cfb_mjx.sysid.tracing.acceptance import CLEAR, LEAST_GAIN, material, significant, worth_it
+from cfb_mjx.sysid.tracing.acceptance import CLEAR, FAR_OFF, LEAST_GAIN, material, significant, worth_it
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint, Progress
 from cfb_mjx.sysid.tracing.columns import SHIFT, Column
 from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.contenders import CLOSE, contenders
-from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
+from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, solve
 from cfb_mjx.sysid.tracing.fits import ERRORS, Fit, as_it_is, completed, fitted
 from cfb_mjx.sysid.tracing.hypothesis import LEAD_SPREAD, Hypothesis, Linear
+from cfb_mjx.sysid.tracing.jointly import beside_each_other, borne_out, everything, one_by_one
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
 
@@ -26,6 +27,8 @@ RIVALS, AS_GOOD = 3, 0.03
 """So many effects are tried alone in place of several; no error may grow by more than this share."""
 LARGEST = 6
 """Effects at most."""
+MANY = 3
+"""So many that stand clearly beside each other and what was found are taken in together."""
 PATIENCE = 3
 """Candidates in a row that stand against chance but lower no error: then the search ends."""
 
@@ -81,9 +84,9 @@ class LeftOut:
     """For the effect itself; None if its best value makes no sense."""
 
 
-def leave_out(search: Search, hypothesis: Hypothesis, name: str) -> LeftOut:
-    """Fit without an effect and see what would come in its place."""
-    less = fitted(search, hypothesis.without(name))
+def leave_out(search: Search, hypothesis: Hypothesis, name: str, start: Hypothesis | None = None) -> LeftOut:
+    """Fit without an effect and see what would come in its place; the fit may ``start`` nearer to where it ends."""
+    less = fitted(search, start or hypothesis.without(name))
     ranking = rank(search, less, set())
     return LeftOut(less, ranking, next((e for e, v in ranking if v[0].effect == name), None))
 
@@ -116,7 +119,7 @@ def trace(
     progress("replaying the declared model")
     nothing = fitted(search, search.learned(search.nothing()))
     saved = checkpoint.restore(nothing.hypothesis)
-    fit, refused, tried, vain = nothing, set(), [], 0
+    fit, refused, tried, vain, lacking = nothing, set(), [], 0, False
     # Without which effects was a model fitted (None: it can be again), and which.
     left_out: dict[str, LeftOut | None] = {}
     judged = nothing.hypothesis
@@ -135,6 +138,11 @@ def trace(
         passing = [(e, v) for e, v in ranking if significant(e, len(search.names))]
         if not passing:
             break
+        if fit.hypothesis.present or vain:
+            many = lacks_many(search, fit, progress)
+            if many is not None:
+                fit, judged, left_out, lacking = many, many.hypothesis, {}, True
+                break
         options, stretched = contenders(search, fit, passing, progress)
         refused |= stretched
         statistic = {v[0].effect: e.t for e, v in passing}
@@ -153,15 +161,31 @@ def trace(
         else:
             vain += 1
         checkpoint.save(Progress(fit.hypothesis, frozenset(refused), tuple(tried), vain, tuple(left_out), judged))
-    if len(fit.hypothesis.present) > 1:
+    if len(fit.hypothesis.present) > 1 and not lacking:
         single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
         fit, left_out = (completed(search, single), {}) if single is not None else (fit, left_out)
     found = []
+    starts = {name: less for name, (_, less) in one_by_one(search, fit.hypothesis).items()} if lacking else {}
     for name in fit.hypothesis.present:
-        less = left_out.get(name) or leave_out(search, judged if name in left_out else fit.hypothesis, name)
+        whole = judged if name in left_out else fit.hypothesis
+        less = left_out.get(name) or leave_out(search, whole, name, starts.get(name))
         found.append(summary(search, fit, name, less))
     found.sort(key=lambda f: -f.buys)
     return Trace(fit.hypothesis, sensors, found, tried, search, nothing.errors, fit.errors, fit)
+
+
+def lacks_many(search: Search, fit: Fit, progress: Callable[[str], None]) -> Fit | None:
+    """All that a drone lacks, where that is much beside what was found; None where it is not, or predicts no better.
+
+    It begins with the declared model again, for what was taken in first has taken on what others explain.
+    """
+    standing = beside_each_other(search, fit.hypothesis, fit.linear)
+    if sum(each.found.t > CLEAR for each in standing) < MANY:
+        return None
+    whole = everything(search, progress)
+    if not (np.log(whole.errors / fit.errors).sum() < 0 and whole.beside_hold < FAR_OFF):
+        return None
+    return completed(search, borne_out(search, whole, progress))
 
 
 def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, list[Column]]]:
@@ -277,7 +301,8 @@ def deviations(search: Search, hypothesis: Hypothesis, linear: Linear) -> dict[C
     columns = search.own_columns(hypothesis)
     index = [1, *linear.index(columns)]
     values = solve(linear.blocks.sum(0), index, linear.scale)
-    spread = covariance(linear.blocks, index, linear.scale, values, (linear.scale[1] / LEAD_SPREAD) ** 2)
+    prior = Prior.weak(len(index)).pulled(0, 0.0, (linear.scale[1] / LEAD_SPREAD) ** 2)
+    spread = covariance(linear.blocks, index, linear.scale, values, prior)
     deviation = np.sqrt(np.diag(spread)) * linear.scale[index]
     return dict(zip(columns, deviation[1:].tolist(), strict=True))
 

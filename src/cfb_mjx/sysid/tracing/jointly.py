@@ -1,0 +1,231 @@
+"""Everything a drone lacks, from one look at its flights after another: all effects that stand beside each other.
+
+The inner products of `Search.whole` hold what every effect of the catalogue would explain, and what it has in common
+with every other. So a set of effects is put together without a fit: the one that gains most beside those chosen is
+added, and what is no longer needed beside it taken out, until none gains beyond chance. Then all are fitted, what the
+fit shows to be needless goes, and the flights are looked at again from there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cfb_mjx.model.effects import CATALOGUE
+from cfb_mjx.sysid.tracing.acceptance import CLEAR, SMALLEST_SHIFT, missed, significant
+from cfb_mjx.sysid.tracing.columns import SHIFT, Column
+from cfb_mjx.sysid.tracing.confirmation import confirm
+from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, evidence, solve
+from cfb_mjx.sysid.tracing.fits import Fit, as_it_is
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, Linear
+from cfb_mjx.sysid.tracing.search import Search
+
+ROUNDS = 5
+"""Looks at most."""
+STEPS = 12
+"""Of a fit at most: what is half way there makes others seem needless."""
+MOST = 20
+"""Effects at most in a look."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """One effect of a set.
+
+    Attributes:
+        variant: its columns.
+        found: for it beside those chosen before.
+    """
+
+    variant: list[Column]
+    found: Evidence
+
+    @property
+    def name(self) -> str:
+        """Of the effect."""
+        return self.variant[0].effect
+
+
+def beside_each_other(
+    search: Search, hypothesis: Hypothesis, linear: Linear, refused: Collection[str] = ()
+) -> list[Chosen]:
+    """Absent effects that stand beside what is there and beside each other, the largest gain first."""
+    own = search.own_columns(hypothesis)
+    base, prior = linear.index(own), search.prior(hypothesis, own)
+    absent = [v for v in search.candidates() if v[0].effect not in {*hypothesis.present, *refused}]
+    chosen: list[Chosen] = []
+
+    def beside(variant: list[Column], others: list[Chosen]) -> Evidence:
+        columns = [column for each in others for column in each.variant]
+        index = base + linear.index(columns)
+        known = prior + _near_zero(len(columns) + len(variant))
+        return evidence(linear.blocks, index, linear.index(variant), linear.scale, known)
+
+    def stands(variant: list[Column], found: Evidence) -> bool:
+        return significant(found, len(search.names)) and _sensible(variant, found)
+
+    while len(chosen) < MOST:
+        names = {each.name for each in chosen}
+        more = [(variant, beside(variant, chosen)) for variant in absent if variant[0].effect not in names]
+        more = [Chosen(variant, found) for variant, found in more if stands(variant, found)]
+        if not more:
+            break
+        newest = max(more, key=lambda each: each.found.gain)
+        kept = [*chosen, newest]
+        for each in chosen:
+            others = [other for other in kept if other is not each]
+            if not stands(each.variant, beside(each.variant, others)):
+                kept = others
+        # What pushed out others but gains less than they did would be pushed out by them again.
+        chosen = kept
+    return chosen
+
+
+def everything(search: Search, say: Callable[[str], None] = lambda _: None) -> Fit:
+    """All effects of the catalogue that the innovations ask for, fitted together, beginning with the declared model.
+
+    Args:
+        search: over the flights.
+        say: told what happens.
+    """
+    fit = as_it_is(search, search.learned(search.nothing()))
+    # Late motor columns look like every lag at once: only beside the motors' own lags can they be told.
+    refused, seen = {SHIFT}, {frozenset(fit.hypothesis.present)}
+    for _ in range(ROUNDS):
+        chosen = beside_each_other(search, fit.hypothesis, fit.linear, refused)
+        refused, richer = set(), None
+        while chosen and richer is None:
+            more, there = [each.name for each in chosen], fit.hypothesis.present
+            say(f"fitting {', '.join(more)} beside {', '.join(there) or 'nothing'}")
+            richer = _with(search, fit.hypothesis, fit.linear, chosen)
+            if not confirm(search, fit.hypothesis, richer).gain > 0:
+                # Too far for slopes: those that matter most first.
+                richer, chosen = None, chosen[: len(chosen) // 2]
+        if richer is None or frozenset(richer.present) in seen:
+            break
+        richer = as_it_is(search, richer)
+        if not _total(richer) < _total(fit):
+            break
+        fit = richer
+        seen.add(frozenset(fit.hypothesis.present))
+    return fit
+
+
+def borne_out(search: Search, fit: Fit, say: Callable[[str], None] = lambda _: None) -> Fit:
+    """What of many effects predictions miss: the others go one by one.
+
+    What goes is taken out to first order to see what the predictions say; of the two without which they are best each
+    is, with the rest fitted anew, for one of two that say nearly the same may stand in for the other.
+    """
+    while len(fit.hypothesis.present) > 1:
+        worth = {}
+        for name, (found, without) in one_by_one(search, fit.hypothesis).items():
+            less = as_it_is(search, without, whole=False)
+            if not missed(less, fit, found.t >= CLEAR):
+                worth[name] = _total(less)
+        if not worth:
+            return fit
+        least = sorted(worth, key=worth.get)[:2]
+        say(f"leaving out {' or '.join(least)}")
+        tried = [search.settled(fit.hypothesis.without(name), STEPS, shrunk=True) for name in least]
+        fit = min((as_it_is(search, each, whole=False) for each in tried), key=_total)
+    return fit
+
+
+def one_by_one(search: Search, hypothesis: Hypothesis) -> dict[str, tuple[Evidence, Hypothesis]]:
+    """For each effect that is there, and the hypothesis without it, the others moved to make up: to first order."""
+    own = search.own_columns(hypothesis)
+    linear = search.linearise(hypothesis, own)
+    return {
+        name: (
+            _for_what_is_there(search, hypothesis, linear, own, name, ()),
+            _taken_out(search, hypothesis, linear, own, name),
+        )
+        for name in hypothesis.present
+    }
+
+
+def _total(fit: Fit) -> float:
+    """Sum of the logarithms of the prediction errors; infinite where predictions diverge."""
+    found = float(np.log(fit.errors).sum())
+    return found if np.isfinite(found) else np.inf
+
+
+def needless(search: Search, hypothesis: Hypothesis) -> dict[str, Evidence]:
+    """What is there and does not stand beside the rest, by the slopes where it is; the least first."""
+    own = search.own_columns(hypothesis)
+    linear, gone = search.linearise(hypothesis, own), {}
+    while True:
+        left = {
+            name: _for_what_is_there(search, hypothesis, linear, own, name, gone)
+            for name in hypothesis.present
+            if name not in gone
+        }
+        small = SHIFT in left and abs(hypothesis.shift) < SMALLEST_SHIFT
+        doubted = {
+            name: found
+            for name, found in left.items()
+            if not significant(found, len(search.names)) or (name == SHIFT and small)
+        }
+        if not doubted:
+            return gone
+        least = min(doubted, key=lambda name: doubted[name].gain)
+        gone[least] = doubted[least]
+
+
+def _with(search: Search, hypothesis: Hypothesis, linear: Linear, chosen: list[Chosen]) -> Hypothesis:
+    """The hypothesis with more effects, all fitted, less what the fit shows to be needless."""
+    own = search.own_columns(hypothesis)
+    columns = [column for each in chosen for column in each.variant]
+    index = linear.index([*own, *columns])
+    prior = search.prior(hypothesis, own) + _near_zero(len(columns))
+    values = iter(solve(linear.blocks.sum(0), index, linear.scale, prior)[len(own) :])
+    for each in chosen:
+        start = replace(each.found, values=np.array([next(values) for _ in each.variant]))
+        hypothesis = search.with_candidate(hypothesis, each.variant, start)
+    hypothesis = search.settled(hypothesis, STEPS, shrunk=True)
+    gone = needless(search, hypothesis)
+    for name in gone:
+        hypothesis = hypothesis.without(name)
+    return search.settled(hypothesis, STEPS, shrunk=True) if gone else hypothesis
+
+
+def _for_what_is_there(
+    search: Search, hypothesis: Hypothesis, linear: Linear, own: list[Column], name: str, gone: Collection[str]
+) -> Evidence:
+    """For an effect as it is: the residual is what it would be, to first order, if the effect vanished."""
+    added = [c for c in own if c.effect == name and (name == SHIFT or c.field in CATALOGUE[name].strengths)]
+    others = [c for c in own if c.effect != name and c.effect not in gone]
+    blocks = _put_back(search, hypothesis, linear, [c for c in own if c in added or c.effect in gone])
+    prior = search.prior(hypothesis, others) + _near_zero(len(added))
+    return evidence(blocks, linear.index(others), linear.index(added), linear.scale, prior)
+
+
+def _taken_out(search: Search, hypothesis: Hypothesis, linear: Linear, own: list[Column], name: str) -> Hypothesis:
+    """The hypothesis without an effect, the others moved to make up for it to first order."""
+    away, others = [c for c in own if c.effect == name], [c for c in own if c.effect != name]
+    total = _put_back(search, hypothesis, linear, away).sum(0)
+    index = linear.index(others)
+    steps = solve(total, index, linear.scale, search.prior(hypothesis, others)) * linear.scale[index]
+    return search.moved(hypothesis.without(name), others, np.append(0.0, steps))
+
+
+def _put_back(search: Search, hypothesis: Hypothesis, linear: Linear, away: list[Column]) -> np.ndarray:
+    """(b, c, c) inner products with the residual that is left, to first order, where some numbers are neutral."""
+    back, index = np.eye(linear.blocks.shape[1]), linear.index(away)
+    back[index, 0] = -search.prior(hypothesis, away).center * linear.scale[index]
+    return np.einsum("ki,bkl,lj->bij", back, linear.blocks, back, optimize=True)
+
+
+def _near_zero(count: int) -> Prior:
+    return Prior(np.zeros(count), np.ones(count))
+
+
+def _sensible(variant: list[Column], found: Evidence) -> bool:
+    """Whether the sign makes sense."""
+    if variant[0].effect == SHIFT:
+        return True
+    low = CATALOGUE[variant[0].effect].prior[variant[0].field][0]
+    return low < 0 or bool(np.all(found.values >= 0))
