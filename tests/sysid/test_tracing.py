@@ -26,7 +26,7 @@ from cfb_mjx.sysid.tracing.evidence import evidence
 from cfb_mjx.sysid.tracing.formula import with_library
 from cfb_mjx.sysid.tracing.given import fit_given
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
-from cfb_mjx.sysid.tracing.jointly import beside_each_other, everything, needless
+from cfb_mjx.sysid.tracing.jointly import beside_each_other, everything, needless, one_by_one
 from cfb_mjx.sysid.tracing.lines import find_lines
 from cfb_mjx.sysid.tracing.outcome import close_loop
 from cfb_mjx.sysid.tracing.residuals import residual_rows
@@ -43,7 +43,6 @@ MANY = (
     ("rotor_drag", 0.6),
     ("thrust_scale", 0.6),
     ("cog_offset", 0.5),
-    ("motor_time_constant", 1.0),
     ("gyroscopic", 0.6),
     ("thrust_tilt", 0.6),
 )
@@ -409,29 +408,32 @@ def test_play_of_the_speed_controllers_is_named_with_its_width(campaigns, base):
     assert float(play.width * play.share) == pytest.approx(truth["play"] * truth["play_share"], rel=0.4)
 
 
-def test_many_effects_are_taken_in_together(campaigns, base):
-    """More than a search that takes in one after the other would end with, each with its own number."""
+def test_many_effects_are_found_at_once(campaigns, base):
+    """As many as a search that takes in one after the other ends with, each with its own number."""
     campaign = campaigns["many"]
-    said = []
-    found = trace(campaign.fit, base.parameters(), 0.008, said.append)
-    assert sorted(found.hypothesis.present) == campaign.case.labels
-    assert any(line.startswith("fitting ") for line in said)
+    search = Search.start(campaign.fit, base.parameters(), 0.008, check_sensors(campaign.fit, 0.008, 0.0))
+    found = everything(search)
+    assert set(campaign.case.labels) <= set(found.hypothesis.present)
+    assert len(found.hypothesis.present) < len(campaign.case.labels) + 2
+    assert found.beside_hold < 0.2
     truth, model = campaign.truth["effects"], found.hypothesis.effect
     assert float(model("thrust_scale").relative) == pytest.approx(truth["thrust_scale"]["thrust_scale"] - 1, rel=0.1)
-    np.testing.assert_allclose(model("cog_offset").offset, truth["cog_offset"]["cog"][:2], atol=2e-5)
+    np.testing.assert_allclose(model("cog_offset").offset, truth["cog_offset"]["cog"][:2], atol=1e-4)
     assert float(model("prop_damage").motor) == truth["prop_damage"]["motor"]
-    for item in found.found:
-        assert item.buys > 0.05, item.name
+    # To first order each is missed.
+    for name, (evidence_for, without) in one_by_one(search, found.hypothesis).items():
+        assert name not in campaign.case.labels or evidence_for.t > 5
+        assert name not in without.present
 
 
 def test_what_stands_beside_others_is_told_from_what_stands_in_for_them(campaigns, base):
-    """Of a drone with a drag alone, much gains beside the declared model and nothing beside the drag."""
+    """Of a drone with one drag two stand beside the declared model, and one beside the other."""
     campaign = campaigns["drag"]
     search = Search.start(campaign.fit, base.parameters(), 0.008, check_sensors(campaign.fit, 0.008, 0.0))
     nothing = search.learned(search.nothing())
     linear = search.whole(nothing)
     alone = {name for name, (found, _) in search.probes(nothing, linear).items() if found.gain > 20 and found.t > 5}
-    assert len(alone) > 3
+    assert {"rotor_drag", "parasitic_drag"} <= alone
     assert [each.name for each in beside_each_other(search, nothing, linear, {"sensor_time_shift"})][:1] == [
         "rotor_drag"
     ]
