@@ -285,7 +285,7 @@ def _row(group: list[dict]) -> str:
 
 
 def _strongest(line: dict) -> dict:
-    return max(line["found"], key=lambda item: item.get("buys", 1.0))
+    return line["found"][0]
 
 
 def _detail(line: dict, what: str) -> str:

@@ -57,7 +57,7 @@ def with_rare(found: Trace, held_out: Search, progress: Callable[[str], None] = 
     for name in fit.hypothesis.present:
         item = summary(search, fit, name, leave_out(search, fit.hypothesis, name))
         kept.append(replace(item, buys=max(item.buys, buys.get(name, 0.0))))
-    kept.sort(key=lambda item: -item.buys)
+    kept.sort(key=lambda item: (-item.lowers, -item.buys))
     return replace(found, hypothesis=fit.hypothesis, found=kept, errors=fit.errors, fit=fit)
 
 

@@ -48,6 +48,9 @@ class Found:
     confusable: list[str] = field(default_factory=list)
     without: Hypothesis | None = None
     """The best model without this effect, for judging it on other flights."""
+    lowers: float = 0.0
+    """Sum of the logarithms by which the prediction errors of the fit flights grow without it: the order goes by that,
+    for the largest share is that of one error."""
 
 
 @dataclass
@@ -170,7 +173,7 @@ def trace(
         whole = judged if name in left_out else fit.hypothesis
         less = left_out.get(name) or leave_out(search, whole, name, starts.get(name))
         found.append(summary(search, fit, name, less))
-    found.sort(key=lambda f: -f.buys)
+    found.sort(key=lambda f: -f.lowers)
     return Trace(fit.hypothesis, sensors, found, tried, search, nothing.errors, fit.errors, fit)
 
 
@@ -333,7 +336,8 @@ def summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
         explained = max(gain, confirm(search, less.fit.hypothesis, fit.hypothesis).gain)
         rivals = {rival: its for rival, its in rivals.items() if its > (1 - CLOSE) * explained}
     buys = float(np.max(1 - fit.errors / less.fit.errors))
-    return Found(name, p_value, gain, buys, parameters, uncertainty, list(rivals), less.fit.hypothesis)
+    lowers = float(np.log(less.fit.errors / fit.errors).sum())
+    return Found(name, p_value, gain, buys, parameters, uncertainty, list(rivals), less.fit.hypothesis, lowers)
 
 
 def line_of(variant: list[Column], found: Evidence) -> dict:
