@@ -155,3 +155,28 @@ def test_a_spread_about_zero_is_drawn_in_the_numbers_own_unit(tmp_path):
     ((name, spread),) = load_randomisation(tmp_path / "type.yaml").ranges
     assert (name, spread.relative) == ("center_of_gravity", False)
     assert spread.half_width == pytest.approx((np.sqrt(3) * 1e-3, np.sqrt(3) * 1e-3, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("spread", "complaint"),
+    [
+        ({"coefficient": "wide"}, r"effects\.rotor_drag\.spread\.coefficient = 'wide' must be 1 finite"),
+        ({"coefficient": -0.1}, r"spread\.coefficient = -0\.1 must be 1 finite number\(s\), zero or positive"),
+        ({"coefficient": [0.1, 0.2]}, r"spread\.coefficient = \[0\.1, 0\.2\] must be 1 finite"),
+        ({"coeficient": 0.1}, r"unknown key 'effects\.rotor_drag\.spread\.coeficient'"),
+        (0.1, r"effects\.rotor_drag\.spread must be a mapping, found 0\.1"),
+    ],
+)
+def test_a_spread_that_is_none_is_refused_with_its_place(of_type, spread, complaint):
+    file = load_model_file(of_type)
+    effects = ({"name": "rotor_drag", "parameters": {"coefficient": 0.015}, "spread": spread},)
+    with pytest.raises(CfbError, match=complaint):
+        Quadrotor.from_file(replace(file, effects=effects))
+
+
+def test_a_declared_effect_may_leave_out_what_is_neutral(of_type):
+    """Its spread too: what is left out does not differ from drone to drone."""
+    file = load_model_file(of_type)
+    effects = ({"name": "blade_flapping", "parameters": {"coefficient": -6e-4}, "spread": {"coefficient": 5e-5}},)
+    nominal = Quadrotor.from_file(replace(file, effects=effects))
+    assert nominal.effects[0].power == type(nominal.effects[0]).neutral().power

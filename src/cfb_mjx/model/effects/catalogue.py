@@ -205,7 +205,31 @@ def effect_from_mapping(item: Mapping[str, Any], where: str, parameters: Paramet
         if key in kind.limits:
             kind.limits[key].check(value, f"{where}: effects.{name}.parameters.{key}", kind.units[key], warn=True)
         arguments[key] = value
+    for what in ("uncertainty", "spread"):
+        _check_widths(
+            item.get(what), {field: np.shape(arguments[field]) for field in fields}, f"effects.{name}.{what}", where
+        )
     return kind(**arguments)
+
+
+def _check_widths(widths: Any, shapes: Mapping[str, tuple[int, ...]], what: str, where: str) -> None:
+    """Refuse standard deviations of an effect's fields that are none; null where one is not known."""
+    if widths is None:
+        return
+    if not isinstance(widths, Mapping):
+        raise CfbError(f"{where}: {what} must be a mapping, found {told(widths)}.")
+    for field, raw in widths.items():
+        if field not in shapes:
+            if what.endswith("uncertainty"):  # of a field of an earlier version; nothing reads it
+                continue
+            raise CfbError(f"{where}: unknown key '{what}.{field}'; known are {', '.join(sorted(shapes))}.")
+        try:
+            value = np.asarray(raw, dtype=np.float64)
+        except (TypeError, ValueError):
+            value = np.asarray(-1.0)
+        if value.shape not in ((), shapes[field]) or np.any(value < 0) or np.any(np.isinf(value)):
+            count = int(np.prod(shapes[field]))
+            raise CfbError(f"{where}: {what}.{field} = {told(raw)} must be {count} finite number(s), zero or positive.")
 
 
 def effect_to_mapping(effect: Effect) -> dict[str, Any]:

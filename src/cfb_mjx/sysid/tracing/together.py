@@ -237,8 +237,9 @@ def of_type(base: ModelFile, spreads: float) -> tuple[Number, ...]:
 
     def said(number: Number, what: str) -> float:
         value = (items[number.effect].get(what) or {}).get(number.field)
-        each = np.atleast_1d(np.asarray(0.0 if value is None else value, dtype=float))
-        return float(np.nan_to_num(each)[number.index or 0])
+        each = np.nan_to_num(np.atleast_1d(np.asarray(0.0 if value is None else value, dtype=float)))
+        # One number stands for all components.
+        return float(each[(number.index or 0) % len(each)])
 
     found = []
     for number in plausible_numbers(model.parameters, list(items)):
