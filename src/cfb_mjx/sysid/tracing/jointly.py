@@ -99,9 +99,11 @@ def everything(search: Search, say: Callable[[str], None] = lambda _: None) -> F
         while chosen and richer is None:
             more, there = [each.name for each in chosen], fit.hypothesis.present
             say(f"fitting {', '.join(more)} beside {', '.join(there) or 'nothing'}")
-            richer = _with(search, fit.hypothesis, fit.linear, chosen)
-            if not confirm(search, fit.hypothesis, richer).gain > 0:
-                # Too far for slopes: those that matter most first.
+            with np.errstate(over="ignore", invalid="ignore"):
+                richer = _with(search, fit.hypothesis, fit.linear, chosen)
+                gain = confirm(search, fit.hypothesis, richer).gain
+            if not gain > 0:
+                # Too far for slopes, if not beyond all numbers: those that matter most first.
                 richer, chosen = None, chosen[: len(chosen) // 2]
         if richer is None or frozenset(richer.present) in seen:
             break
