@@ -53,10 +53,10 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
         flown = fly_campaigns(batch + twins)
         perfect = {c.case.name: c for c in flown[len(batch) :]}
         # Programs of every shape met would pile up until the process may map no more memory; they are kept on disk.
-        jax.clear_caches()
         for campaign in flown[: len(batch)]:
             if campaign.case.name in traced(results, again):
                 continue
+            jax.clear_caches()
             began = time.perf_counter()
             outcome = close_loop(campaign.fit, campaign.held_out, base)
             seconds = time.perf_counter() - began

@@ -69,7 +69,7 @@ AIR = {
     "thrust_tilt": ThrustTilt([0.04, -0.03], 0.05),
     "rotor_drag": RotorDrag(0.04),
     "parasitic_drag": ParasiticDrag(0.0, 0.01),
-    "blade_flapping": BladeFlapping(8e-4, [0.3, -0.2], 0.2, 1.7),
+    "blade_flapping": BladeFlapping(8e-4, [0.3, -0.2], 0.2, 1.7, 0.3, -0.15),
     "wind": Wind([2.0, -1.0, 0.5], 0.03),
     "rate_damping": RateDamping(1.5e-4),
     "position_moment": PositionMoment([4e-4, -3e-4]),
@@ -128,8 +128,8 @@ def _wrench(constants, y, on, time, conductance=0.03):
         force -= 0.01 * np.abs(v) * v
     if "blade_flapping" in on:
         along_x, along_y = np.exp(np.array([0.3, -0.2]) * v[2])
-        hub = np.array([-0.8 * v[1] * along_y, 1.2 * v[0] * along_x, 0.0])
-        torque += 8e-4 * (speed.mean() / 1594) ** 1.7 * hub
+        hub = np.array([-0.8 * v[1] * along_y, 1.2 * v[0] * along_x, 0.0]) + 0.3 * v * [1.0, 1.0, 0.0]
+        torque += 8e-4 * (speed.mean() / 1594) ** 1.7 * np.exp(-0.15 * np.sqrt(v[0] ** 2 + v[1] ** 2 + 1e-4)) * hub
     if "rate_damping" in on:
         torque -= 1.5e-4 * speed.mean() / 1594 * rate * [1.0, 1.0, 0.0]
     if "wind" in on:
@@ -457,6 +457,16 @@ def test_rate_limit_ramps(uneven, guards):
         if dt > 0:
             np.testing.assert_allclose(mean, np.mean(path, axis=0), atol=1e-6)
     assert 0 < reached < commands.size
+
+
+@pytest.mark.parametrize("velocity", [[1.2, -0.7, 0.4], [0.0, 2.0, 0.0]])
+def test_a_hub_moment_with_a_cross_part_is_one_that_is_turned(guards, velocity):
+    """By an angle whose tangent it is, however the drone moves."""
+    c, s = np.cos(0.4), np.sin(0.4)
+    state = State.at_rest(velocity=jnp.asarray(velocity), rotor_speed=jnp.full(4, 1594.0))
+    straight = _felt(guards, (BladeFlapping(2e-4, 0.0),), state)[3:]
+    turned = _felt(guards, (BladeFlapping(2e-4 * c, 0.0, cross=s / c),), state)[3:]
+    np.testing.assert_allclose(turned, np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ straight, rtol=1e-9, atol=1e-18)
 
 
 @pytest.mark.parametrize("share", [1.0, 0.4])

@@ -2,13 +2,16 @@
 
 The disc tilts or, on stiff blades, the hub is twisted:
 
-    tau_x = -(1 - anisotropy) c exp(climb_y v_z) v_y,  tau_y = (1 + anisotropy) c exp(climb_x v_z) v_x
-    c = coefficient (Omega / 1594 rad/s)^power
+    tau_x = c (-(1 - anisotropy) exp(climb_y v_z) v_y + cross v_x)
+    tau_y = c ((1 + anisotropy) exp(climb_x v_z) v_x + cross v_y)
+    c = coefficient (Omega / 1594 rad/s)^power exp(fading |v_xy|)
 
 with v the velocity through the air, in body axes, and the mean rotor speed. The sign is free, because stiffness and the
 height of the discs over the rotors' centre pull in opposite directions. ``climb`` lets the moments depend on the flow
 through the discs, without ever turning them round. With ``anisotropy`` flow along the body twists it more than flow
-from the side, for what sits between the rotors (battery, decks) is longer than wide.
+from the side, for what sits between the rotors (battery, decks) is longer than wide. A disc flaps late, and so its
+moment is turned, the way it spins: over four rotors that cancels but for what makes them unequal, and is ``cross``.
+Where the wake is blown away the moment grows less than in proportion: ``fading`` is below zero.
 """
 
 from __future__ import annotations
@@ -24,9 +27,12 @@ from cfb_mjx.model.effects.fields import mean_hover_ratio, number, vector
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 
+STILL = 0.01
+"""m/s."""
+
 
 class BladeFlapping(Effect):
-    """tau = coefficient (Omega / 1594)^power (-(1 - anisotropy) v_y, (1 + anisotropy) v_x, 0) exp(climb v_z)."""
+    """Tau = c (cross v_x - (1 - anisotropy) v_y, cross v_y + (1 + anisotropy) v_x, 0), weaker or stronger in climb."""
 
     name: ClassVar[str] = "blade_flapping"
     meaning: ClassVar[str] = "sideways motion tilts the rotor discs and turns the body"
@@ -38,6 +44,8 @@ class BladeFlapping(Effect):
         "climb": "s/m",
         "anisotropy": "1",
         "power": "1",
+        "cross": "1",
+        "fading": "s/m",
     }
     source: ClassVar[str] = (
         "R. Mahony, V. Kumar, P. Corke, Multirotor aerial vehicles, IEEE RAM 19(3), 2012; G. Hoffmann, H. Huang, S."
@@ -49,17 +57,23 @@ class BladeFlapping(Effect):
         "climb": (-0.5, 0.5),
         "anisotropy": (-0.5, 0.5),
         "power": (0.0, 3.0),
+        "cross": (-0.5, 0.5),
+        "fading": (-0.3, 0.3),
     }
     limits: ClassVar[dict[str, Limits]] = {
         "coefficient": Limits(-0.1, 0.1, -0.004, 0.004),
         "climb": Limits(-2.0, 2.0, -1.5, 1.5),
         "anisotropy": Limits(-1.0, 1.0, -1.0, 1.0),
         "power": Limits(-2.0, 6.0, -0.5, 4.0),
+        "cross": Limits(-10.0, 10.0, -1.5, 1.5),
+        "fading": Limits(-2.0, 2.0, -1.0, 1.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
     feels_air: ClassVar[bool] = True
-    # Both are looked for at zero, and fitted once the moment is there.
-    probes: ClassVar[tuple[dict[str, float], ...]] = ({"climb": 0.0, "anisotropy": 0.0, "power": 1.0},)
+    # All are looked for at zero, the power at theory's, and fitted once the moment is there.
+    probes: ClassVar[tuple[dict[str, float], ...]] = (
+        {"climb": 0.0, "anisotropy": 0.0, "power": 1.0, "cross": 0.0, "fading": 0.0},
+    )
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
     """Of the four rotors together at hover speed."""
@@ -69,6 +83,10 @@ class BladeFlapping(Effect):
     """By which share pitching moments exceed, and rolling moments fall short of, their mean."""
     power: Float[Array, "*batch"] = eqx.field(converter=number, default=1.0)
     """Of the mean rotor speed: 1 as blade theory has it at a fixed pitch, 2 in proportion to thrust."""
+    cross: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
+    """Moment about the direction of motion over the moment across it."""
+    fading: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
+    """Relative change of the moments per airspeed along the discs."""
 
     @classmethod
     def neutral(cls) -> BladeFlapping:
@@ -76,7 +94,10 @@ class BladeFlapping(Effect):
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         vx, vy, vz = condition.airspeed_body
-        c = self.coefficient * mean_hover_ratio(condition) ** self.power
+        # Smooth where the drone stands still in the air.
+        along = jnp.sqrt(vx**2 + vy**2 + STILL**2)
+        c = self.coefficient * mean_hover_ratio(condition) ** self.power * jnp.exp(self.fading * along)
         along_x, along_y = (jnp.exp(climb * vz) for climb in Vec.unstack(self.climb))
-        roll = -(1 - self.anisotropy) * c * along_y * vy
-        return Wrench(wrench.force, wrench.torque + Vec(roll, (1 + self.anisotropy) * c * along_x * vx, 0.0))
+        roll = self.cross * vx - (1 - self.anisotropy) * along_y * vy
+        pitch = self.cross * vy + (1 + self.anisotropy) * along_x * vx
+        return Wrench(wrench.force, wrench.torque + Vec(c * roll, c * pitch, 0.0))

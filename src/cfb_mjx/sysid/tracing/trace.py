@@ -113,7 +113,7 @@ def trace(
         declared: effects the declared model has already.
         checkpoint: where the search is kept while it runs, and taken up from.
         patience: so many candidates in a row that lower no error end the search while the model predicts worse than
-            `hold` does; it ends after `PATIENCE` in any case.
+            `hold` does; it ends after `PATIENCE` in any case. With 1 what lacks much is left to who asks.
     """
     checkpoint = checkpoint or Checkpoint()
     progress("comparing the sensors with each other")
@@ -141,7 +141,7 @@ def trace(
         passing = [(e, v) for e, v in ranking if significant(e, len(search.names))]
         if not passing:
             break
-        if fit.hypothesis.present or vain:
+        if (fit.hypothesis.present or vain) and patience > 1:
             many = lacks_many(search, fit, progress)
             if many is not None:
                 fit, judged, left_out, lacking = many, many.hypothesis, {}, True
