@@ -463,7 +463,8 @@ def test_rate_limit_ramps(uneven, guards):
 def test_a_hub_moment_with_a_cross_part_is_one_that_is_turned(guards, velocity):
     """By an angle whose tangent it is, however the drone moves."""
     c, s = np.cos(0.4), np.sin(0.4)
-    state = State.at_rest(velocity=jnp.asarray(velocity), rotor_speed=jnp.full(4, 1594.0))
+    still = State.at_rest(rotor_speed=jnp.full(4, 1594.0))
+    state = dataclasses.replace(still, velocity=jnp.asarray(velocity))
     straight = _felt(guards, (BladeFlapping(2e-4, 0.0),), state)[3:]
     turned = _felt(guards, (BladeFlapping(2e-4 * c, 0.0, cross=s / c),), state)[3:]
     np.testing.assert_allclose(turned, np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]) @ straight, rtol=1e-9, atol=1e-18)
