@@ -70,6 +70,7 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
                 "after": _pick(outcome.after.metrics("commands_in")),
                 "seconds": seconds,
                 "again": again,
+                "version": environment()["cfb_mjx"],
             }
             if campaign.case.name in perfect:
                 from cfb_mjx.model import Quadrotor
@@ -128,6 +129,7 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
         if len(lines) == planned
         else f"{len(lines)} of {planned} campaigns of the sweep have been traced so far, in an order of no meaning; "
         "the command goes on with the rest.",
+        *_traced_by(lines),
         *_traced_again(lines),
         "",
         "Campaigns of 10 to 11 flights by an independent simulator (`cfb_mjx.labelled_plants`, NumPy, closed loop)",
@@ -167,6 +169,12 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
         text += ["", "Not as it should be there:", "", "| there | strengths | buys | found | recovered | unexplained |"]
         text += ["|---|---|---|---|---|---|", *(_detail(x, x["name"]) for x in lines if not _right(x))]
     return "\n".join([*text, ""])
+
+
+def _traced_by(lines: list[dict]) -> list[str]:
+    """Which versions of the search traced how many."""
+    counts = Counter(line.get("version", "0.1.0") for line in lines)
+    return ["Traced by " + ", ".join(f"cfb_mjx {version}: {count}" for version, count in sorted(counts.items())) + "."]
 
 
 def _traced_again(lines: list[dict]) -> list[str]:

@@ -55,14 +55,19 @@ class MotorHysteresis(Effect):
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
         steady = (rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
-        return (steady.map(lambda u: jnp.clip(u, 0.0, 1.0)),)
+        return steady.map(lambda u: jnp.clip(u, 0.0, 1.0)), 0.0 * steady
 
     def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
-        (last,) = memory
+        last, place = memory
         # Comparison instead of maximum: at zero the derivative is that of a growing play.
         width = jnp.where(self.width >= 0, self.width, 0.0)
-        # In this order the command decides where there is no play.
-        output = command.map(
-            lambda u, y: jnp.where(y < u - width, u - width, jnp.where(y > u + width, u + width, y)), last
-        )
-        return command + self.share * (output - command), (output,)
+        there = width > 0
+
+        def placed(u, before, z):
+            # Where in its play an output is, -1 to 1: so that without play it has a slope, and the command is as it is.
+            moved = u - before
+            at_end = jnp.where(moved > 0, -1.0, jnp.where(moved < 0, 1.0, z))
+            return jnp.where(there, jnp.clip(z - moved / jnp.where(there, width, 1.0), -1.0, 1.0), at_end)
+
+        place = command.map(placed, last, place)
+        return command + (self.share * width) * place, (command, place)
