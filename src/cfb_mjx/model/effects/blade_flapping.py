@@ -28,7 +28,7 @@ from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 
 STILL = 0.01
-"""m/s."""
+"""m/s: a drone at rest in the air moves so fast along its discs, that its speed there has a slope."""
 
 
 class BladeFlapping(Effect):
@@ -94,7 +94,6 @@ class BladeFlapping(Effect):
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         vx, vy, vz = condition.airspeed_body
-        # Smooth where the drone stands still in the air.
         along = jnp.sqrt(vx**2 + vy**2 + STILL**2)
         c = self.coefficient * mean_hover_ratio(condition) ** self.power * jnp.exp(self.fading * along)
         along_x, along_y = (jnp.exp(climb * vz) for climb in Vec.unstack(self.climb))

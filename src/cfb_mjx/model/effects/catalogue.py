@@ -194,42 +194,49 @@ def effect_from_mapping(item: Mapping[str, Any], where: str, parameters: Paramet
             raise CfbError(
                 f"{where}: unknown key 'effects.{name}.parameters.{key}'; known are {', '.join(sorted(fields))}."
             )
-        try:
-            value = np.asarray(raw, dtype=np.float64)
-        except (TypeError, ValueError):
-            value = np.asarray(np.nan)
         shape = np.shape(arguments[key])
-        if not np.all(np.isfinite(value)) or value.shape not in ((), shape):
+        value = _numbers(raw, shape)
+        if value is None or not np.all(np.isfinite(value)):
             count = int(np.prod(shape))
             raise CfbError(f"{where}: effects.{name}.parameters.{key} = {told(raw)} must be {count} finite number(s).")
         if key in kind.limits:
             kind.limits[key].check(value, f"{where}: effects.{name}.parameters.{key}", kind.units[key], warn=True)
         arguments[key] = value
     for what in ("uncertainty", "spread"):
-        _check_widths(
-            item.get(what), {field: np.shape(arguments[field]) for field in fields}, f"effects.{name}.{what}", where
-        )
+        _check_widths(item, what, neutral, where)
     return kind(**arguments)
 
 
-def _check_widths(widths: Any, shapes: Mapping[str, tuple[int, ...]], what: str, where: str) -> None:
-    """Refuse standard deviations of an effect's fields that are none; null where one is not known."""
+def _numbers(raw: Any, shape: tuple[int, ...]) -> np.ndarray | None:
+    """What is written of a field, one number or all of ``shape`` (null: NaN); None if it is neither."""
+    try:
+        value = np.asarray(raw, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return value if value.shape in ((), shape) else None
+
+
+def _check_widths(item: Mapping[str, Any], what: str, neutral: Effect, where: str) -> None:
+    """Refuse standard deviations of an effect's fields that are none; null where one is not known.
+
+    An ``uncertainty`` may be of a field of an earlier version, for nothing is drawn from it.
+    """
+    widths, at = item.get(what), f"effects.{neutral.name}.{what}"
     if widths is None:
         return
     if not isinstance(widths, Mapping):
-        raise CfbError(f"{where}: {what} must be a mapping, found {told(widths)}.")
-    for field, raw in widths.items():
-        if field not in shapes:
-            if what.endswith("uncertainty"):  # of a field of an earlier version; nothing reads it
-                continue
-            raise CfbError(f"{where}: unknown key '{what}.{field}'; known are {', '.join(sorted(shapes))}.")
-        try:
-            value = np.asarray(raw, dtype=np.float64)
-        except (TypeError, ValueError):
-            value = np.asarray(-1.0)
-        if value.shape not in ((), shapes[field]) or np.any(value < 0) or np.any(np.isinf(value)):
-            count = int(np.prod(shapes[field]))
-            raise CfbError(f"{where}: {what}.{field} = {told(raw)} must be {count} finite number(s), zero or positive.")
+        raise CfbError(f"{where}: {at} must be a mapping, found {told(widths)}.")
+    known = {field.name for field in dataclasses.fields(neutral)}
+    if what == "spread" and (unknown := sorted(map(str, set(widths) - known))):
+        raise CfbError(f"{where}: unknown key '{at}.{unknown[0]}'; known are {', '.join(sorted(known))}.")
+    for field in known & set(widths):
+        shape = np.shape(getattr(neutral, field))
+        value = _numbers(widths[field], shape)
+        if value is None or np.any(value < 0) or np.any(np.isinf(value)):
+            count = int(np.prod(shape))
+            raise CfbError(
+                f"{where}: {at}.{field} = {told(widths[field])} must be {count} finite number(s), zero or positive."
+            )
 
 
 def effect_to_mapping(effect: Effect) -> dict[str, Any]:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect, Memory
-from cfb_mjx.model.effects.fields import number
+from cfb_mjx.model.effects.fields import command_before, number
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
@@ -65,8 +65,7 @@ class CommandDelay(Effect):
         return self._steady(rotor_speed, parameters, ROWS)
 
     def _steady(self, rotor_speed: Vec, parameters: Parameters, rows: int) -> Memory:
-        steady = (rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
-        steady = steady.map(lambda u: jnp.clip(u, 0.0, 1.0))
+        steady = command_before(rotor_speed, parameters)
         age = jnp.zeros_like(rotor_speed[0])
         # Commands that began at the same instant had no time to act, save the oldest, which has acted for ever.
         return Vec(*(age,) * rows), *(steady,) * rows

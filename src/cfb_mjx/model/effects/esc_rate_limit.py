@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect, Memory, Motors
-from cfb_mjx.model.effects.fields import number
+from cfb_mjx.model.effects.fields import command_before, number
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
@@ -61,8 +61,7 @@ class EscRateLimit(Effect):
         return jnp.where(self.slowness >= 0, self.slowness, 0.0)
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
-        steady = (rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
-        return (steady.map(lambda u: jnp.clip(u, 0.0, 1.0)),)
+        return (command_before(rotor_speed, parameters),)
 
     def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
         (last,) = memory

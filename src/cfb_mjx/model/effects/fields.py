@@ -47,6 +47,12 @@ def hub_velocities(condition: Condition) -> tuple[Vec, Vec, Vec]:
     return vx + wz * -y, vy + wz * x, vz + wx * y + wy * -x
 
 
+def command_before(rotor_speed: Vec, parameters: Parameters) -> Vec:
+    """Commands, 0 to 1, of a long steady flight at ``rotor_speed`` (rad/s)."""
+    steady = (rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
+    return steady.map(lambda u: jnp.clip(u, 0.0, 1.0))
+
+
 def mean_hover_ratio(condition: Condition):
     """Mean rotor speed over `HOVER_SPEED`."""
     return condition.rotor_speed.sum() * (0.25 / HOVER_SPEED)

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect, Memory
-from cfb_mjx.model.effects.fields import number
+from cfb_mjx.model.effects.fields import command_before, number
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
@@ -54,8 +54,7 @@ class MotorHysteresis(Effect):
         return cls(width=0.0)
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
-        steady = (rotor_speed - parameters.motor_speed_offset) / parameters.motor_gain
-        return steady.map(lambda u: jnp.clip(u, 0.0, 1.0)), 0.0 * steady
+        return command_before(rotor_speed, parameters), 0.0 * rotor_speed
 
     def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
         last, place = memory
