@@ -434,15 +434,23 @@ def test_what_stands_beside_others_is_told_from_what_stands_in_for_them(campaign
     linear = search.whole(nothing)
     alone = {name for name, (found, _) in search.probes(nothing, linear).items() if found.gain > 20 and found.t > 5}
     assert {"rotor_drag", "parasitic_drag"} <= alone
-    assert [each.name for each in beside_each_other(search, nothing, linear, {"sensor_time_shift"})][:1] == [
-        "rotor_drag"
-    ]
+    assert beside_each_other(search, nothing, linear, {"sensor_time_shift"})[0].name == "rotor_drag"
     found = everything(search).hypothesis
     assert found.present[0] == "rotor_drag"
     assert len(found.present) < 3
     # An effect that is not there is seen to be needless, the one that is not.
     both = search.settled(found.having(CATALOGUE["thrust_tilt"](tilt=[0.01, 0.0], twist=0.0)))
     assert set(needless(search, both)) == {"thrust_tilt"}
+
+
+def test_what_is_taken_out_goes_back_to_the_declared_model(campaigns, base):
+    """Not to nothing: a declared drag that was found to be larger is as declared without that finding."""
+    logs, parameters = campaigns["drag"].fit[:1], base.parameters()
+    search = Search.start(logs, parameters, 0.008, check_sensors(logs, 0.008, 0.0), (RotorDrag(0.02),))
+    found = search.nothing().having(RotorDrag(0.03))
+    (column,) = strengths("rotor_drag")[0]
+    assert search.prior(found, [column]).center * column.scale == pytest.approx([-0.01])
+    assert float(found.without("rotor_drag").effect("rotor_drag").coefficient) == pytest.approx(0.02)
 
 
 def test_the_innovations_contradict_what_predictions_only_wish_for(campaigns, base):

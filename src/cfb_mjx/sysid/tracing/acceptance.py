@@ -75,10 +75,9 @@ def missed(poorer: Fit, richer: Fit, clear: bool) -> bool:
 
     What the declared model scores, far off with many effects missing, is no measure of that.
     """
-    share = MATERIAL
-    if enough(poorer.errors, richer.errors, poorer.errors, share, share):
+    if np.max(1 - richer.errors / poorer.errors) >= MATERIAL:
         return True
-    return clear and enough(poorer.by_flight, richer.by_flight, poorer.by_flight, 2 * share, 2 * share)
+    return clear and bool(np.max(1 - richer.by_flight / poorer.by_flight) >= 2 * MATERIAL)
 
 
 def enough(poorer: np.ndarray, better: np.ndarray, first: np.ndarray, share: float, of_first: float) -> bool:

@@ -83,6 +83,14 @@ def bounds(name: str, item: str) -> tuple[float, float]:
     return max(low, kind.limits[item].soft_low), min(high, kind.limits[item].hard_high)
 
 
+def sensible(variant: list[Column], values: np.ndarray) -> bool:
+    """Whether strengths have a sign that makes sense."""
+    if variant[0].effect == SHIFT:
+        return True
+    low = KNOWN[variant[0].effect].prior[variant[0].field][0]
+    return low < 0 or bool(np.all(values >= 0))
+
+
 def coarse(name: str) -> bool:
     """Whether an effect's slope at zero says little of its strength."""
     return name in KNOWN and bool(KNOWN[name].coarse)

@@ -38,6 +38,10 @@ class Hypothesis:
         """The effect of that name."""
         return next(e for e in self.effects if type(e).name == name)
 
+    def declared(self, name: str) -> Effect:
+        """The effect of that name as the declared model has it: neutral, where it has none."""
+        return next(e for e in self.origin if type(e).name == name)
+
     def model(self, parameters: Parameters) -> Quadrotor:
         """The drone of this hypothesis, with every effect of the catalogue (most of them neutral)."""
         return Quadrotor(parameters, self.effects)

@@ -15,7 +15,7 @@ import numpy as np
 
 from cfb_mjx.model.effects import CATALOGUE
 from cfb_mjx.sysid.tracing.acceptance import CLEAR, SMALLEST_SHIFT, missed, significant
-from cfb_mjx.sysid.tracing.columns import SHIFT, Column
+from cfb_mjx.sysid.tracing.columns import SHIFT, Column, sensible
 from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, evidence, solve
 from cfb_mjx.sysid.tracing.fits import Fit, as_it_is
@@ -27,7 +27,7 @@ ROUNDS = 5
 STEPS = 12
 """Of a fit at most: what is half way there makes others seem needless."""
 MOST = 20
-"""Effects at most in a look."""
+"""Effects taken in at most in a look."""
 
 
 @dataclass(frozen=True)
@@ -64,22 +64,21 @@ def beside_each_other(
         return evidence(linear.blocks, index, linear.index(variant), linear.scale, known)
 
     def stands(variant: list[Column], found: Evidence) -> bool:
-        return significant(found, len(search.names)) and _sensible(variant, found)
+        return significant(found, len(search.names)) and sensible(variant, found.values)
 
-    while len(chosen) < MOST:
+    # So many times: what pushed out others may in turn be pushed out by those that came after.
+    for _ in range(MOST):
         names = {each.name for each in chosen}
         more = [(variant, beside(variant, chosen)) for variant in absent if variant[0].effect not in names]
         more = [Chosen(variant, found) for variant, found in more if stands(variant, found)]
         if not more:
             break
         newest = max(more, key=lambda each: each.found.gain)
-        kept = [*chosen, newest]
-        for each in chosen:
-            others = [other for other in kept if other is not each]
+        before, chosen = chosen, [*chosen, newest]
+        for each in before:
+            others = [other for other in chosen if other is not each]
             if not stands(each.variant, beside(each.variant, others)):
-                kept = others
-        # What pushed out others but gains less than they did would be pushed out by them again.
-        chosen = kept
+                chosen = others
     return chosen
 
 
@@ -215,7 +214,7 @@ def _taken_out(search: Search, hypothesis: Hypothesis, linear: Linear, own: list
 
 
 def _put_back(search: Search, hypothesis: Hypothesis, linear: Linear, away: list[Column]) -> np.ndarray:
-    """(b, c, c) inner products with the residual that is left, to first order, where some numbers are neutral."""
+    """(b, c, c) inner products with the residual that is left, to first order, where some numbers are as declared."""
     back, index = np.eye(linear.blocks.shape[1]), linear.index(away)
     back[index, 0] = -search.prior(hypothesis, away).center * linear.scale[index]
     return np.einsum("ki,bkl,lj->bij", back, linear.blocks, back, optimize=True)
@@ -223,11 +222,3 @@ def _put_back(search: Search, hypothesis: Hypothesis, linear: Linear, away: list
 
 def _near_zero(count: int) -> Prior:
     return Prior(np.zeros(count), np.ones(count))
-
-
-def _sensible(variant: list[Column], found: Evidence) -> bool:
-    """Whether the sign makes sense."""
-    if variant[0].effect == SHIFT:
-        return True
-    low = CATALOGUE[variant[0].effect].prior[variant[0].field][0]
-    return low < 0 or bool(np.all(found.values >= 0))

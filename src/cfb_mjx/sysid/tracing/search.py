@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import CATALOGUE, KNOWN, Effect
+from cfb_mjx.model.effects import CATALOGUE, Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.sensor_faults import SensorFaults
@@ -192,8 +192,8 @@ class Search:
     ) -> Hypothesis:
         """Fit everything that is there together, the lead of the commands too unless it is to stay.
 
-        If ``shrunk``, towards where effects vanish, by half the range of what is plausible: of effects that say the
-        same none runs away then.
+        If ``shrunk``, towards the declared model, by half the range of what is plausible: of effects that say the same
+        none runs away then.
         """
         for attempt in range(rounds - 1):
             # With half a limit's strength another shape of it seems to be what is missing.
@@ -222,7 +222,7 @@ class Search:
         return hypothesis
 
     def prior(self, hypothesis: Hypothesis, columns: list[Column]) -> Prior:
-        """Of steps: that numbers are not far, by half the range of what is plausible, from where effects vanish."""
+        """Of steps: that numbers are not far, by half the range of what is plausible, from the declared ones."""
         away = []
         for column in columns:
             if column.effect == cols.SHIFT:
@@ -230,7 +230,7 @@ class Search:
                 continue
             here, there = (
                 np.asarray(getattr(effect, column.field))[... if column.index is None else column.index]
-                for effect in (hypothesis.effect(column.effect), KNOWN[column.effect].neutral())
+                for effect in (hypothesis.effect(column.effect), hypothesis.declared(column.effect))
             )
             away.append(float(there - here) / column.scale)
         return Prior(np.array(away), np.ones(len(columns)))
@@ -258,10 +258,7 @@ class Search:
         # Not beside a free lead: late commands would look like one.
         base = linear.index(self.own_columns(hypothesis))
         found = evidence(linear.blocks, base, linear.index(variant), linear.scale)
-        if variant[0].effect == cols.SHIFT:
-            return found
-        low = CATALOGUE[variant[0].effect].prior[variant[0].field][0]
-        return None if low >= 0 and np.any(found.values < 0) else found
+        return found if cols.sensible(variant, found.values) else None
 
     def probes(self, hypothesis: Hypothesis, linear: Linear) -> dict[str, tuple[Evidence, list[Column]]]:
         """Every absent effect whose sign makes sense, at the probe that gains most."""

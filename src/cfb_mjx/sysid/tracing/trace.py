@@ -113,7 +113,7 @@ def trace(
         declared: effects the declared model has already.
         checkpoint: where the search is kept while it runs, and taken up from.
         patience: so many candidates in a row that lower no error end the search while the model predicts worse than
-            `hold` does; it ends after `PATIENCE` in any case. With 1 what lacks much is left to who asks.
+            `hold` does; it ends after `PATIENCE` in any case. With 1 a drone that lacks much is left to the caller.
     """
     checkpoint = checkpoint or Checkpoint()
     progress("comparing the sensors with each other")
@@ -122,10 +122,12 @@ def trace(
     progress("replaying the declared model")
     nothing = fitted(search, search.learned(search.nothing()))
     saved = checkpoint.restore(nothing.hypothesis)
-    fit, refused, tried, vain, lacking = nothing, set(), [], 0, False
+    fit, refused, tried, vain = nothing, set(), [], 0
     # Without which effects was a model fitted (None: it can be again), and which.
     left_out: dict[str, LeftOut | None] = {}
     judged = nothing.hypothesis
+    # Of many taken in together: near to where a fit without one of them ends.
+    starts: dict[str, Hypothesis] = {}
     if saved is not None:
         progress(f"going on with {', '.join(saved.hypothesis.present) or 'no effect'} found before the interruption")
         fit, judged = as_it_is(search, saved.hypothesis), saved.judged
@@ -144,7 +146,8 @@ def trace(
         if (fit.hypothesis.present or vain) and patience > 1:
             many = lacks_many(search, fit, progress)
             if many is not None:
-                fit, judged, left_out, lacking = many, many.hypothesis, {}, True
+                fit, left_out = many, {}
+                starts = {name: less for name, (_, less) in one_by_one(search, fit.hypothesis).items()}
                 break
         options, stretched = contenders(search, fit, passing, progress)
         refused |= stretched
@@ -164,11 +167,10 @@ def trace(
         else:
             vain += 1
         checkpoint.save(Progress(fit.hypothesis, frozenset(refused), tuple(tried), vain, tuple(left_out), judged))
-    if len(fit.hypothesis.present) > 1 and not lacking:
+    if len(fit.hypothesis.present) > 1 and not starts:
         single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
         fit, left_out = (completed(search, single), {}) if single is not None else (fit, left_out)
     found = []
-    starts = {name: less for name, (_, less) in one_by_one(search, fit.hypothesis).items()} if lacking else {}
     for name in fit.hypothesis.present:
         whole = judged if name in left_out else fit.hypothesis
         less = left_out.get(name) or leave_out(search, whole, name, starts.get(name))
