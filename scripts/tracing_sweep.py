@@ -37,10 +37,12 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
     """Fly, trace and append one line per campaign; those traced before too if ``again``."""
     import jax
 
+    from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid.evaluation import evaluate
     from cfb_mjx.sysid.tracing.outcome import close_loop
 
     base = load_model_file("cfb-guards")
+    declared = Quadrotor.from_file(base)
     while True:
         # Read anew: another process may be at the other end.
         done = traced(results, again)
@@ -52,10 +54,10 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
         twins = [Case(case.name, case.seed, ()) for case in batch if case.effects]
         flown = fly_campaigns(batch + twins)
         perfect = {c.case.name: c for c in flown[len(batch) :]}
-        # Programs of every shape met would pile up until the process may map no more memory; they are kept on disk.
         for campaign in flown[: len(batch)]:
             if campaign.case.name in traced(results, again):
                 continue
+            # Programs of every shape met would pile up until the process may map no more memory; they are kept on disk.
             jax.clear_caches()
             began = time.perf_counter()
             outcome = close_loop(campaign.fit, campaign.held_out, base)
@@ -73,15 +75,13 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
                 "version": environment()["cfb_mjx"],
             }
             if campaign.case.name in perfect:
-                from cfb_mjx.model import Quadrotor
-
-                twin = evaluate(Quadrotor.from_file(base), perfect[campaign.case.name].held_out)
+                twin = evaluate(declared, perfect[campaign.case.name].held_out)
                 line["perfect"] = _pick(twin.metrics("commands_in"))
                 if _many(line):
-                    line["alone"] = {}
-                    for name, case in alone(campaign.case).items():
-                        one = evaluate(Quadrotor.from_file(base), fly_campaigns([case])[0].held_out)
-                        line["alone"][name] = achievable(_pick(one.metrics("commands_in")), line["perfect"])
+                    each = alone(campaign.case)
+                    ones = [evaluate(declared, one.held_out) for one in fly_campaigns(list(each.values()))]
+                    before = [_pick(one.metrics("commands_in")) for one in ones]
+                    line["alone"] = {n: achievable(b, line["perfect"]) for n, b in zip(each, before, strict=True)}
             if campaign.case.name in traced(results, again):  # by the other process, meanwhile
                 continue
             with results.open("a") as file:
