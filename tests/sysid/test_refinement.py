@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.refinement import Number, free_numbers, plausible_numbers, refine
 from cfb_mjx.sysid.refinement.fitting import _prepared
 from cfb_mjx.sysid.refinement.numbers import INERTIA, with_values
-from cfb_mjx.sysid.refinement.predictions import TRIM, Predictions, kinds_alike
+from cfb_mjx.sysid.refinement.predictions import TRIM, Predictions, _unwrapped, kinds_alike
 from cfb_mjx.sysid.repeatability import repeated
 
 pytestmark = pytest.mark.xdist_group("refinement")
@@ -242,3 +243,23 @@ def test_a_load_on_a_string_is_found_from_far_off():
     assert value["payload_swing.mass"] == pytest.approx(truth["bob_mass"], rel=0.05)
     assert value["payload_swing.length"] == pytest.approx(truth["bob_length"], rel=0.05)
     assert abs(value["payload_swing.pivot"]) < 1e-3
+
+
+def test_numbers_too_short_for_differences_are_refused(campaign):
+    numbers = plausible_numbers(GUARDS(), ("rotor_drag",))
+    with jax.enable_x64(False), pytest.raises(CfbError, match="64-bit"):
+        refine(Quadrotor(GUARDS()), campaign.fit, numbers)
+
+
+@pytest.mark.parametrize("angle", [3.0, np.pi - 1e-4, np.pi - 1e-9])
+def test_a_slope_sees_no_jump_where_half_a_circle_is_passed(angle):
+    """A drone that has turned over errs by half a circle one way or the other."""
+    axis, sizes = np.array([0.6, 0.0, 0.8]), np.array([[0.1, 1.0]])
+    near = np.array([[angle * axis / 0.1, np.zeros(3)]])
+    for step in (1e-3, -1e-3):
+        beyond = angle + step
+        said = beyond if beyond < np.pi else beyond - 2 * np.pi
+        found = np.array([[said * axis / 0.1, np.ones(3)]])
+        plain = _unwrapped(found, near, sizes)
+        np.testing.assert_allclose(plain[0, 0], beyond * axis / 0.1, rtol=1e-9)
+        np.testing.assert_array_equal(plain[0, 1], found[0, 1])

@@ -14,9 +14,9 @@ from cfb_mjx.logs import FlightLog, require_own_names
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.sysid import metrics
 from cfb_mjx.sysid.disturbance import observed_model
-from cfb_mjx.sysid.flight import delay_of
+from cfb_mjx.sysid.flight import delay_of, prepare_flight
 from cfb_mjx.sysid.observer import Observer, at_starts, observe
-from cfb_mjx.sysid.prediction import hold, predict, select, start_of_windows
+from cfb_mjx.sysid.prediction import hold, predict, select, starts_of_windows
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 from cfb_mjx.sysid.windows import Windows, find_windows
 
@@ -111,8 +111,10 @@ def evaluate(
     require_own_names(logs)
     precise = Quadrotor(model.parameters, model.effects, body=model.body, integrator="rk4", rotor_loads="instant")
     results = []
-    for index, log in enumerate(logs):
-        results.append(_evaluate_log(precise, log, horizons, observer, faults, over))
+    recordings = [_Recording.of(precise, log, horizons, faults) for log in logs]
+    began = _starts(precise, recordings)
+    for index, recording in enumerate(recordings):
+        results.append(_evaluate_log(precise, recording, began[index], horizons, observer, over))
         if not keep_diverged:
             _refuse_diverged(results[-1])
         if progress is not None:
@@ -135,24 +137,55 @@ def _refuse_diverged(result: LogEvaluation) -> None:
             )
 
 
+@dataclass(frozen=True)
+class _Recording:
+    """A log before anything is predicted: its windows as recorded, and as a healthy chain would have recorded them."""
+
+    as_logged: FlightLog
+    log: FlightLog
+    delay: float
+    gyro_delay: float
+    recorded: Windows
+    windows: Windows
+    faults: SensorFaults
+
+    @classmethod
+    def of(cls, model: Quadrotor, log: FlightLog, horizons: tuple[float, ...], faults: SensorFaults) -> _Recording:
+        delay, gyro_delay = delay_of(log, model.parameters), float(model.parameters.gyro_delay)
+        recorded = find_windows(log, horizons, delay, gyro_delay)
+        repaired, reached = faults.repaired(log), faults.reached(horizons)
+        windows = recorded if faults.healthy else find_windows(repaired, reached, delay, gyro_delay, recorded.start)
+        return cls(log, repaired, delay, gyro_delay, recorded, windows, faults)
+
+
+def _starts(model: Quadrotor, recordings: Sequence[_Recording]) -> list[tuple[np.ndarray, tuple]]:
+    """Rotor speeds and memories at the windows' starts of every log; nothing where there are none."""
+    there = [i for i, each in enumerate(recordings) if len(each.windows)]
+    found: list[tuple[np.ndarray, tuple]] = [(np.zeros((0, 4)), ())] * len(recordings)
+    if there:
+        chosen = [recordings[i] for i in there]
+        flights = [prepare_flight(each.log, each.delay, each.gyro_delay) for each in chosen]
+        began = starts_of_windows(model, [e.log for e in chosen], [e.windows for e in chosen], flights)
+        for i, start in zip(there, began, strict=True):
+            found[i] = start
+    return found
+
+
 def _evaluate_log(
     model: Quadrotor,
-    log: FlightLog,
+    recording: _Recording,
+    at_start: tuple[np.ndarray, tuple],
     horizons: tuple[float, ...],
     observer: Observer | None,
-    faults: SensorFaults,
     over: Devices | None,
 ) -> LogEvaluation:
-    delay, gyro_delay = delay_of(log, model.parameters), float(model.parameters.gyro_delay)
-    recorded = find_windows(log, horizons, delay, gyro_delay)
-    reached, as_logged = faults.reached(horizons), log
-    log = faults.repaired(log)
-    windows = recorded if faults.healthy else find_windows(log, reached, delay, gyro_delay, recorded.start)
-    began = faults.began(as_logged, windows, delay)
+    log, delay, faults = recording.log, recording.delay, recording.faults
+    recorded, windows = recording.recorded, recording.windows
+    began = faults.began(recording.as_logged, windows, delay)
     measured = np.isfinite(windows.rotor_speed).all(axis=(1, 2))
     predictions: dict[str, State | None] = dict.fromkeys(VARIANTS + OBSERVED)
     if len(windows):
-        start, memory = start_of_windows(model, log, windows, delay)
+        start, memory = at_start
         predictions["commands_in"] = predict(model, windows, start, memory, over)
         predictions["rotor_speed_in"] = _measured_in(model, windows, measured, memory, over)
         predictions["hold"] = hold(recorded, horizons)
@@ -168,7 +201,7 @@ def _evaluate_log(
         else metrics.errors(select(recorded, measured) if variant.startswith("rotor") else recorded, predicted)
         for variant, predicted in predictions.items()
     }
-    return LogEvaluation(log, delay, gyro_delay, recorded, measured, predictions, errors)
+    return LogEvaluation(log, delay, recording.gyro_delay, recorded, measured, predictions, errors)
 
 
 def _measured_in(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -15,7 +16,7 @@ from cfb_mjx.model.quadrotor import Quadrotor, begin, commanded_path, integrate_
 from cfb_mjx.model.state import State, stack, unstack
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.sysid.flight import Flight, prepare_flight
-from cfb_mjx.sysid.replay import remembered
+from cfb_mjx.sysid.replay import remembered_along, rotors_alone
 from cfb_mjx.sysid.windows import Windows
 
 WINDOWS_PER_BLOCK, STEPS_PER_BLOCK = 128, 160
@@ -99,20 +100,33 @@ def start_of_windows(model: Quadrotor, log: FlightLog, windows: Windows, delay: 
     Both come from the commands since the log began and from what the log measured before each start, never after.
     """
     flight = prepare_flight(log, delay, float(model.parameters.gyro_delay))
-    # Indexing in NumPy: the number of windows differs from log to log, and the program should not.
-    speed, memory = jax.tree.map(lambda x: np.asarray(x)[windows.row], _remembered(model, flight))
-    # A start that is a row's own time may fall a rounding before it.
-    since = np.maximum(windows.start - log.time[windows.row], 0.0)
-    command = np.clip(log.command[windows.row], 0, 1)
-    count = len(windows)
-    blocks = WINDOWS_PER_BLOCK * -(-count // WINDOWS_PER_BLOCK)
-    inputs = jax.tree.map(lambda x: _pad(x, blocks), (speed, memory, command, since))
-    return jax.tree.map(lambda x: np.asarray(x)[:count], _advance_rotors(model, *inputs))
+    return starts_of_windows(model, [log], [windows], [flight])[0]
 
 
-@eqx.filter_jit
-def _remembered(model: Quadrotor, flight: Flight):
-    return remembered(model, flight, jnp.zeros(()))
+def starts_of_windows(
+    model: Quadrotor, logs: Sequence[FlightLog], windows: Sequence[Windows], flights: Sequence[Flight]
+) -> list[tuple[np.ndarray, tuple]]:
+    """`start_of_windows` of several logs, walked along side by side; ``flights`` are the same logs, prepared."""
+    known = remembered_along(model, flights)
+    found = []
+    for log, own, (speed, memory) in zip(logs, windows, known, strict=True):
+        # A start that is a row's own time may fall a rounding before it.
+        since = np.maximum(own.start - log.time[own.row], 0.0)
+        found.append((speed[own.row], jax.tree.map(lambda x, r=own.row: x[r], memory), log.command[own.row], since))
+    ends = np.cumsum([len(own) for own in windows])
+    count = int(ends[-1])
+    if not count:
+        return [part[:2] for part in found]
+    speed, memory, command, since = jax.tree.map(lambda *x: np.concatenate(x), *found)
+    inputs = speed, memory, np.clip(command, 0, 1), since
+    parts = []
+    for first in range(0, count, WINDOWS_PER_BLOCK):
+        # One program serves any number of windows.
+        block = jax.tree.map(lambda x, f=first: _pad(x[f : f + WINDOWS_PER_BLOCK], WINDOWS_PER_BLOCK), inputs)
+        parts.append(jax.tree.map(np.asarray, _advance_rotors(rotors_alone(model), *block)))
+    every = jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
+    pieces = zip(ends - [len(own) for own in windows], ends, strict=True)
+    return [jax.tree.map(lambda x, a=a, b=b: x[a:b], every) for a, b in pieces]
 
 
 @eqx.filter_jit

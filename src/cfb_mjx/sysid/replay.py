@@ -7,6 +7,9 @@ functions it has in simulation.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -28,7 +31,7 @@ from cfb_mjx.model.quadrotor import (
 )
 from cfb_mjx.model.state import State, unstack
 from cfb_mjx.model.vector import Vec, rotate
-from cfb_mjx.sysid.flight import Flight
+from cfb_mjx.sysid.flight import Flight, in_groups
 
 
 def next_row(x: Array) -> Array:
@@ -69,6 +72,21 @@ def remembered(model: Quadrotor, flight: Flight, lead: Float[Array, ""]) -> tupl
     """Rotor speeds (n, 4) from commands, and the memories of all effects (arrays with leading axis n), at each row."""
     out, memory = _scan(model, flight, flight.rotor_speed, lead)
     return out.rotor_speed, memory
+
+
+def remembered_along(model: Quadrotor, flights: Sequence[Flight], lead: float = 0.0) -> list[tuple[np.ndarray, tuple]]:
+    """`remembered` of several flights, walked along side by side."""
+    return in_groups(partial(_remembered, rotors_alone(model), jnp.asarray(lead)), flights)
+
+
+def rotors_alone(model: Quadrotor) -> Quadrotor:
+    """The model however its body is integrated, for which one program serves all: rotors do not depend on that."""
+    return Quadrotor(model.parameters, model.effects, model.body, dt=model.dt, substeps=model.substeps)
+
+
+@eqx.filter_jit
+def _remembered(model: Quadrotor, lead: Array, flights: Flight):
+    return jax.vmap(lambda flight: remembered(model, flight, lead))(flights)
 
 
 def _scan(model: Quadrotor, flight: Flight, driven, lead):

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -200,8 +201,10 @@ def refine(
         progress: told what happens.
 
     Raises:
-        CfbError: no numbers, or no log allows a window.
+        CfbError: no numbers, no 64-bit numbers, or no log that allows a window.
     """
+    if not jax.config.jax_enable_x64:
+        raise CfbError('refine needs 64-bit numbers: jax.config.update("jax_enable_x64", True) before anything else.')
     if not numbers:
         raise CfbError("refine needs at least one number to fit; name an effect.")
     numbers = tuple(numbers)
@@ -261,4 +264,4 @@ def _prepared(model: Quadrotor, numbers: tuple[Number, ...]) -> Quadrotor:
 
 def _trimmed(model: Quadrotor) -> Quadrotor:
     effects = (*model.effects, Trim(jnp.zeros(3)))
-    return Quadrotor(model.parameters, effects, body=model.body, integrator="rk4", rotor_loads="instant")
+    return Quadrotor(model.parameters, effects, body=model.body, rotor_loads="instant")

@@ -25,6 +25,8 @@ INERTIA = 0.25
 """Largest plausible change of a moment of inertia, as a share: what decks and another battery bring about."""
 HELD = 1e-12
 """By so much a number that is held may move: its scale must not be nothing."""
+STEP = 1e-5
+"""Of a finite difference, in a number's scale."""
 AIR = 1.2
 """Density, kg/m^3."""
 
@@ -63,6 +65,11 @@ class Number:
     def held(self) -> bool:
         """Whether it may not move."""
         return self.high - self.low <= 4 * HELD
+
+    def step(self, value: float) -> float:
+        """Of a finite difference at a value: upwards, unless that leaves the range."""
+        step = STEP * self.scale
+        return step if value + step <= self.high else -step
 
     def of(self, model: Quadrotor) -> float:
         """Its value in a model."""

@@ -18,10 +18,10 @@ from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.model.effects import Condition, Effect, Wrench
 from cfb_mjx.model.effects.base import overrides
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.sysid.flight import MEASURED_SHARE, delay_of
+from cfb_mjx.sysid.flight import MEASURED_SHARE, Flight, delay_of, prepare_flight
 from cfb_mjx.sysid.metrics import BLOCK, errors
-from cfb_mjx.sysid.prediction import hold, predict_one, start_of_windows
-from cfb_mjx.sysid.refinement.numbers import Number, with_values
+from cfb_mjx.sysid.prediction import hold, predict_one, starts_of_windows
+from cfb_mjx.sysid.refinement.numbers import STEP, Number, with_values
 from cfb_mjx.sysid.windows import Windows, find_starts, find_windows
 
 HORIZONS = (0.1, 0.2, 0.3, 0.4, 0.5)
@@ -35,10 +35,10 @@ AT_BOUND = 1e-3
 """A number this near to a bound, in its scale, stands at it."""
 ALIKE = 2.0
 """Factor between the errors of `hold` within which two flights are of one kind."""
-STEP = 1e-3
-"""Of a finite difference, in a number's scale."""
-CHUNK = 128
-_STEPS = 128
+CHUNK = 64
+GROUP = 12
+"""Models predicted side by side."""
+_STEPS = 64
 
 
 class Trim(Effect):
@@ -137,8 +137,8 @@ class Predictions:
     """(F,) what flights count, 1 on average."""
     sizes: Array
     """(H, 2) what `hold` errs: attitude rad, velocity m/s."""
-    flown: tuple[tuple[FlightLog, float, Windows], ...]
-    """Of every flight: its log, the age of its pose, its windows."""
+    flown: tuple[tuple[FlightLog, Windows, Flight], ...]
+    """Of every flight: its log, its windows, and its rows prepared."""
 
     @classmethod
     def of(cls, model: Quadrotor, logs: Sequence[FlightLog], share: np.ndarray, most: int | None = None) -> Predictions:
@@ -148,10 +148,14 @@ class Predictions:
         starts = [find_starts(log, HORIZONS, delay, gyro_delay) for log, delay in zip(logs, delays, strict=True)]
         each = np.inf if most is None else most / len(logs)
         flown = [
-            (log, delay, find_windows(log, HORIZONS, delay, gyro_delay, own[:: max(1, round(len(own) / each))]))
+            (
+                log,
+                find_windows(log, HORIZONS, delay, gyro_delay, own[:: max(1, round(len(own) / each))]),
+                prepare_flight(log, delay, gyro_delay),
+            )
             for log, delay, own in zip(logs, delays, starts, strict=True)
         ]
-        held = [_norms(hold(windows, HORIZONS), windows) for _, _, windows in flown if len(windows)]
+        held = [_norms(hold(windows, HORIZONS), windows) for _, windows, _ in flown if len(windows)]
         if not held:
             names = ", ".join(log.name for log in logs)
             raise CfbError(f"{names}: no prediction window fits; a log must fly at least 1.2 s without a gap.")
@@ -160,10 +164,11 @@ class Predictions:
 
     def started(self, model: Quadrotor) -> Predictions:
         """The same windows, with rotor speeds and memories at their starts as a model says they were."""
-        flights = [
-            (windows, *(start_of_windows(model, log, windows, delay) if len(windows) else ((), ())))
-            for log, delay, windows in self.flown
-        ]
+        there = [each for each in self.flown if len(each[1])]
+        # A trim remembers nothing; without it the program is that of any evaluation.
+        plain = Quadrotor(model.parameters, model.effects[:-1], model.body)
+        began = ((speed, (*memory, ())) for speed, memory in starts_of_windows(plain, *zip(*there, strict=True)))
+        flights = [(windows, *(next(began) if len(windows) else ((), ()))) for _, windows, _ in self.flown]
         kinds = (_part(flights, self.share, measured) for measured in (False, True))
         return replace(self, parts=[part for part in kinds if part is not None])
 
@@ -210,23 +215,27 @@ class Predictions:
         count, flights = len(numbers), len(trims)
         width = count + 3 * flights
         matrix, gradient, scatter = np.zeros((width, width)), np.zeros(width), np.zeros((width, width))
-        scale = np.array([n.scale for n in numbers])
-        here = jnp.asarray(values), jnp.asarray(scale)
+        model = with_values(model, numbers, values)
+        # What may not move needs no slope.
+        free = [k for k, n in enumerate(numbers) if not n.held]
+        steps = np.array([numbers[k].step(values[k]) for k in free])
+        moved = [with_values(model, numbers, _but(values, k, by)) for k, by in zip(free, steps, strict=True)]
         # Where an effect's memory follows the flights, its numbers also act by what is remembered at a window's start.
         kept = {type(e).name for e in model.effects if overrides(e, "follow")}
-        moved = {k: self._moved(model, numbers, values, k) for k, n in enumerate(numbers) if n.effect in kept}
-        # Other bounds are no reason to compile anew.
-        numbers = tuple(replace(n, low=-1.0, high=1.0) for n in numbers)
+        began = {i: self.started(moved[i]) for i, k in enumerate(free) if numbers[k].effect in kept}
+        along = np.concatenate([[numbers[k].scale for k in free] / steps, np.full(3, 1 / STEP)])
         for place, part in enumerate(self.parts):
-            found = [
-                _linearised(model, numbers, *here, chunk, _own(trims, chunk), self.sizes, part.measured)
-                for chunk in part.chunks
+            groups = [
+                _moves(model, moved, chunk, _own(trims, chunk), self.sizes, part.measured) for chunk in part.chunks
             ]
-            error, slope = (np.array(np.concatenate([f[k] for f in found])[: len(part.flight)]) for k in (0, 1))
-            for k, (other, by, elsewhere) in moved.items():
+            found = np.concatenate(groups, axis=1)[:, : len(part.flight)]
+            for i, elsewhere in began.items():
                 chunks = elsewhere.parts[place].chunks
-                there = [_scaled(other, c, _own(trims, c), self.sizes, part.measured) for c in chunks]
-                slope[..., k] = (np.concatenate(there)[: len(part.flight)] - error) * (scale[k] / by)
+                there = [_scaled(moved[i], c, _own(trims, c), self.sizes, part.measured) for c in chunks]
+                found[1 + i] = np.concatenate(there)[: len(part.flight)]
+            error, slope = found[0], np.zeros((*found[0].shape, count + 3))
+            difference = _unwrapped(found[1:], error, np.asarray(self.sizes)) - error
+            slope[..., [*free, count, count + 1, count + 2]] = np.moveaxis(difference, 0, -1) * along
             heavy = part.weight[:, None, None, None] / np.maximum(np.linalg.norm(error, axis=-1, keepdims=True), HUBER)
             flat = slope.reshape(len(slope), -1, count + 3)
             pull = (heavy * error).reshape(len(error), -1)
@@ -241,14 +250,22 @@ class Predictions:
                 scatter[np.ix_(at, at)] += sums.T @ sums
         return Normal(matrix, gradient, scatter, count, self.share, trimmed)
 
-    def _moved(
-        self, model: Quadrotor, numbers: tuple[Number, ...], values: np.ndarray, k: int
-    ) -> tuple[Quadrotor, float, Predictions]:
-        """The model with one number moved a little, by how much, and the windows as that model starts them."""
-        number = numbers[k]
-        by = STEP * number.scale * (1 if values[k] + STEP * number.scale <= number.high else -1)
-        other = with_values(model, numbers, values + by * (np.arange(len(values)) == k))
-        return other, by, self.started(other)
+
+def _unwrapped(found: np.ndarray, near: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """Errors (..., H, 2, 3), of attitude said the other way round where that is nearer to another error.
+
+    A rotation by half a circle or so is one vector or its opposite; a slope must not see a jump between the two.
+    """
+    turn = found[..., 0, :] * sizes[:, :1]
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    far = np.linalg.norm(turn - near[..., 0, :] * sizes[:, :1], axis=-1, keepdims=True) > np.pi
+    turned = np.where(far, turn * (1 - 2 * np.pi / np.maximum(angle, 1e-9)), turn)
+    return np.stack([turned / sizes[:, :1], found[..., 1, :]], axis=-2)
+
+
+def _but(values: np.ndarray, k: int, by: float) -> np.ndarray:
+    """The values, one of them moved."""
+    return values + by * (np.arange(len(values)) == k)
 
 
 def kinds_alike(model: Quadrotor, logs: Sequence[FlightLog]) -> dict[str, float]:
@@ -346,27 +363,32 @@ def _scaled(model: Quadrotor, chunk: dict, trims: Array, sizes: Array, measured:
     return jax.vmap(lambda window, trim: _error(model, window, trim, sizes, measured))(chunk, trims)
 
 
+def _moves(
+    model: Quadrotor, moved: list[Quadrotor], chunk: dict, trims: Array, sizes: Array, measured: bool
+) -> np.ndarray:
+    """`_scaled` (1 + N + 3, W, H, 2, 3) of a model as it is, of others, and with each component of the trims moved.
+
+    By differences, in groups of one size: one program serves whatever is fitted. Derivatives would have to be traced
+    anew for every other set of numbers, which takes a minute where the predictions take a second.
+    """
+    every = [(m.effects, np.zeros(3)) for m in (model, *moved)] + [
+        (model.effects, TRIM * STEP * row) for row in np.eye(3)
+    ]
+    found = []
+    for first in range(0, len(every), GROUP):
+        group = [every[min(i, len(every) - 1)] for i in range(first, first + GROUP)]
+        effects, by = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *group)
+        found.append(_grouped(model, effects, chunk, trims + by[:, None], sizes, measured))
+    return np.concatenate(found)[: len(every)]
+
+
 @eqx.filter_jit
-def _linearised(
-    model: Quadrotor,
-    numbers: tuple[Number, ...],
-    values: Array,
-    scale: Array,
-    chunk: dict,
-    trims: Array,
-    sizes: Array,
-    measured: bool,
-) -> tuple[Array, Array]:
-    """`_scaled`, and its derivatives (W, H, 2, 3, N + 3) by numbers and by the window's own trim, in their scales."""
+def _grouped(
+    model: Quadrotor, effects: tuple[Effect, ...], chunk: dict, trims: Array, sizes: Array, measured: bool
+) -> Array:
+    """`_scaled` of models that differ in their effects' numbers, and in the trims, along a leading axis (G)."""
 
-    def one(window, trim):
-        def moved(by):
-            shared, own = by[:-3], by[-3:]
-            return _error(
-                with_values(model, numbers, values + shared * scale), window, trim + own * TRIM, sizes, measured
-            )
+    def one(own, turned):
+        return _scaled(eqx.tree_at(lambda m: m.effects, model, own), chunk, turned, sizes, measured)
 
-        here = jnp.zeros(len(numbers) + 3)
-        return moved(here), jax.jacfwd(moved)(here)
-
-    return jax.vmap(one)(chunk, trims)
+    return jax.vmap(one)(effects, trims)
