@@ -39,7 +39,7 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
 
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid.evaluation import evaluate
-    from cfb_mjx.sysid.tracing.outcome import close_loop
+    from cfb_mjx.sysid.tracing.closing import close_loop
 
     base = load_model_file("cfb-guards")
     declared = Quadrotor.from_file(base)

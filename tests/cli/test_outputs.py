@@ -52,7 +52,7 @@ def test_a_loop_stopped_at_its_report_leaves_model_and_report_of_the_run_before(
         (folder / name).write_text("old")
     nothing = {"reported": [], "unexplained": None, "together": None}
     outcome = SimpleNamespace(model_file=lambda *_: load_model_file("cfb"), to_json=dict, **nothing)
-    monkeypatch.setattr("cfb_mjx.sysid.tracing.outcome.close_loop", lambda *_, **__: outcome)
+    monkeypatch.setattr("cfb_mjx.sysid.tracing.closing.close_loop", lambda *_, **__: outcome)
     monkeypatch.setitem(sys.modules, "cfb_mjx.view.closing", SimpleNamespace(write_report=stop))
     arguments = ["close-loop", "--fit", tmp_path / "fit.mcap", "--held-out", tmp_path / "held.mcap", "-o", folder]
     assert cli.main(list(map(str, arguments))) == 130

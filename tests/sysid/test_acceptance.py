@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from cfb_mjx.sysid.tracing.acceptance import CLEAR, material, significant
 from cfb_mjx.sysid.tracing.evidence import Evidence
-from cfb_mjx.sysid.tracing.fits import ERRORS, Fit
+from cfb_mjx.sysid.tracing.fits import ERRORS
+from cfb_mjx.sysid.tracing.hypothesis import Fit
+from cfb_mjx.sysid.tracing.rules import RULES
 
 COUNT = len(ERRORS)
 
@@ -20,22 +21,22 @@ DECLARED = fit(1.0, 1.0, 1.0, 1.0)
 
 
 def test_a_drop_of_all_flights_is_enough():
-    assert material(fit(1.0, 1.0), fit(0.9, 0.9), DECLARED, clear=False)
+    assert RULES.lowers(fit(1.0, 1.0), fit(0.9, 0.9), DECLARED, clear=False)
 
 
 def test_a_drop_in_one_flight_needs_a_clear_statistic():
     poorer, richer = fit(1.0, 1.0, 1.0, 1.0), fit(0.9, 1.0, 1.0, 1.0)
-    assert not material(poorer, richer, DECLARED, clear=False)
-    assert material(poorer, richer, DECLARED, clear=True)
+    assert not RULES.lowers(poorer, richer, DECLARED, clear=False)
+    assert RULES.lowers(poorer, richer, DECLARED, clear=True)
 
 
 def test_crumbs_of_a_large_error_do_not_count():
     declared, poorer, richer = fit(1.0, 1.0), fit(0.1, 0.1), fit(0.09, 0.09)
-    assert not material(poorer, richer, declared, clear=True)
+    assert not RULES.lowers(poorer, richer, declared, clear=True)
 
 
 def test_getting_worse_is_not_material():
-    assert not material(fit(1.0, 1.0), fit(1.2, 1.0), fit(1.0, 1.0), clear=True)
+    assert not RULES.lowers(fit(1.0, 1.0), fit(1.2, 1.0), fit(1.0, 1.0), clear=True)
 
 
 @pytest.mark.parametrize(
@@ -43,4 +44,4 @@ def test_getting_worse_is_not_material():
     [(30.0, 1e-6, 23, True), (30.0, 1e-3, 23, False), (30.0, 1e-3, 5, True), (4.0, 1e-6, 23, False)],
 )
 def test_chance_is_counted_once_per_effect_tried(gain, p_value, tried, counts):
-    assert significant(Evidence(gain, CLEAR, p_value, np.zeros(1)), tried) == counts
+    assert RULES.significant(Evidence(gain, RULES.clear, p_value, np.zeros(1)), tried) == counts

@@ -1,14 +1,16 @@
 """In which order the effects that explain the flights about as well are tried, and that one in vain ends nothing."""
 
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from cfb_mjx.sysid.tracing import contenders
+from cfb_mjx.sysid.tracing import trace
 from cfb_mjx.sysid.tracing.evidence import Evidence
-from cfb_mjx.sysid.tracing.fits import ERRORS, Fit
-from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.fits import ERRORS
+from cfb_mjx.sysid.tracing.hypothesis import Fit, Hypothesis
+from cfb_mjx.sysid.tracing.rules import RULES
 
 NOTHING = Fit(SimpleNamespace(present=()), None, np.ones(len(ERRORS)), np.ones((1, len(ERRORS))))
 
@@ -29,15 +31,13 @@ def contest(monkeypatch):
             )
             for name, (_, _, _, error, _) in made.items()
         }
-        search = SimpleNamespace(with_candidate=lambda hypothesis, variant, found: variant[0].effect)
-        monkeypatch.setattr(contenders, "fitted", lambda search, name, whole: fits[name])
-        monkeypatch.setattr(contenders, "implausible", lambda hypothesis, name: not made[name][4])
-        monkeypatch.setattr(
-            contenders, "confirm", lambda search, poorer, richer: SimpleNamespace(gain=made[richer.name][2])
-        )
-        monkeypatch.setattr(contenders, "_without_lead", lambda search, hypothesis: np.log(made[hypothesis.name][3]))
+        rules = SimpleNamespace(**asdict(RULES), stretched=lambda hypothesis, name: not made[name][4])
+        search = SimpleNamespace(with_candidate=lambda hypothesis, variant, found: variant[0].effect, rules=rules)
+        monkeypatch.setattr(trace, "fitted", lambda search, name, whole: fits[name])
+        monkeypatch.setattr(trace, "confirm", lambda search, poorer, richer: SimpleNamespace(gain=made[richer.name][2]))
+        monkeypatch.setattr(trace, "_without_lead", lambda search, hypothesis: np.log(made[hypothesis.name][3]))
         ranking = _ranking({name: (gain, numbers) for name, (gain, numbers, *_) in made.items()})
-        options, stretched = contenders.contenders(search, NOTHING, ranking, lambda _: None)
+        options, stretched = trace.contenders(search, NOTHING, ranking, lambda _: None)
         return [name for name, _ in options], stretched
 
     return run
@@ -63,8 +63,8 @@ def test_where_all_explain_less_than_what_is_there_the_search_goes_on(contest):
 def test_predictions_that_diverge_are_worse_than_all_others(monkeypatch):
     search = SimpleNamespace(settled=lambda hypothesis, lead_free: hypothesis)
     for error, expected in ((np.nan, np.inf), (np.inf, np.inf), (1.0, 0.0)):
-        monkeypatch.setattr(contenders, "prediction_errors", lambda search, held, e=error: np.array([1.0, e]))
-        assert contenders._without_lead(search, Hypothesis(())) == expected
+        monkeypatch.setattr(trace, "prediction_errors", lambda search, held, e=error: np.array([1.0, e]))
+        assert trace._without_lead(search, Hypothesis(())) == expected
 
 
 def test_of_those_that_predict_alike_too_the_one_with_fewer_numbers_comes_first(contest):

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from cfb_mjx.sysid.tracing import formula
-from cfb_mjx.sysid.tracing.columns import neutral_effects, term_columns
-from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
-from cfb_mjx.sysid.tracing.terms import Selection
+from cfb_mjx.sysid.tracing.formula import Selection
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, neutral_effects, term_columns
+from cfb_mjx.sysid.tracing.rules import RULES
 
 
 class _Search:
+    rules = RULES
     names = ("wind", "rotor_drag")
 
     def settled(self, hypothesis):
@@ -67,7 +68,7 @@ def rare(monkeypatch):
         monkeypatch.setattr(formula, "fit_formula", lambda _, one, terms: (replace(one, terms=tuple(terms)), None))
         monkeypatch.setattr(formula, "prediction_errors", errors)
         monkeypatch.setattr(formula, "confirm", lambda *_: SimpleNamespace(t=statistic))
-        held_out = SimpleNamespace(nothing=lambda: base)
+        held_out = SimpleNamespace(nothing=lambda: base, rules=RULES)
         found = formula._with_rare(_Search(), base, [sure], Selection([sure], [[seldom]]), held_out)
         return found == [sure, seldom]
 
@@ -98,5 +99,5 @@ def test_what_held_out_flights_alone_show_must_be_large_beside_effects_fitted_to
     monkeypatch.setattr(formula, "fit_formula", fitted)
     monkeypatch.setattr(formula, "prediction_errors", errors)
     monkeypatch.setattr(formula, "terms_of", lambda one, *_: list(one.terms))
-    held_out = SimpleNamespace(nothing=lambda: base)
+    held_out = SimpleNamespace(nothing=lambda: base, rules=RULES)
     assert formula.only_there(held_out, base) == ([slope] if told else [])

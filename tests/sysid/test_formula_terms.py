@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from cfb_mjx.model.effects.formula import PLACES
-from cfb_mjx.sysid.tracing.columns import LEAD, Column, term_columns
-from cfb_mjx.sysid.tracing.hypothesis import Linear
-from cfb_mjx.sysid.tracing.terms import select
+from cfb_mjx.sysid.tracing.formula import select
+from cfb_mjx.sysid.tracing.hypothesis import LEAD, Column, Linear, term_columns
+from cfb_mjx.sysid.tracing.rules import RULES
 
 BLOCKS, ROWS, AXIS = 60, 200, 3
 
@@ -27,7 +27,9 @@ def _selected(signals: dict[str, np.ndarray], residual: np.ndarray):
     stacked = np.stack([residual, *slopes], axis=-1)
     blocks = np.einsum("brc,brd->bcd", stacked, stacked)
     linear = Linear(columns, blocks)
-    search = SimpleNamespace(own_columns=lambda hypothesis: [], linearise_terms=lambda hypothesis, own: [linear])
+    search = SimpleNamespace(
+        own_columns=lambda hypothesis: [], linearise_terms=lambda hypothesis, own: [linear], rules=RULES
+    )
     chosen = select(search, None)
     return [list(PLACES)[c.index[1]] for c in chosen.sure], [
         [list(PLACES)[c.index[1]] for c in group] for group in chosen.rare

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from cfb_mjx.sysid.tracing import rare
-from cfb_mjx.sysid.tracing.columns import neutral_effects, strengths
+from cfb_mjx.sysid.tracing import trace
 from cfb_mjx.sysid.tracing.evidence import Evidence
-from cfb_mjx.sysid.tracing.fits import Fit
-from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.hypothesis import Fit, Hypothesis, neutral_effects, strengths
+from cfb_mjx.sysid.tracing.rules import RULES
 from cfb_mjx.sysid.tracing.trace import Found, Trace
 
 NAMES = ("rotor_drag", "torque_scale", "gyroscopic")
@@ -26,7 +26,7 @@ def tried(monkeypatch):
     def fit_of(hypothesis):
         return Fit(hypothesis, None, np.full(8, 0.9 ** len(hypothesis.present)), np.ones((1, 8)))
 
-    def run(evidence, statistic=9.0, with_it=0.5):
+    def run(evidence, statistic=9.0, with_it=0.5, impossible=(), rules=RULES):
         asked = []
 
         def rank(search, fit, refused):
@@ -44,18 +44,21 @@ def tried(monkeypatch):
         def left_out(search, hypothesis, name):
             return SimpleNamespace(fit=fit_of(hypothesis.without(name)))
 
-        monkeypatch.setattr(rare, "rank", rank)
-        monkeypatch.setattr(rare, "fitted", lambda search, one, whole: fit_of(one))
-        monkeypatch.setattr(rare, "completed", lambda search, fit: fit)
-        monkeypatch.setattr(rare, "confirm", lambda *_: SimpleNamespace(t=statistic))
-        monkeypatch.setattr(rare, "prediction_errors", errors)
-        monkeypatch.setattr(rare, "leave_out", left_out)
-        monkeypatch.setattr(rare, "summary", lambda s, f, name, less: Found(name, 0.01, 9.0, 0.1, {}, {}))
-        search = SimpleNamespace(with_candidate=richer)
-        judge = SimpleNamespace(nothing=lambda: base.without("rotor_drag"))
+        monkeypatch.setattr(trace, "rank", rank)
+        monkeypatch.setattr(trace, "fitted", lambda search, one, whole: fit_of(one))
+        monkeypatch.setattr(trace, "completed", lambda search, fit: fit)
+        monkeypatch.setattr(trace, "confirm", lambda *_: SimpleNamespace(t=statistic))
+        monkeypatch.setattr(trace, "prediction_errors", errors)
+        monkeypatch.setattr(trace, "leave_out", left_out)
+        monkeypatch.setattr(trace, "summary", lambda s, f, name, less: Found(name, 0.01, 9.0, 0.1, {}, {}))
+        search = SimpleNamespace(with_candidate=richer, rules=rules)
+        judging = SimpleNamespace(
+            rare_sure=rules.rare_sure, lowered=rules.lowered, stretched=lambda _, name: name in impossible
+        )
+        judge = SimpleNamespace(nothing=lambda: base.without("rotor_drag"), rules=judging)
         first = Found("rotor_drag", 1e-9, 99.0, 0.4, {}, {})
         found = Trace(base, None, [first], [], search, np.ones(8), np.ones(8), fit_of(base))
-        result = rare.with_rare(found, judge)
+        result = trace.with_rare(found, judge)
         assert set(result.hypothesis.present) == {item.name for item in result.found}
         return [item.name for item in result.found], asked, result
 
@@ -84,11 +87,9 @@ def test_an_effect_is_left_where_one_condition_fails(tried, evidence, statistic,
     assert names == ["rotor_drag"]
 
 
-def test_no_more_than_two_are_tried_and_one_that_needs_an_impossible_strength_is_not_taken(tried, monkeypatch):
+def test_no_more_than_two_are_tried_and_one_that_needs_an_impossible_strength_is_not_taken(tried):
     evidence = {"torque_scale": (20.0, 3.0), "gyroscopic": (30.0, 3.0)}
-    monkeypatch.setattr(rare, "implausible", lambda hypothesis, name: name == "gyroscopic")
-    names, asked, _ = tried(evidence)
+    names, asked, _ = tried(evidence, impossible=("gyroscopic",))
     assert asked == ["gyroscopic", "torque_scale"]
     assert "gyroscopic" not in names
-    monkeypatch.setattr(rare, "TRIED", 1)
-    assert tried(evidence)[1] == ["gyroscopic"]
+    assert tried(evidence, rules=replace(RULES, rare_tried=1))[1] == ["gyroscopic"]

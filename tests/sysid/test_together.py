@@ -13,11 +13,13 @@ from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.refinement.numbers import PLANT
 from cfb_mjx.sysid.sensor_faults import HEALTHY
-from cfb_mjx.sysid.tracing import outcome
-from cfb_mjx.sysid.tracing.fits import Fit, beside_hold
+from cfb_mjx.sysid.tracing import closing
+from cfb_mjx.sysid.tracing.fits import beside_hold
+from cfb_mjx.sysid.tracing.hypothesis import Fit
+from cfb_mjx.sysid.tracing.rules import Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
-from cfb_mjx.sysid.tracing.together import Rules, fit_together, names_to_fit, of_type, paired
+from cfb_mjx.sysid.tracing.together import fit_together, names_to_fit, of_type, paired
 from cfb_mjx.sysid.tracing.trace import Trace
 from cfb_mjx.view import closing_sections
 from cfb_mjx.view.closing_words import verdict
@@ -38,8 +40,8 @@ def campaign():
 @pytest.fixture(scope="module")
 def whole(campaign):
     check = replace(check_sensors(campaign.fit, 0.008, 0.0), faults=HEALTHY, findings=[])
-    search = Search.start(campaign.fit, GUARDS.parameters(), 0.008, check, (), PLANT)
-    return fit_together(campaign.fit, GUARDS, search, rules=RULES)
+    search = Search.start(campaign.fit, GUARDS.parameters(), 0.008, check, (), PLANT, RULES)
+    return fit_together(campaign.fit, GUARDS, search)
 
 
 def test_what_a_drone_lacks_is_found_all_at_once(campaign, whole):
@@ -88,8 +90,8 @@ def closed(campaign, whole):
     check = check_sensors(campaign.fit, 0.008, 0.0)
     found = Trace(search.nothing(), check, [], [], search, np.ones(8), np.ones(8), fit)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(outcome, "fit_together", lambda *_: whole)
-        return outcome._whole(found, campaign.fit, campaign.held_out, GUARDS, lambda _: None)
+        patch.setattr(closing, "fit_together", lambda *_: whole)
+        return closing._whole(found, campaign.fit, campaign.held_out, GUARDS, lambda _: None)
 
 
 def test_the_corrected_model_predicts_what_the_report_says(campaign, closed, tmp_path):
@@ -131,8 +133,8 @@ def test_the_first_paragraph_says_what_the_drone_has_what_it_buys_and_what_to_do
 def test_a_whole_that_is_hardly_better_than_the_search_does_not_replace_it(campaign, closed, whole):
     found = replace(closed.trace, fit=replace(closed.trace.fit, beside_hold=whole.beside_hold))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(outcome, "fit_together", lambda *_: whole)
-        assert outcome._whole(found, campaign.fit, campaign.held_out, GUARDS, lambda _: None) is None
+        patch.setattr(closing, "fit_together", lambda *_: whole)
+        assert closing._whole(found, campaign.fit, campaign.held_out, GUARDS, lambda _: None) is None
 
 
 def test_what_the_rotor_speeds_tell_stands_unless_predictions_are_worse(campaign, whole, monkeypatch):
@@ -140,13 +142,13 @@ def test_what_the_rotor_speeds_tell_stands_unless_predictions_are_worse(campaign
     part = replace(whole.parts[0], told=True)
     found = {}
     for t in (-1.0, -5.0):
-        monkeypatch.setattr(outcome, "paired", lambda *_, t=t: (t, 0.5))
-        entry = outcome._reported(_search(campaign), part, None, campaign.held_out)
-        found[t] = outcome._stands(entry, part)
+        monkeypatch.setattr(closing, "paired", lambda *_, t=t: (t, 0.5))
+        entry = closing._reported(_search(campaign), part, None, campaign.held_out)
+        found[t] = closing._stands(entry, part)
         assert entry.p_value == part.p_value
     assert found == {-1.0: True, -5.0: False}
-    entry = outcome._reported(_search(campaign), replace(part, told=False), None, campaign.held_out)
-    assert not outcome._stands(entry, replace(part, told=False))
+    entry = closing._reported(_search(campaign), replace(part, told=False), None, campaign.held_out)
+    assert not closing._stands(entry, replace(part, told=False))
 
 
 def _search(campaign):

@@ -21,15 +21,13 @@ from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
-from cfb_mjx.sysid.tracing.columns import moved, neutral_effects, shapes, strengths, term_columns
+from cfb_mjx.sysid.tracing.closing import close_loop
 from cfb_mjx.sysid.tracing.evidence import evidence
 from cfb_mjx.sysid.tracing.formula import with_library
 from cfb_mjx.sysid.tracing.given import fit_given
-from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, moved, neutral_effects, shapes, strengths, term_columns
 from cfb_mjx.sysid.tracing.jointly import beside_each_other, everything, needless, one_by_one
-from cfb_mjx.sysid.tracing.lines import find_lines
-from cfb_mjx.sysid.tracing.outcome import close_loop
-from cfb_mjx.sysid.tracing.residuals import residual_rows
+from cfb_mjx.sysid.tracing.residuals import find_lines, residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors, lags
 from cfb_mjx.sysid.tracing.together import asked
@@ -231,40 +229,70 @@ def closed(campaigns, base, tmp_path_factory):
 
 
 def test_drag_is_named_measured_and_bought(closed, campaigns):
-    outcome, _ = closed
-    assert [item.name for item in outcome.reported] == ["rotor_drag"]
+    diagnosis, _ = closed
+    assert [item.name for item in diagnosis.reported] == ["rotor_drag"]
     truth = campaigns["drag"].truth["effects"]["rotor_drag"]
     # The plant's drag saturates at speed, so the linear coefficient comes out below its slope at rest.
     total = 4 * np.mean(truth["rotor_drag"])
-    found = outcome.reported[0].parameters["coefficient"]
+    found = diagnosis.reported[0].parameters["coefficient"]
     assert 0.6 * total < found < 1.05 * total
-    assert outcome.reported[0].p_value < 1e-6
-    before, after = (e.metrics("commands_in") for e in (outcome.before, outcome.after))
+    assert diagnosis.reported[0].p_value < 1e-6
+    before, after = (e.metrics("commands_in") for e in (diagnosis.before, diagnosis.after))
     assert after["velocity_rmse_mps@0.5s"] < 0.5 * before["velocity_rmse_mps@0.5s"]
-    assert not outcome.faults.to_mappings()
-    report = outcome.to_json()
+    assert not diagnosis.faults.to_mappings()
+    report = diagnosis.to_json()
     json.dumps(report, default=float)
     assert report["unexplained"] is False
 
 
+def test_evidence_lies_where_an_effect_acts(closed):
+    diagnosis, _ = closed
+    (drag,) = diagnosis.reported
+    domains = drag.verdict.domains
+    assert sum(domains.values()) == pytest.approx(drag.verdict.gain)
+    # The drag acts above the centre of gravity, so the body turns too; the rotors do not feel it.
+    assert domains["force"] > 0.5 * drag.verdict.gain
+    assert domains["torque"] > 0.2 * drag.verdict.gain
+    assert domains["rotor_speed"] == 0.0
+    assert drag.to_json()["held_out_gain_nats_by_domain"] == domains
+
+
+def test_a_diagnosis_holds_what_was_weighed_and_both_models(closed):
+    diagnosis, _ = closed
+    before, after = diagnosis.models
+    assert [type(e).name for e in (*before.effects, *after.effects)] == ["rotor_drag"]
+    assert diagnosis.candidates
+    assert "rotor_drag" not in {each.name for each in diagnosis.candidates}
+    gains = [each.gain for each in diagnosis.candidates]
+    assert gains == sorted(gains, reverse=True)
+    assert all(each.why for each in diagnosis.candidates)
+    with_drag, without = (np.concatenate([row.specific_force[row.valid] for row in rows]) for rows in _rows(diagnosis))
+    assert np.mean(with_drag**2) < 0.7 * np.mean(without**2)
+
+
+def _rows(diagnosis):
+    """Residuals of the held-out flights, of the corrected model first."""
+    return diagnosis.held_out.rows[::-1]
+
+
 def test_the_corrected_model_predicts_as_reported(closed, campaigns, tmp_path):
-    outcome, _ = closed
+    diagnosis, _ = closed
     path = tmp_path / "model.yaml"
-    save_model_file(outcome.model_file("closed", {"command": "test"}), path)
+    save_model_file(diagnosis.model_file("closed", {"command": "test"}), path)
     model = Quadrotor.from_file(str(path))
     assert [type(e) for e in model.effects] == [RotorDrag]
     again = evaluate(model, campaigns["drag"].held_out).metrics("commands_in")
-    reported = outcome.after.metrics("commands_in")
+    reported = diagnosis.after.metrics("commands_in")
     for key, value in reported.items():
         assert again[key] == pytest.approx(value, rel=1e-6)
 
 
 def test_an_interrupted_search_comes_to_the_result_of_one_that_was_not(closed, campaigns, base, tmp_path):
-    outcome, _ = closed
+    diagnosis, _ = closed
     # Interrupted after the first round: an effect was taken in, and others are still to be tried in vain.
     checkpoint = Checkpoint(tmp_path / "search.json", {"a": "b"}, json.loads(STATES[0]))
     again = trace(campaigns["drag"].fit[:6], base.parameters(), checkpoint=checkpoint)
-    whole = outcome.trace
+    whole = diagnosis.trace
     for a, b in zip(jax.tree.leaves(again.hypothesis.effects), jax.tree.leaves(whole.hypothesis.effects), strict=True):
         np.testing.assert_array_equal(a, b)
     for name in ("present", "lead", "shift"):
@@ -277,14 +305,14 @@ def test_an_interrupted_search_comes_to_the_result_of_one_that_was_not(closed, c
 
 
 def test_what_was_searched_for_can_be_given_up_again(closed):
-    outcome, path = closed
-    nothing = outcome.trace.search.nothing()
+    diagnosis, path = closed
+    nothing = diagnosis.trace.search.nothing()
     hypothesis = Checkpoint(path, {"a": "b"}, json.loads(STATES[-1])).restore(nothing).hypothesis
     assert hypothesis.present == ("rotor_drag",)
     looked_for = {name for name, kind in CATALOGUE.items() if kind.searched}
     assert looked_for == {type(e).name for e in hypothesis.effects}
     assert hypothesis.terms == ()
-    assert [c.effect for c in outcome.trace.search.own_columns(hypothesis)] == ["rotor_drag"]
+    assert [c.effect for c in diagnosis.trace.search.own_columns(hypothesis)] == ["rotor_drag"]
     given_up = hypothesis.without("rotor_drag")
     np.testing.assert_array_equal(given_up.effect("rotor_drag").coefficient, 0.0)
 
@@ -355,8 +383,8 @@ def test_all_effects_at_neutral_replay_like_the_bare_model(campaigns, base):
 @pytest.mark.parametrize("axis", [1, 3])
 def test_terms_of_formulas_are_the_derivatives_by_their_numbers(closed, axis):
     """Without replaying the model for each: so they must agree with replays."""
-    outcome, _ = closed
-    search, hypothesis = with_library(outcome.trace.search, outcome.hypothesis)
+    diagnosis, _ = closed
+    search, hypothesis = with_library(diagnosis.trace.search, diagnosis.hypothesis)
     search = dataclasses.replace(search, logs=search.logs[:1], _flights={})
     own, library = search.own_columns(hypothesis), term_columns(axis)
     quick = search.linearise_terms(hypothesis, own)[axis]

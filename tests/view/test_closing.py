@@ -1,4 +1,4 @@
-"""The report of a closed loop says what the outcome says, stands alone, and its statistics are right."""
+"""The report of a closed loop says what the diagnosis says, stands alone, and its statistics are right."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from cfb_mjx.parameters import load_model_file
 from cfb_mjx.plugins import plugged
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
-from cfb_mjx.sysid.tracing.floor import noise_floor, sensor_levels
+from cfb_mjx.sysid.tracing.diagnosis import Diagnosis, Reported, Unexplained
+from cfb_mjx.sysid.tracing.fits import Verdict
 from cfb_mjx.sysid.tracing.formula import Term
-from cfb_mjx.sysid.tracing.outcome import Outcome, Reported, Unexplained
 from cfb_mjx.sysid.tracing.residuals import UNITS, Smoother, residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
-from cfb_mjx.sysid.tracing.structure import BLOCK, OFFSET, binned, edges_of, explained
+from cfb_mjx.sysid.tracing.structure import BLOCK, OFFSET, binned, edges_of, explained, noise_floor, sensor_levels
 from cfb_mjx.sysid.tracing.trace import Found, Trace
 from cfb_mjx.view import closing_sections as sections
 from cfb_mjx.view import closing_words as words
 from cfb_mjx.view.closing import write_report
-from cfb_mjx.view.closing_next import next_flights
+from cfb_mjx.view.closing_sections import next_flights
 from tests.own_effect import AIR_DRAG
 from tests.rerun_command import rerun
 from tests.simulated_log import noisy, simulated_log
@@ -47,8 +47,8 @@ def logs():
 
 
 @pytest.fixture(scope="module")
-def outcome(logs):
-    """A hand-made outcome: a drag the drone does not have was 'found', with a made-up verdict."""
+def diagnosis(logs):
+    """A hand-made diagnosis: a drag the drone does not have was 'found', with a made-up verdict."""
     base = load_model_file("cfb-guards")
     parameters = base.parameters()
     sensors = check_sensors(logs[0], 0.008, 0.0)
@@ -66,7 +66,7 @@ def outcome(logs):
         Reported("sensor_delay", 1e-12, {"delay": 0.012}, {"delay": 1e-4}),
         Reported("rotor_drag", 1e-7, values, stds, found),
     ]
-    return Outcome(
+    return Diagnosis(
         Trace(hypothesis, sensors, [found], tried, search, np.ones(8), np.ones(8)),
         base,
         reported,
@@ -79,13 +79,13 @@ def outcome(logs):
 
 
 @pytest.fixture(scope="module")
-def folder(outcome, logs, tmp_path_factory):
+def folder(diagnosis, logs, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
-    write_report(outcome, folder, {"date": "2000-01-02", "jax": "x.y"}, *logs)
+    write_report(diagnosis, folder, {"date": "2000-01-02", "jax": "x.y"}, *logs)
     return folder
 
 
-def test_page_stands_alone_and_says_what_the_outcome_says(folder, outcome):
+def test_page_stands_alone_and_says_what_the_outcome_says(folder, diagnosis):
     assert sorted(path.name for path in folder.iterdir()) == ["report.html", "residual.rrd"]
     page = (folder / "report.html").read_text()
     text = re.sub(r"data:image/[^\"]*", "", page)
@@ -97,8 +97,8 @@ def test_page_stands_alone_and_says_what_the_outcome_says(folder, outcome):
     # What looks alike is named together with the flight that would tell.
     assert "parasitic_drag" in text
     assert words.experiment("parasitic_drag")[1:] in text
-    before, after = outcome.before.metrics("commands_in"), outcome.after.metrics("commands_in")
-    low, high = outcome.after.intervals("commands_in")["velocity_rmse_mps@0.5s"]
+    before, after = diagnosis.before.metrics("commands_in"), diagnosis.after.metrics("commands_in")
+    low, high = diagnosis.after.intervals("commands_in")["velocity_rmse_mps@0.5s"]
     assert f"{before['velocity_rmse_mps@0.5s']:.3g} [" in text
     assert f"{after['velocity_rmse_mps@0.5s']:.3g} [{low:.3g}, {high:.3g}]" in text
 
@@ -128,9 +128,9 @@ def test_recording_opens(folder, tmp_path):
     assert "/flight\\ 3/residual/rotor_M1" not in found
 
 
-def test_residuals_see_a_drag_that_is_not_there(outcome):
-    declared = residual_rows(outcome.trace.search, outcome.trace.search.nothing())
-    wrong = residual_rows(outcome.trace.search, outcome.hypothesis)
+def test_residuals_see_a_drag_that_is_not_there(diagnosis):
+    declared = residual_rows(diagnosis.trace.search, diagnosis.trace.search.nothing())
+    wrong = residual_rows(diagnosis.trace.search, diagnosis.hypothesis)
     assert declared[0].rotor_speed is not None
     assert declared[1].rotor_speed is None
     for right, flight in zip(declared, wrong, strict=True):
@@ -177,7 +177,7 @@ def test_shares_are_those_on_data_left_out():
     assert np.max(np.abs(found.mean - 2 * found.center) / found.error) < 4.5
 
 
-def test_noise_floor_is_the_noise_put_in(outcome, logs):
+def test_noise_floor_is_the_noise_put_in(diagnosis, logs):
     found = sensor_levels(logs[1][0])
     assert found["position"] == pytest.approx(4e-4, rel=0.1)
     assert found["gyro"] == pytest.approx(0.015, rel=0.1)
@@ -186,25 +186,31 @@ def test_noise_floor_is_the_noise_put_in(outcome, logs):
     fast = uneven.replace(position=uneven.position + 5.0 * uneven.time[:, None])
     assert sensor_levels(fast)["position"] == pytest.approx(4e-4, rel=0.15)
     # The declared model is right here, so it scores the floor; a drag that is not there scores more.
-    floor = noise_floor(outcome.before)
-    right, wrong = outcome.before.metrics("commands_in"), outcome.after.metrics("commands_in")
+    floor = noise_floor(diagnosis.before)
+    right, wrong = diagnosis.before.metrics("commands_in"), diagnosis.after.metrics("commands_in")
     for key, value in floor.items():
         assert right[key] == pytest.approx(value, rel=0.25), key
     assert wrong["velocity_rmse_mps@0.5s"] > 1.5 * floor["velocity_rmse_mps@0.5s"]
 
 
-def test_nothing_and_unexplained_in_words(outcome):
-    nothing = replace(outcome, reported=[])
+def without_structure(diagnosis):
+    """As if nothing were left in its residuals."""
+    left = SimpleNamespace(strongest=lambda _: [])
+    vars(diagnosis)["held_out"] = SimpleNamespace(structure=(None, left), search=SimpleNamespace(logs=[]))
+    return diagnosis
+
+
+def test_nothing_and_unexplained_in_words(diagnosis):
+    nothing = replace(diagnosis, reported=[])
     assert words.verdict(nothing) == "Nothing is missing beyond chance."
     term = Term("force_x", "x", "N / (m)", 0.01, 0.001, 30.0)
     nothing.unexplained = Unexplained(SimpleNamespace(terms=[term]), [])
     assert "no effect of the catalogue accounts for: force_x follows x." in words.verdict(nothing)
 
 
-def test_what_only_the_held_out_flights_show_is_flagged_and_asked_for(outcome):
-    looked = SimpleNamespace(structure=(None, SimpleNamespace(strongest=lambda _: [])), judge=SimpleNamespace(logs=[]))
+def test_what_only_the_held_out_flights_show_is_flagged_and_asked_for(diagnosis):
     term = Term("torque_x", "v_x w_z", "N m / (m rad/s^2)", 5e-5, 5e-6, 90.0)
-    found = replace(outcome, unexplained=Unexplained(None, [], [term]))
+    found = without_structure(replace(diagnosis, unexplained=Unexplained(None, [], [term])))
     where = "in the held-out flights only, torque_x follows v_x w_z"
     assert f"accounts for: {where}." in words.verdict(found)
     report = found.to_json()
@@ -214,9 +220,9 @@ def test_what_only_the_held_out_flights_show_is_flagged_and_asked_for(outcome):
         "torque_x = (5e-05 +- 5e-06 N m / (m rad/s^2)) v_x w_z (held-out flights only, not in the model)"
     ]
     # A model learns nothing from the flights that judge it.
-    assert found.model_file("drone", {}) == outcome.model_file("drone", {})
-    assert any("like the held-out ones" in text and where in text for text in next_flights(found, looked))
-    fault = replace(outcome, reported=outcome.reported[:1])
+    assert found.model_file("drone", {}) == diagnosis.model_file("drone", {})
+    assert any("like the held-out ones" in text and where in text for text in next_flights(found))
+    fault = replace(diagnosis, reported=diagnosis.reported[:1])
     assert "fault, not the physics" in words.verdict(fault)
 
 
@@ -228,17 +234,16 @@ def test_every_effect_has_words():
         assert any(signal.startswith(key) for key in words.FOLLOWS), signal
 
 
-def test_an_effect_from_outside_is_spoken_of_by_what_it_says_of_itself(outcome, tmp_path):
+def test_an_effect_from_outside_is_spoken_of_by_what_it_says_of_itself(diagnosis, tmp_path):
     """Found and not known well, found and not confirmed, hardly told from another: each once ended in a KeyError."""
     (tmp_path / "my effects.py").write_text(AIR_DRAG)
-    looked = SimpleNamespace(structure=(None, SimpleNamespace(strongest=lambda _: [])), judge=SimpleNamespace(logs=[]))
-    found = replace(outcome.reported[1].found, name="air_drag", confusable=["rotor_drag"])
+    found = replace(diagnosis.reported[1].found, name="air_drag", confusable=["rotor_drag"])
     item = Reported("air_drag", 1e-7, {"coefficient": DRAG}, {"coefficient": DRAG}, found)
-    own = replace(outcome, reported=[item], unconfirmed=[replace(item, found=None)])
+    own = without_structure(replace(diagnosis, reported=[item], unconfirmed=[replace(item, found=None)]))
     line = "F = -coefficient v, with v the velocity in body axes"
     with plugged(tmp_path / "my effects.py"):
         assert f"air_drag the model lacks ({line}): coefficient 0.010 ± 0.010 N s/m" in words.verdict(own)
-        flights = "\n".join(next_flights(own, looked))
+        flights = "\n".join(next_flights(own))
         assert words.experiment("air_drag") == "flights that excite air_drag"
         assert "Flights that excite air_drag. Why: this shows air_drag, and not rotor_drag; " in flights
         assert "air_drag is known to 100 % only; air_drag was found, but not confirmed" in flights
@@ -260,3 +265,20 @@ def test_an_effect_from_outside_is_spoken_of_by_what_it_says_of_itself(outcome, 
 )
 def test_numbers_have_the_digits_they_deserve(value, std, unit, expected):
     assert words.with_error(value, std, unit) == expected
+
+
+@pytest.mark.parametrize(
+    ("domains", "words"),
+    [
+        (None, ""),
+        ({"rotor_speed": 0.0, "force": 95.0, "torque": -3.0}, "shows in the forces (100 %)."),
+        (
+            {"rotor_speed": 60.0, "force": 5.0, "torque": 35.0},
+            "what commands do to the rotors (60 %), in the torques (35 %).",
+        ),
+        ({"rotor_speed": 0.0, "force": 20.0, "torque": -117.0}, "only predictions ask for it."),
+    ],
+)
+def test_a_report_says_where_the_evidence_lies(domains, words):
+    item = Reported("rotor_drag", 1e-9, {}, {}, verdict=Verdict(1.0, 9.0, 1e-9, domains))
+    assert sections._where(item).endswith(words)

@@ -10,7 +10,7 @@ from cfb_mjx.model.rotors import TORQUE_SIGNS
 from cfb_mjx.sysid.tracing.formula import Term
 from cfb_mjx.sysid.tracing.residuals import PATTERNS, UNITS
 from cfb_mjx.sysid.tracing.structure import Pooled
-from cfb_mjx.view.closing_terms import panels_of, signal_of
+from cfb_mjx.view.closing_figures import panels_of, signal_of
 
 
 @pytest.fixture

@@ -35,7 +35,7 @@ def run_close_loop(
     from cfb_mjx.cli.evaluating import changed_model
     from cfb_mjx.parameters import save_model_file
     from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
-    from cfb_mjx.sysid.tracing.outcome import close_loop
+    from cfb_mjx.sysid.tracing.closing import close_loop
     from cfb_mjx.view.closing import write_report
     from cfb_mjx.view.closing_words import verdict
 

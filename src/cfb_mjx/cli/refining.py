@@ -93,8 +93,8 @@ def by_innovations(
     """The model with some effects fitted to innovations, and what to report."""
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.sysid.flight import usual_delay
-    from cfb_mjx.sysid.tracing.columns import bounds
     from cfb_mjx.sysid.tracing.given import fit_given
+    from cfb_mjx.sysid.tracing.hypothesis import bounds
 
     parameters = base.parameters()
     delay = usual_delay(logs, parameters)

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from cfb_mjx.files import scratch, write_text
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.sysid.tracing.outcome import Outcome
-from cfb_mjx.view.closing_drawing import draw
-from cfb_mjx.view.closing_look import look
+from cfb_mjx.sysid.tracing.diagnosis import Diagnosis
+from cfb_mjx.view.closing_figures import draw
 from cfb_mjx.view.closing_recording import write_recording
 from cfb_mjx.view.closing_sections import sections
 from cfb_mjx.view.closing_words import verdict
@@ -17,7 +16,7 @@ from cfb_mjx.view.page import html_page
 
 
 def write_report(
-    outcome: Outcome,
+    diagnosis: Diagnosis,
     folder: Path,
     facts: Mapping[str, object],
     logs_fit: list[FlightLog],
@@ -26,7 +25,7 @@ def write_report(
     """Write ``report.html``, which needs nothing beside it, and ``residual.rrd`` into a folder.
 
     Args:
-        outcome: of `cfb_mjx.sysid.tracing.outcome.close_loop`.
+        diagnosis: of `cfb_mjx.sysid.tracing.closing.close_loop`.
         folder: an existing folder; each file in it is replaced whole or not at all.
         facts: date, machine and versions, printed at the end.
         logs_fit: flights that were learned from, as read.
@@ -36,10 +35,9 @@ def write_report(
         CfbError: a file cannot be written, or rerun is not installed.
     """
     folder = Path(folder)
-    looked = look(outcome, logs_held_out)
     with scratch() as drawn:
-        figures = draw(outcome, looked, Path(drawn))
-        found = sections(outcome, looked, figures, logs_fit, logs_held_out)
-        page = html_page(f"Closing the loop on {outcome.base.name}", verdict(outcome), found, facts)
-    write_recording(folder / "residual.rrd", looked.rows, outcome.before, outcome.after)
+        figures = draw(diagnosis, Path(drawn))
+        found = sections(diagnosis, figures, logs_fit, logs_held_out)
+        page = html_page(f"Closing the loop on {diagnosis.base.name}", verdict(diagnosis), found, facts)
+    write_recording(folder / "residual.rrd", diagnosis.held_out.rows, diagnosis.before, diagnosis.after)
     write_text(folder / "report.html", page)

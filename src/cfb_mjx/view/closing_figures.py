@@ -1,17 +1,20 @@
-"""Figures of the closed loop: held-out errors, what residuals follow before and after, and their spectra."""
+"""Figures of the report of a closed loop: which there are, and what each of them shows."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from cfb_mjx.model.effects.fields import HOVER_SPEED
 from cfb_mjx.model.effects.formula import PLACES, TERMS
 from cfb_mjx.sysid.metrics import QUANTITIES
-from cfb_mjx.sysid.tracing.residuals import UNITS
-from cfb_mjx.sysid.tracing.structure import Pooled, Structure, binned
+from cfb_mjx.sysid.tracing.diagnosis import Diagnosis, HeldOut, Reported
+from cfb_mjx.sysid.tracing.formula import Term
+from cfb_mjx.sysid.tracing.residuals import UNITS, sensor_spectra, spectra
+from cfb_mjx.sysid.tracing.structure import BINS, PREDICTION_BINS, Pooled, Structure, binned, where_it_shows
 from cfb_mjx.view import style
 
 BEFORE, AFTER = style.COLOURS["rotor_speed_in"], style.COLOURS["commands_in"]
@@ -226,3 +229,127 @@ def spectra_figure(
             left=0.05, right=0.99, top=1 - 0.55 / height, bottom=0.5 / height, hspace=0.25, wspace=0.17
         )
         style.save(figure, path)
+
+
+def panels_of(terms: list[Term], before: Pooled, after: Pooled, most: int) -> list[Panel]:
+    """One panel for each of the first terms: its axis against its signal.
+
+    Args:
+        terms: of a formula; constants follow nothing and have no panel.
+        before: residuals without them.
+        after: with them.
+        most: panels.
+    """
+    found = []
+    for term in [term for term in terms if term.signal != "1"][:most]:
+        name = term.signal
+        pair = [replace(p, drivers=p.drivers | {name: signal_of(name, p.drivers)}) for p in (before, after)]
+        found.append(Panel(_axis(term, before), name, *pair))
+    return found
+
+
+def signal_of(name: str, drivers: dict[str, np.ndarray]) -> np.ndarray:
+    """A signal of the formulas' library (`cfb_mjx.model.effects.formula`), from the drivers of residuals (N,)."""
+    known = {f"v_{a}": drivers[f"velocity {a}"] for a in "xyz"} | {f"w_{a}": drivers[f"rate {a}"] for a in "xyz"}
+    known |= {f"n_{key}": drivers[f"rotor {key}"] / HOVER_SPEED for key in ("roll", "pitch", "yaw")}
+    known |= {"n": drivers["rotor mean"] / HOVER_SPEED - 1, "1": np.ones_like(drivers["time"])}
+    known |= {"x": drivers["position x"], "y": drivers["position y"], "z": drivers["height"]}
+    known["|v|"] = np.linalg.norm([known[f"v_{a}"] for a in "xyz"], axis=0)
+    factors = [known[part.removesuffix("^2")] ** (1 + part.endswith("^2")) for part in name.split()]
+    return np.prod(factors, axis=0)
+
+
+def _axis(term: Term, pooled: Pooled) -> str:
+    """The residual axis of a term: for the world's vertical that of the body, which stands upright while it hovers."""
+    name = term.axis.replace("_", " ")
+    return name if name in pooled.axes else name.removeprefix("world ")
+
+
+PANELS = 3
+"""Of one figure at most."""
+Figures = dict[str, list[tuple[Path, str]]]
+
+
+def draw(diagnosis: Diagnosis, folder: Path) -> Figures:
+    """Figures as files with alternative texts.
+
+    Under ``errors``, ``residuals``, ``left``, ``unexplained`` (the last two if there is anything) and `key_of` effects.
+
+    Args:
+        diagnosis: of the closed loop.
+        folder: to write into.
+    """
+    held_out = diagnosis.held_out
+    figures: Figures = {"errors": [(folder / "errors.svg", "held-out error against horizon, before and after")]}
+    errors_figure(diagnosis.before, diagnosis.after, held_out.floor, held_out.random, figures["errors"][0][0])
+    for item in diagnosis.reported:
+        panels, labels = _effect(diagnosis, item)
+        if panels:
+            path = folder / f"{key_of(item.name)}.svg"
+            binned_figure(panels, labels, path)
+            what = ", ".join(f"{p.axis} against {p.signal}" for p in panels)
+            figures[key_of(item.name)] = [(path, f"{item.name}: {what}, {labels[0]} and {labels[1]}")]
+    panels, labels = _terms(diagnosis)
+    if panels:
+        binned_figure(panels, labels, folder / "unexplained.svg")
+        what = ", ".join(f"{p.axis} against {p.signal}" for p in panels)
+        figures["unexplained"] = [(folder / "unexplained.svg", f"{what}: {' and '.join(filter(None, labels))}")]
+    matrix_figure(*held_out.structure, folder / "matrix.svg")
+    figures["residuals"] = [
+        (folder / "matrix.svg", "share of each residual that follows each signal, before and after")
+    ]
+    figures["residuals"] += _spectra(held_out, folder / "spectra.svg")
+    after = held_out.structure[1]
+    left = [(after.axes[i], after.signals[j]) for i, j in after.strongest(PANELS)]
+    # A mean has no signal to be drawn against; over time it shows as well as over any other.
+    panels = [
+        Panel(axis, name if name in held_out.pair(axis)[0].drivers else "time", *held_out.pair(axis))
+        for axis, name in left
+    ]
+    if panels:
+        # Beside what was there before, little of it would be seen.
+        binned_figure(panels, ("", "after"), folder / "left.svg")
+        figures["left"] = [(folder / "left.svg", "the strongest structure left in the residuals")]
+    return figures
+
+
+def key_of(name: str) -> str:
+    """Under which an effect's figures stand, whatever it is called."""
+    return f"effect {name}"
+
+
+def _spectra(held_out: HeldOut, path: Path) -> list[tuple[Path, str]]:
+    before, after = spectra(held_out.rows[0]), spectra(held_out.rows[1])
+    if not before:
+        return []
+    frequency = next(iter(before.values()))[0]
+    interval = float(np.median([log.nominal_interval for log in held_out.search.logs]))
+    noise = sensor_spectra(frequency, held_out.search.noise, interval)
+    units = {axis: held_out.pooled[0].units.get(axis, "rad/s") for axis in before}
+    spectra_figure(before, after, noise, units, path)
+    return [(path, "spectra of the residuals before and after")]
+
+
+def _effect(diagnosis: Diagnosis, item: Reported) -> tuple[list[Panel], tuple[str, str]]:
+    """Where an effect shows: residuals of all flights without and with it, against the signal it follows."""
+    without = diagnosis.without(item)
+    if without is None:
+        # A fault of pose or gyro hardly touches forces and torques; it spoils predictions.
+        return _panels(*diagnosis.held_out.predictions, PREDICTION_BINS), ("before", "after")
+    return _panels(*diagnosis.residuals(without)), (f"best model without {item.name}", "corrected model")
+
+
+def _terms(diagnosis: Diagnosis) -> tuple[list[Panel], tuple[str, str]]:
+    """Panels of the terms of a formula: on all flights, or on those that alone show them."""
+    left = diagnosis.unexplained
+    if left is not None and left.proposal is not None:
+        both = diagnosis.residuals(left.proposal.without)
+        return panels_of(left.proposal.terms, *both, PANELS), ("without the terms", "with them")
+    if left is not None and left.held_out_only:
+        after = diagnosis.held_out.pooled[1]
+        return panels_of(left.held_out_only, after, after, PANELS), ("left on the held-out flights", "")
+    return [], ("", "")
+
+
+def _panels(less: Pooled, more: Pooled, bins: int = BINS) -> list[Panel]:
+    return [Panel(axis, signal, less, more) for axis, signal in where_it_shows(less, more, bins)]

@@ -1,4 +1,4 @@
-"""The sections of the report of a closed loop."""
+"""The sections of the report of a closed loop: what was found, what is left, what to fly next."""
 
 from __future__ import annotations
 
@@ -9,13 +9,22 @@ import numpy as np
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.sysid.evaluation import Evaluation
 from cfb_mjx.sysid.metrics import QUANTITIES
-from cfb_mjx.sysid.tracing.floor import noise_floor
-from cfb_mjx.sysid.tracing.outcome import Outcome, Reported, Unexplained
-from cfb_mjx.view.closing_drawing import Figures, key_of
-from cfb_mjx.view.closing_figures import squared
-from cfb_mjx.view.closing_look import Looked
-from cfb_mjx.view.closing_next import next_flights, refused, what_is_left
-from cfb_mjx.view.closing_words import change, documented, is_fault, meaning, numbers, probability, strength, with_error
+from cfb_mjx.sysid.tracing.diagnosis import Diagnosis, HeldOut, Reported, Unexplained
+from cfb_mjx.sysid.tracing.structure import noise_floor
+from cfb_mjx.view.closing_figures import Figures, key_of, squared
+from cfb_mjx.view.closing_words import (
+    FOLLOWS,
+    change,
+    documented,
+    experiment,
+    is_fault,
+    meaning,
+    numbers,
+    probability,
+    separating,
+    strength,
+    with_error,
+)
 from cfb_mjx.view.page import Section
 
 Table = tuple[str, list[str], list[list[str]]]
@@ -23,20 +32,20 @@ UNIT = {"m": "m", "mps": "m/s", "deg": "deg", "radps": "rad/s"}
 
 
 def sections(
-    outcome: Outcome, looked: Looked, figures: Figures, logs_fit: list[FlightLog], logs_held_out: list[FlightLog]
+    diagnosis: Diagnosis, figures: Figures, logs_fit: list[FlightLog], logs_held_out: list[FlightLog]
 ) -> list[Section]:
     """All of them, in the order they are read."""
-    found = [_short(logs_fit, logs_held_out), _missing(outcome, figures), _errors(figures)]
-    if outcome.unexplained is not None:
-        found.append(_unexplained(outcome.unexplained, figures))
+    found = [_short(logs_fit, logs_held_out), _missing(diagnosis, figures), _errors(figures)]
+    if diagnosis.unexplained is not None:
+        found.append(_unexplained(diagnosis.unexplained, figures))
     found += [
-        Section("What is left", what_is_left(outcome, looked), figures=figures.get("left", [])),
-        Section("What to fly next", next_flights(outcome, looked)),
-        _numbers(outcome, looked),
-        _residuals(looked, figures),
-        _measured(outcome, logs_fit, logs_held_out),
-        _refused(outcome),
-        _per_log(outcome),
+        Section("What is left", what_is_left(diagnosis), figures=figures.get("left", [])),
+        Section("What to fly next", next_flights(diagnosis)),
+        _numbers(diagnosis),
+        _residuals(diagnosis.held_out, figures),
+        _measured(diagnosis, logs_fit, logs_held_out),
+        _refused(diagnosis),
+        _per_log(diagnosis),
     ]
     return found
 
@@ -75,14 +84,14 @@ def _how_many(logs: list[FlightLog], column: str) -> str:
     return {len(logs): "all", 0: "none"}.get(count, f"{count} of {len(logs)}")
 
 
-def _missing(outcome: Outcome, figures: Figures) -> Section:
-    if not outcome.reported:
-        count = len(outcome.trace.search.names)
+def _missing(diagnosis: Diagnosis, figures: Figures) -> Section:
+    if not diagnosis.reported:
+        count = len(diagnosis.trace.search.names)
         text = f"None of the {count} effects of the catalogue and no sensor fault was both significant and material."
         return Section("What was found", [text])
     paragraphs, rows = [], []
-    for item in outcome.reported:
-        paragraphs.append(_sentence(item, "the mean" if outcome.together is not None else "one"))
+    for item in diagnosis.reported:
+        paragraphs.append(_sentence(item, "the mean" if diagnosis.together is not None else "one"))
         for number in numbers(item):
             low, high = number.value - 1.96 * number.std, number.value + 1.96 * number.std
             plausible = "" if number.plausible is None else "{:g} to {:g}".format(*number.plausible)
@@ -92,10 +101,10 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
         "Value ± standard deviation. p: probability of this much evidence by chance, on the held-out flights "
         "(of a sensor fault: from comparing the sensors with each other, without any model)."
     )
-    if outcome.together is not None:
-        paragraphs.insert(0, TOGETHER + _held(outcome))
+    if diagnosis.together is not None:
+        paragraphs.insert(0, TOGETHER + _held(diagnosis))
     head = ["effect", "parameter", "value", "95 % interval", "plausible", "p"]
-    shown = [figure for item in outcome.reported for figure in figures.get(key_of(item.name), [])]
+    shown = [figure for item in diagnosis.reported for figure in figures.get(key_of(item.name), [])]
     if shown:
         paragraphs.append(
             "Figures, one row each: mean residual (measured minus modelled) in bins of the signal it follows, with "
@@ -105,13 +114,13 @@ def _missing(outcome: Outcome, figures: Figures) -> Section:
     return Section("What was found", paragraphs, [(caption, head, rows)], shown)
 
 
-def _held(outcome: Outcome) -> str:
+def _held(diagnosis: Diagnosis) -> str:
     """Which declared effects a fit of all at once left as they were, or within what drones of the type differ."""
-    judged = {item.name for item in (*outcome.reported, *outcome.unconfirmed)}
-    present, typical = set(outcome.hypothesis.present), outcome.together.typical
-    declared = [item["name"] for item in outcome.base.effects if item["name"] in present - judged]
+    judged = {item.name for item in (*diagnosis.reported, *diagnosis.unconfirmed)}
+    present, typical = set(diagnosis.hypothesis.present), diagnosis.together.typical
+    declared = [item["name"] for item in diagnosis.base.effects if item["name"] in present - judged]
     held, moved = ([n for n in declared if (n in typical) == which] for which in (False, True))
-    fit = outcome.together.fit
+    fit = diagnosis.together.fit
     edge = [n.name for n in fit.numbers if n.effect in moved and fit.at_bound(n)]
     text = f" Held as the model declares them: {', '.join(held)}." if held else ""
     text += f" Moved within the spread of the type: {', '.join(moved)}." if moved else ""
@@ -126,6 +135,7 @@ def _sentence(item: Reported, which: str = "one") -> str:
         text += f" In the model: {documented(item.name)}."
     if item.found is not None:
         text += f" Without it {which} prediction error of the fit flights grows by {_grows(item.found.buys)}."
+        text += _where(item)
         if item.asked:
             told = (f"{a.name} {with_error(a.value, a.std)}{' (a contradiction)' * a.contradicts}" for a in item.asked)
             text += f" Accelerations alone ask for {', '.join(told)}."
@@ -133,6 +143,26 @@ def _sentence(item: Reported, which: str = "one") -> str:
             names = ", ".join([item.name, *item.found.confusable])
             text += f" These flights cannot tell which of this set it is: {names}."
     return text
+
+
+DOMAINS = {
+    "rotor_speed": "in what commands do to the rotors",
+    "force": "in the forces",
+    "torque": "in the torques",
+}
+
+
+def _where(item: Reported) -> str:
+    """In which domains the evidence of the held-out flights lies, those of a tenth of it and more."""
+    domains = {} if item.verdict is None else item.verdict.domains or {}
+    if not domains:
+        return ""
+    if sum(domains.values()) <= 0:
+        return " Row by row the held-out flights are explained no better with it: only predictions ask for it."
+    gains = {name: gain for name, gain in domains.items() if gain > 0}
+    shares = {name: gain / sum(gains.values()) for name, gain in gains.items()}
+    named = [f"{DOMAINS[n]} ({100 * s:.0f} %)" for n, s in sorted(shares.items(), key=lambda p: -p[1]) if s >= 0.1]
+    return f" On the held-out flights it shows {', '.join(named)}."
 
 
 def _grows(buys: float) -> str:
@@ -152,13 +182,13 @@ def _errors(figures: Figures) -> Section:
     return Section("Error on held-out flights", [text], figures=figures["errors"])
 
 
-def _numbers(outcome: Outcome, looked: Looked) -> Section:
-    windows = sum(len(log.windows) for log in outcome.before.logs)
-    caption = f"RMS errors over {windows} windows of {len(outcome.before.logs)} held-out flights, with 95 % intervals"
-    rows = _rows(outcome.before, outcome.after, looked.floor, looked.random)
+def _numbers(diagnosis: Diagnosis) -> Section:
+    windows = sum(len(log.windows) for log in diagnosis.before.logs)
+    caption = f"RMS errors over {windows} windows of {len(diagnosis.before.logs)} held-out flights, with 95 % intervals"
+    rows = _rows(diagnosis.before, diagnosis.after, diagnosis.held_out.floor, diagnosis.held_out.random)
     head = ["error of", "ahead", "before", "after", "change", "hold", "noise floor", "noise and disturbances"]
     tables = [(caption, head, rows)]
-    speed = outcome.before.metrics("rotor_speed_in"), outcome.after.metrics("rotor_speed_in")
+    speed = diagnosis.before.metrics("rotor_speed_in"), diagnosis.after.metrics("rotor_speed_in")
     if all(speed):
         tables.append(_speed_in(*speed))
     return Section("Held-out errors in numbers", tables=tables)
@@ -214,7 +244,7 @@ def _unexplained(found: Unexplained, figures: Figures) -> Section:
     return Section("Unexplained", [*texts, found.where], tables, figures.get("unexplained", []))
 
 
-def _residuals(looked: Looked, figures: Figures) -> Section:
+def _residuals(held_out: HeldOut, figures: Figures) -> Section:
     paragraphs = [
         "Residuals of the held-out flights are measured minus modelled, given where the drone really was: torque (as "
         "angular acceleration, from the gyro), force (specific force, from the accelerometer; body axes), rotor speed "
@@ -223,8 +253,8 @@ def _residuals(looked: Looked, figures: Figures) -> Section:
         "mean square before; blanks are below 3 %. Offset: its mean. A column that stays dark on the right is "
         "something not accounted for. Second figure: spectra, with what white noise of the sensors leaves.",
     ]
-    before, after = looked.structure
-    units = looked.pooled[0].units | looked.predictions[0].units
+    before, after = held_out.structure
+    units = held_out.pooled[0].units | held_out.predictions[0].units
     rows = [
         [axis, squared(units[axis]), f"{a:.3g}", f"{b:.3g}", change(a, b)]
         for axis, a, b in zip(before.axes, before.rms, after.rms, strict=True)
@@ -234,7 +264,7 @@ def _residuals(looked: Looked, figures: Figures) -> Section:
     return Section("Residuals and what they follow", paragraphs, tables, figures["residuals"])
 
 
-def _measured(outcome: Outcome, logs_fit: list[FlightLog], logs_held_out: list[FlightLog]) -> Section:
+def _measured(diagnosis: Diagnosis, logs_fit: list[FlightLog], logs_held_out: list[FlightLog]) -> Section:
     rows = []
     for use, logs in (("fit", logs_fit), ("held out", logs_held_out)):
         for log in logs:
@@ -245,9 +275,9 @@ def _measured(outcome: Outcome, logs_fit: list[FlightLog], logs_held_out: list[F
     head = ["flight", "use", "s", "rows/s", "top m/s", "top rad/s", "height, m", "rotor speed", "voltage", "gaps"]
     looked = [
         [name, with_error(value, std) if name.endswith("scale") else with_error(1e3 * value, 1e3 * std, "ms")]
-        for name, (value, std) in outcome.trace.sensors.measured.items()
+        for name, (value, std) in diagnosis.trace.sensors.measured.items()
     ]
-    delay = 1e3 * outcome.trace.search.delay
+    delay = 1e3 * diagnosis.trace.search.delay
     text = f"Pose and velocity rows are taken to be {delay:.0f} ms late, as declared; the rest is compared below."
     sensors = ("Sensors compared with each other, no model involved", ["fault", "found"], looked)
     return Section("Flights and sensors", [text], [("Flights", head, rows), sensors])
@@ -257,25 +287,116 @@ def _yes(column) -> str:
     return "no" if column is None else "yes"
 
 
-def _refused(outcome: Outcome) -> Section:
+def _refused(diagnosis: Diagnosis) -> Section:
     text = (
         "Every effect of the catalogue was tried in every round, on blocks of the fit flights left out. To be reported "
         "it must be significant there, lower a prediction error, and stand on the held-out flights."
     )
     head = ["effect", "gain, nats", "p", "why not"]
     caption = "Effects not reported, at their last try (gain in log-likelihood on blocks left out)"
-    rows, others = refused(outcome)
+    candidates = diagnosis.candidates
+    rows = [[each.name, f"{each.gain:.1f}", probability(each.p_value), each.why] for each in candidates]
+    near = {item.name for item in (*candidates, *diagnosis.reported)}
+    others = sorted(set(diagnosis.trace.search.names) - near)
     texts = [text, f"Never among the eight most likely: {', '.join(others)}."] if others else [text]
     return Section("Tried and refused", texts, [(caption, head, rows)] if rows else [])
 
 
-def _per_log(outcome: Outcome) -> Section:
+def _per_log(diagnosis: Diagnosis) -> Section:
     tables = []
     head = ["error of", "ahead", "before", "after", "change", "hold", "noise floor"]
-    for old, new in zip(outcome.before.logs, outcome.after.logs, strict=True):
+    for old, new in zip(diagnosis.before.logs, diagnosis.after.logs, strict=True):
         if not len(old.windows):
             continue
-        before, after = replace(outcome.before, logs=(old,)), replace(outcome.after, logs=(new,))
+        before, after = replace(diagnosis.before, logs=(old,)), replace(diagnosis.after, logs=(new,))
         rows = _rows(before, after, noise_floor(after), None)
         tables.append((f"{old.log.name}, {len(old.windows)} windows", head, rows))
     return Section("Every held-out flight", ["RMS errors with 95 % intervals."], tables)
+
+
+UNSURE = 0.2
+"""Relative standard deviation above which more flights of an effect's kind are asked for."""
+
+
+def what_is_left(diagnosis: Diagnosis) -> list[str]:
+    """Paragraphs on structure that remains, and on where the remaining error comes from."""
+    after = diagnosis.held_out.structure[1]
+    strongest = after.strongest(3)
+    if strongest:
+        named = "; ".join(
+            f"{after.axes[i]} follows {after.signals[j]} ({100 * after.share[i, j]:.0f} % of what is left in it, "
+            f"{_size(diagnosis.held_out, i)} rms)"
+            for i, j in strongest
+        )
+        first = f"Structure that remains on the held-out flights: {named}. Shown below."
+    else:
+        first = "No residual of the held-out flights follows any measured signal by more than 5 % of its mean square."
+    return [first, _budget(diagnosis)]
+
+
+def _size(held_out: HeldOut, index: int) -> str:
+    after = held_out.structure[1]
+    axis = after.axes[index]
+    return f"{after.rms[index]:.2g} {squared(held_out.pair(axis)[1].units[axis])}"
+
+
+def _budget(diagnosis: Diagnosis) -> str:
+    horizon = max(diagnosis.after.horizons)
+    errors = diagnosis.after.metrics("commands_in")
+    sensors, wandering = [], []
+    for quantity, unit in QUANTITIES.items():
+        key = f"{quantity}_rmse_{unit}@{horizon:g}s"
+        for found, floor in (
+            (sensors, diagnosis.held_out.floor[key]),
+            (wandering, max(diagnosis.held_out.floor[key], diagnosis.held_out.random[key])),
+        ):
+            found.append(f"{quantity} {100 * min(1.0, floor**2 / errors[key] ** 2):.0f} %")
+    return (
+        f"Where the remaining error comes from: of its square {horizon:g} s ahead, sensor noise makes "
+        f"{', '.join(sensors)}. Sensor noise together with forces and torques that wander as these residuals do makes "
+        f"{', '.join(wandering)}. What wanders without following a measured signal no model predicts; any structure "
+        "named above is part of it and could still be taken out."
+    )
+
+
+def next_flights(diagnosis: Diagnosis) -> list[str]:
+    """Flights that would tell what is not known well enough yet, each with its reason, the most useful first."""
+    flights: dict[str, list[str]] = {}
+
+    def fly(what: str, because: str) -> None:
+        flights.setdefault(what, []).append(because)
+
+    for item in diagnosis.reported:
+        rivals = [] if item.found is None else item.found.confusable
+        for name in [item.name, *rivals] if rivals else []:
+            others = ", ".join(other for other in [item.name, *rivals] if other != name)
+            fly(experiment(name), f"this shows {name}, and not {others}")
+        command = separating([item.name, *rivals], "model.yaml") if rivals else None
+        if command is not None:
+            fly(f"what `{command}` writes", f"it looks for the flight that tells {item.name} from {', '.join(rivals)}")
+        main = max(numbers(item), key=lambda number: abs(number.value))
+        if main.std > UNSURE * abs(main.value):
+            share = 100 * main.std / max(abs(main.value), 1e-300)
+            fly(experiment(item.name), f"{item.name} is known to {share:.0f} % only")
+    for item in diagnosis.unconfirmed:
+        fly(experiment(item.name), f"{item.name} was found, but not confirmed on held-out flights")
+    if diagnosis.unexplained is not None and diagnosis.unexplained.held_out_only:
+        fly(
+            "more flights like the held-out ones, some of them to fit to",
+            f"what they show is in no model yet: {diagnosis.unexplained.where}",
+        )
+    after = diagnosis.held_out.structure[1]
+    for i, j in after.strongest(3):
+        signal = after.signals[j]
+        fly(next(text for key, text in FOLLOWS.items() if signal.startswith(key)), f"{after.axes[i]} follows {signal}")
+    logs = [*diagnosis.trace.search.logs, *diagnosis.held_out.search.logs]
+    for column, name, why in (
+        ("rotor_speed", "rotor speed", "it separates the motors from the aerodynamics"),
+        ("battery_voltage", "the battery's voltage", "without it battery_sag cannot be seen"),
+    ):
+        lacking = sum(getattr(log, column) is None for log in logs)
+        if lacking:
+            fly(f"any flight with {name} logged, which {lacking} of {len(logs)} lack", why)
+    if not flights:
+        return ["Flights unlike these: faster, lower, longer. What was not flown was not tested."]
+    return [f"{what[0].upper()}{what[1:]}. Why: {'; '.join(why)}." for what, why in flights.items()]

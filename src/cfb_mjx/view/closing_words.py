@@ -9,7 +9,7 @@ import numpy as np
 
 from cfb_mjx import plugins
 from cfb_mjx.model.effects import CATALOGUE, KNOWN, SENSOR_FAULTS, CogOffset, Inertia, MotorTimeConstant, RotorDrag
-from cfb_mjx.sysid.tracing.outcome import Outcome, Reported
+from cfb_mjx.sysid.tracing.diagnosis import Diagnosis, Reported
 
 FOLLOWS = {
     "velocity": RotorDrag.experiment,
@@ -129,13 +129,13 @@ def change(before: float, after: float) -> str:
     return f"{share:+d} %" if share else "0 %"
 
 
-def verdict(outcome: Outcome) -> str:
+def verdict(diagnosis: Diagnosis) -> str:
     """What was found, in a sentence or two."""
-    physics = [item for item in outcome.reported if not is_fault(item.name)]
-    faults = [item for item in outcome.reported if is_fault(item.name)]
+    physics = [item for item in diagnosis.reported if not is_fault(item.name)]
+    faults = [item for item in diagnosis.reported if is_fault(item.name)]
     parts = []
-    if outcome.together is not None:
-        return _many(outcome, physics)
+    if diagnosis.together is not None:
+        return _many(diagnosis, physics)
     if len(physics) == 1:
         (item,) = physics
         parts.append(
@@ -148,14 +148,14 @@ def verdict(outcome: Outcome) -> str:
     if faults:
         named = "; ".join(f"{item.name}, {meaning(item.name)}: {strength(item)}" for item in faults)
         parts.append(f"The recording is at fault, not the physics: {named}.")
-        if not physics and outcome.unexplained is None:
+        if not physics and diagnosis.unexplained is None:
             parts.append("Of the physics nothing is missing beyond chance.")
-    if outcome.unexplained is not None:
-        parts.append(f"Something is left that no effect of the catalogue accounts for: {outcome.unexplained.where}.")
-    elif not outcome.reported:
+    if diagnosis.unexplained is not None:
+        parts.append(f"Something is left that no effect of the catalogue accounts for: {diagnosis.unexplained.where}.")
+    elif not diagnosis.reported:
         parts.append("Nothing is missing beyond chance.")
-    if outcome.reported or outcome.unexplained is not None:
-        parts.append(_bought(outcome))
+    if diagnosis.reported or diagnosis.unexplained is not None:
+        parts.append(_bought(diagnosis))
     return " ".join(parts)
 
 
@@ -163,22 +163,22 @@ SHOWN = 3
 """Effects that the first paragraph names when there are many."""
 
 
-def _many(outcome: Outcome, physics: list[Reported]) -> str:
+def _many(diagnosis: Diagnosis, physics: list[Reported]) -> str:
     """What a drone has that lacks much at once, how much it buys, and what to do."""
     first = "; ".join(f"{item.name} ({meaning(item.name)})" for item in physics[:SHOWN])
     more = [item.name for item in physics[SHOWN:]]
     count = f"{len(physics)} effects" if len(physics) != 1 else "one effect"
-    motors = ", beside motors of its own" if outcome.motors else ""
+    motors = ", beside motors of its own" if diagnosis.motors else ""
     has = f"The drone flies with {count} the model lacks{motors}; what buys most: {first}"
     has += f"; then {', '.join(more)}." if more else "."
-    horizon = f"@{max(outcome.before.horizons):g}s"
+    horizon = f"@{max(diagnosis.before.horizons):g}s"
     keys = {"attitude": ("attitude_mean_deg", "deg"), "velocity": ("velocity_mean_mps", "m/s")}
     before, after, still = (
         found.metrics(variant)
         for found, variant in (
-            (outcome.before, "commands_in"),
-            (outcome.after, "commands_in"),
-            (outcome.before, "hold"),
+            (diagnosis.before, "commands_in"),
+            (diagnosis.after, "commands_in"),
+            (diagnosis.before, "hold"),
         )
     )
     errors = " and ".join(
@@ -186,11 +186,11 @@ def _many(outcome: Outcome, physics: list[Reported]) -> str:
         f"{unit} (hold: {still[key + horizon]:.3g})"
         for name, (key, unit) in keys.items()
     )
-    bound = [number for item in outcome.reported for number in item.at_bound]
+    bound = [number for item in diagnosis.reported for number in item.at_bound]
     do = "Fly and train with model.yaml"
     if bound:
         do += f"; do not trust as physics what stands at the edge of what is plausible ({', '.join(bound)})"
-    other = [item.name for item in outcome.reported if any(each.contradicts for each in item.asked)]
+    other = [item.name for item in diagnosis.reported if any(each.contradicts for each in item.asked)]
     if other:
         no = ", nor" if bound else "; do not trust as physics"
         do += f"{no} what the accelerations contradict ({', '.join(other)})"
@@ -206,10 +206,10 @@ def _interval(item: Reported) -> str:
     return f" (95 % interval {low:.4g} to {high:.4g})"
 
 
-def _bought(outcome: Outcome) -> str:
+def _bought(diagnosis: Diagnosis) -> str:
     """The largest drop of a held-out error at the longest horizon."""
-    before, after = outcome.before.metrics("commands_in"), outcome.after.metrics("commands_in")
-    horizon = f"@{max(outcome.before.horizons):g}s"
+    before, after = diagnosis.before.metrics("commands_in"), diagnosis.after.metrics("commands_in")
+    horizon = f"@{max(diagnosis.before.horizons):g}s"
     keys = [key for key in before if "_rmse_" in key and key.endswith(horizon)]
     key = min(keys, key=lambda k: after[k] / before[k])
     quantity, _, unit = key.partition("@")[0].split("_")

@@ -22,7 +22,7 @@ from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.sysid.excitation.conditions import Conditions
 from cfb_mjx.sysid.excitation.experiment import TICK, Experiment, follow
 from cfb_mjx.sysid.excitation.paths import PATHS, path
-from cfb_mjx.sysid.tracing.confirmation import confirm
+from cfb_mjx.sysid.tracing.fits import confirm
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 

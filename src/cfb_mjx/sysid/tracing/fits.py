@@ -1,13 +1,21 @@
-"""A hypothesis fitted to the flights of a search, and how well it predicts them."""
+"""A hypothesis fitted to the flights of a search: how well it predicts them, and whether others bear it out."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
+from scipy.stats import norm
 
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
-from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, Linear
+from cfb_mjx.sysid.flight import Flight, prepare_flight
+from cfb_mjx.sysid.tracing.hypothesis import Fit, Hypothesis
+from cfb_mjx.sysid.tracing.innovations import CHANNELS, Blocks, Levels, innovations, levels_from
 from cfb_mjx.sysid.tracing.search import Search
 
 ERRORS = tuple(
@@ -34,25 +42,6 @@ def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
     return errors_of(predicted(search, hypothesis))
 
 
-@dataclass(frozen=True)
-class Fit:
-    """A hypothesis fitted to the flights.
-
-    Attributes:
-        hypothesis: with the values that fit.
-        linear: its derivatives by the whole catalogue; None for one among many, which may not be taken.
-        errors: (8,) `ERRORS` over all flights.
-        by_flight: (L, 8) `ERRORS` in each flight that has prediction windows.
-        beside_hold: `beside_hold` of its predictions.
-    """
-
-    hypothesis: Hypothesis
-    linear: Linear | None
-    errors: np.ndarray
-    by_flight: np.ndarray
-    beside_hold: float = 0.0
-
-
 def beside_hold(evaluation: Evaluation) -> float:
     """The larger of attitude and velocity error at the last horizon (means), over what hold errs there."""
     model, still = (evaluation.metrics(variant) for variant in ("commands_in", "hold"))
@@ -77,3 +66,73 @@ def as_it_is(search: Search, hypothesis: Hypothesis, whole: bool = True) -> Fit:
 def completed(search: Search, fit: Fit) -> Fit:
     """The fit with its derivatives by the whole catalogue."""
     return fit if fit.linear is not None else replace(fit, linear=search.whole(fit.hypothesis))
+
+
+DOMAINS = {"rotor_speed": range(6, 10), "force": (*range(3, 6), *range(10, 13)), "torque": range(3)}
+"""Channels of the innovations by where an effect acts: commands to rotor speeds, these to forces, and to torques."""
+
+
+TOGETHER = 64
+"""Blocks compared at a time: one program serves any number."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How a richer hypothesis does beside a poorer one on held-out flights.
+
+    Attributes:
+        gain: drop of half the sum of squared innovations, nats; None where predictions judged.
+        t: standard normal where the richer one explains nothing.
+        p_value: one-sided.
+        domains: the gain by `DOMAINS`.
+    """
+
+    gain: float | None
+    t: float
+    p_value: float
+    domains: dict[str, float] | None = None
+
+
+def confirm(search: Search, poorer: Hypothesis, richer: Hypothesis) -> Verdict:
+    """Compare two fitted hypotheses on the flights of ``search``, at the noise levels of the poorer one."""
+    levels = levels_from(jnp.asarray(poorer.levels), search.noise)
+    score, power, noise = np.zeros(CHANNELS + 3), np.zeros(CHANNELS + 3), 0.0
+    # The richer one first: it stays while one poorer after another is compared with it.
+    alike = poorer.shift == richer.shift
+    flights = (None, None) if alike else zip(*_matched(search, poorer, richer), strict=True)
+    left = [search.residuals(each, own) for each, own in zip((richer, poorer), reversed(list(flights)), strict=True)][
+        ::-1
+    ]
+    less, more = (
+        jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x]), *(blocks for blocks, _ in side))
+        for side in left
+    )
+    signals = jax.tree.map(lambda a, b: np.stack([a, b], axis=-1), less.signals, more.signals)
+    for first in range(0, len(less.interval), TOGETHER):
+        # The last group repeats its last block.
+        rows = np.arange(first, min(first + TOGETHER, len(less.interval)))
+        filled = np.pad(rows, (0, TOGETHER - len(rows)), mode="edge")
+        both = jax.tree.map(lambda x, r=filled: x[r], Blocks(signals, less.interval, less.valid))
+        rz, zz = (np.asarray(x)[: len(rows)] for x in _products(both, levels))
+        score, power = score + rz.sum(axis=0), power + zz.sum(axis=0)
+        noise += np.sum(np.sum(rz - zz, axis=1) ** 2)
+    t = score.sum() / np.sqrt(max(noise, power.sum(), 1e-30))
+    gain = score - 0.5 * power
+    domains = {name: float(gain[list(channels)].sum()) for name, channels in DOMAINS.items()}
+    return Verdict(float(gain.sum()), float(t), float(norm.sf(t)), domains)
+
+
+@eqx.filter_jit
+def _products(both: Blocks, levels: Levels) -> tuple[Array, Array]:
+    """Of every block and channel (b, 13): what is left times what the richer one says more, and that squared."""
+    e, _, _ = innovations(both, levels)
+    said = e[..., 0] - e[..., 1]
+    return jnp.sum(e[..., 0] * said, axis=1), jnp.sum(said**2, axis=1)
+
+
+def _matched(search: Search, poorer: Hypothesis, richer: Hypothesis) -> Iterator[tuple[Flight, Flight]]:
+    """Every flight as both read it, row by row: a shift of the motor columns costs rows at the ends and at gaps."""
+    for log in search.logs:
+        logs = [hypothesis.faults.repaired(log) for hypothesis in (poorer, richer)]
+        both = np.intersect1d(logs[0].time, logs[1].time)
+        yield tuple(prepare_flight(one.rows(np.isin(one.time, both)), *search.delays) for one in logs)

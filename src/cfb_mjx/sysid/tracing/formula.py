@@ -3,25 +3,131 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS
-from cfb_mjx.sysid.tracing.acceptance import STRUCTURE, enough, lowered
-from cfb_mjx.sysid.tracing.columns import FORMULA, Column, term_columns
-from cfb_mjx.sysid.tracing.confirmation import confirm
-from cfb_mjx.sysid.tracing.evidence import Prior, covariance, solve
-from cfb_mjx.sysid.tracing.fits import prediction_errors
-from cfb_mjx.sysid.tracing.hypothesis import LEAD_SPREAD, Hypothesis
+from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS, ResidualFormula
+from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, evidence, solve
+from cfb_mjx.sysid.tracing.fits import confirm, prediction_errors
+from cfb_mjx.sysid.tracing.hypothesis import FORMULA, LEAD_SPREAD, Column, Hypothesis, Linear, term_columns
+from cfb_mjx.sysid.tracing.rules import Rules, enough
 from cfb_mjx.sysid.tracing.search import Search
-from cfb_mjx.sysid.tracing.terms import Selection, select, with_library
 from cfb_mjx.sysid.tracing.trace import Trace
 
-SURE = 3.0
-"""A formula counts when its statistic on flights nothing was fitted to is above this."""
-THERE_ALONE = 0.2
-"""Terms that only those flights show must lower an error by this share, and by as much of the declared model's."""
+_QUADRATIC = ("n_roll^2", "n_pitch^2", "n_roll n_pitch")
+FAMILIES = {"body_terms": [_QUADRATIC], "place": [(p, f"{p}^2") for p in ("x", "y", "z")]}
+"""Terms that describe one thing only together: a force that grows towards a wall is badly told by its slope alone, and
+what one term describes badly does not stand against chance."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Terms of the library that improve blocks left out.
+
+    Attributes:
+        sure: beyond chance.
+        rare: groups of terms that gain as much, but in so few blocks that these alone are no proof.
+        gains: of every term, nats on blocks left out, when it was chosen.
+    """
+
+    sure: list[Column] = field(default_factory=list)
+    rare: list[list[Column]] = field(default_factory=list)
+    gains: dict[Column, float] = field(default_factory=dict)
+
+
+def with_library(search: Search, hypothesis: Hypothesis) -> tuple[Search, Hypothesis]:
+    """The same search and hypothesis with the (empty) formula among the effects."""
+    empty = ResidualFormula.neutral()
+    widened = replace(search, names=(*search.names, FORMULA), _flights=search._flights)
+    return widened, replace(hypothesis, effects=(*hypothesis.effects, empty), origin=(*hypothesis.origin, empty))
+
+
+def select(search: Search, hypothesis: Hypothesis, progress: Callable[[str], None] = lambda _: None) -> Selection:
+    """Choose terms beside everything found.
+
+    Args:
+        search: with the library (`with_library`).
+        hypothesis: likewise.
+        progress: told what happens.
+    """
+    own = search.own_columns(hypothesis)
+    tried = sum(len(term_columns(axis)) for axis in range(6))
+    chosen, rules = Selection(), search.rules
+    progress("looking for structure in what is left")
+    for linear in search.linearise_terms(hypothesis, own):
+        library = [c for c in linear.columns if c.effect == FORMULA and c not in own]
+        axis = _Axis(linear, linear.index(own), [[c] for c in library if not _square(c)] + _families(library), rules)
+        sure, gains = axis.forward([], lambda e: e.p_value * tried < rules.term_alpha)
+        sure = axis.pruned([c for group in sure for c in group])
+        rare, more = axis.forward(sure, lambda e: e.t > rules.term_rare)
+        chosen.sure.extend(sure)
+        chosen.rare.extend(rare)
+        chosen.gains.update(gains | more)
+    return chosen
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """Inner products along one axis: the ``base`` is free anyway, ``groups`` may be added."""
+
+    linear: Linear
+    base: list[int]
+    groups: list[list[Column]]
+    rules: Rules
+
+    def gaining(self, columns: list[Column], beside: list[Column]) -> Evidence:
+        index = self.linear.index
+        return evidence(self.linear.blocks, self.base + index(beside), index(columns), self.linear.scale)
+
+    def forward(self, picked: list[Column], stands: Callable[[Evidence], bool]):
+        """Groups added one after the other while one stands, and the gain of each of their terms."""
+        picked, added, gains = list(picked), [], {}
+        for _ in range(self.rules.per_axis):
+            rest = [[c for c in group if c not in picked] for group in self.groups]
+            found = [(self.gaining(columns, picked), columns) for columns in rest if columns]
+            passing = [pair for pair in found if pair[0].gain > self.rules.term_gain and stands(pair[0])]
+            if not passing:
+                break
+            most = max(e.gain for e, _ in passing)
+            best, columns = min(
+                (pair for pair in passing if pair[0].gain >= self.rules.of_family * most),
+                key=lambda pair: (len(pair[1]), -pair[0].gain),
+            )
+            picked += columns
+            added.append(columns)
+            gains |= dict.fromkeys(columns, best.gain)
+        return added, gains
+
+    def pruned(self, picked: list[Column]) -> list[Column]:
+        """Without terms that gain next to nothing beside the others."""
+        for column in list(picked):
+            others = [c for c in picked if c != column]
+            squared = any(_square(c) and _coordinate(c) == _coordinate(column) for c in others)
+            if others and not squared and self.gaining([column], others).gain < self.rules.term_needless:
+                picked = others
+        return picked
+
+
+def _square(column: Column) -> bool:
+    """Whether it is the square of a coordinate: alone it would say that the origin of the room means something."""
+    return column.field == "place" and list(PLACES)[column.index[1]].endswith("^2")
+
+
+def _coordinate(column: Column) -> str | None:
+    return list(PLACES)[column.index[1]].removesuffix("^2") if column.field == "place" else None
+
+
+def _families(library: list[Column]) -> list[list[Column]]:
+    """`FAMILIES` among the terms of one axis."""
+    found = []
+    for name, groups in FAMILIES.items():
+        signals = list(TERMS if name == "body_terms" else PLACES)
+        named = {signals[c.index[1]]: c for c in library if c.field == name}
+        found += [[named[s] for s in group] for group in groups if set(group) <= set(named)]
+    return found
+
+
 _WIDTH = 64
 
 
@@ -147,7 +253,7 @@ def explain(
         wider = terms + _constant_forces(terms) if instead else terms
         less, spread = fit_formula(widened, richer.without(name), wider)
         without = prediction_errors(widened, less)
-        if np.max(1 - new / without) < STRUCTURE:
+        if np.max(1 - new / without) < search.rules.structure:
             richer, deviation, new, terms = less, spread, without, wider
     plain = base
     for name in set(hypothesis.present) - set(richer.present):
@@ -174,7 +280,8 @@ def only_there(held_out: Search, hypothesis: Hypothesis) -> list[Term]:
     plain, _ = fit_formula(widened, base, [])
     richer, deviation = fit_formula(widened, base, chosen.sure)
     three = [prediction_errors(widened, each) for each in (plain, richer, widened.nothing())]
-    return terms_of(richer, deviation, chosen.gains) if enough(*three, THERE_ALONE, THERE_ALONE) else []
+    alone = held_out.rules.there_alone
+    return terms_of(richer, deviation, chosen.gains) if enough(*three, alone, alone) else []
 
 
 def _material(
@@ -184,12 +291,12 @@ def _material(
     if not terms:
         return []
     richer, _ = fit_formula(search, base, terms)
-    if lowered(found.errors, prediction_errors(search, richer), found.declared_errors):
+    if search.rules.lowered(found.errors, prediction_errors(search, richer), found.declared_errors):
         return terms
     if held_out is None:
         return []
     three = found.hypothesis, richer, held_out.nothing()
-    return terms if lowered(*(prediction_errors(held_out, each) for each in three)) else []
+    return terms if search.rules.lowered(*(prediction_errors(held_out, each) for each in three)) else []
 
 
 def _with_rare(
@@ -205,13 +312,13 @@ def _with_rare(
     more = []
     for group in chosen.rare + [known] * bool(known):
         richer, _ = fit_formula(search, base, terms + group)
-        if confirm(judge, poorer, richer).t >= SURE:
+        if confirm(judge, poorer, richer).t >= search.rules.formula_sure:
             more += group
     if not more:
         return terms
     richer, _ = fit_formula(search, base, terms + more)
     three = [prediction_errors(judge, each) for each in (poorer, richer, judge.nothing())]
-    return terms + more if lowered(*three) else terms
+    return terms + more if search.rules.lowered(*three) else terms
 
 
 def _constant_forces(terms: list[Column]) -> list[Column]:

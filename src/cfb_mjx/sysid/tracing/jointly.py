@@ -14,20 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cfb_mjx.model.effects import CATALOGUE
-from cfb_mjx.sysid.tracing.acceptance import CLEAR, SMALLEST_SHIFT, missed, significant
-from cfb_mjx.sysid.tracing.columns import SHIFT, Column, sensible
-from cfb_mjx.sysid.tracing.confirmation import confirm
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, evidence, solve
-from cfb_mjx.sysid.tracing.fits import Fit, as_it_is
-from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, Linear
+from cfb_mjx.sysid.tracing.fits import as_it_is, confirm
+from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Column, Fit, Hypothesis, Linear, sensible
 from cfb_mjx.sysid.tracing.search import Search
-
-ROUNDS = 5
-"""Looks at most."""
-STEPS = 12
-"""Of a fit at most: what is half way there makes others seem needless."""
-MOST = 20
-"""Effects taken in at most in a look."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +54,10 @@ def beside_each_other(
         return evidence(linear.blocks, index, linear.index(variant), linear.scale, known)
 
     def stands(variant: list[Column], found: Evidence) -> bool:
-        return significant(found, len(search.names)) and sensible(variant, found.values)
+        return search.stands(found) and sensible(variant, found.values)
 
     # So many times: what pushed out others may in turn be pushed out by those that came after.
-    for _ in range(MOST):
+    for _ in range(search.rules.a_look):
         names = {each.name for each in chosen}
         more = [(variant, beside(variant, chosen)) for variant in absent if variant[0].effect not in names]
         more = [Chosen(variant, found) for variant, found in more if stands(variant, found)]
@@ -92,7 +82,7 @@ def everything(search: Search, say: Callable[[str], None] = lambda _: None) -> F
     fit = as_it_is(search, search.learned(search.nothing()))
     # Late motor columns look like every lag at once: only beside the motors' own lags can they be told.
     refused, seen = {SHIFT}, {frozenset(fit.hypothesis.present)}
-    for _ in range(ROUNDS):
+    for _ in range(search.rules.looks):
         chosen = beside_each_other(search, fit.hypothesis, fit.linear, refused)
         refused, richer = set(), None
         while chosen and richer is None:
@@ -124,13 +114,13 @@ def borne_out(search: Search, fit: Fit, say: Callable[[str], None] = lambda _: N
         worth = {}
         for name, (found, without) in one_by_one(search, fit.hypothesis).items():
             less = as_it_is(search, without, whole=False)
-            if not missed(less, fit, found.t >= CLEAR):
+            if not search.rules.missed(less, fit, found.t >= search.rules.clear):
                 worth[name] = _total(less)
         if not worth:
             return fit
         least = sorted(worth, key=worth.get)[:2]
         say(f"leaving out {' or '.join(least)}")
-        tried = [search.settled(fit.hypothesis.without(name), STEPS, shrunk=True) for name in least]
+        tried = [search.settled(fit.hypothesis.without(name), search.rules.look_steps, shrunk=True) for name in least]
         fit = min((as_it_is(search, each, whole=False) for each in tried), key=_total)
     return fit
 
@@ -164,12 +154,8 @@ def needless(search: Search, hypothesis: Hypothesis) -> dict[str, Evidence]:
             for name in hypothesis.present
             if name not in gone
         }
-        small = SHIFT in left and abs(hypothesis.shift) < SMALLEST_SHIFT
-        doubted = {
-            name: found
-            for name, found in left.items()
-            if not significant(found, len(search.names)) or (name == SHIFT and small)
-        }
+        small = SHIFT in left and abs(hypothesis.shift) < search.rules.smallest_shift
+        doubted = {name: found for name, found in left.items() if not search.stands(found) or (name == SHIFT and small)}
         if not doubted:
             return gone
         least = min(doubted, key=lambda name: doubted[name].gain)
@@ -186,11 +172,11 @@ def _with(search: Search, hypothesis: Hypothesis, linear: Linear, chosen: list[C
     for each in chosen:
         start = replace(each.found, values=np.array([next(values) for _ in each.variant]))
         hypothesis = search.with_candidate(hypothesis, each.variant, start)
-    hypothesis = search.settled(hypothesis, STEPS, shrunk=True)
+    hypothesis = search.settled(hypothesis, search.rules.look_steps, shrunk=True)
     gone = needless(search, hypothesis)
     for name in gone:
         hypothesis = hypothesis.without(name)
-    return search.settled(hypothesis, STEPS, shrunk=True) if gone else hypothesis
+    return search.settled(hypothesis, search.rules.look_steps, shrunk=True) if gone else hypothesis
 
 
 def _for_what_is_there(

@@ -7,20 +7,20 @@ the same zero-phase Gaussian, so neither lags the other, and the driving signals
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import comb
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from scipy.ndimage import median_filter
+from scipy.signal import lombscargle
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import to_body
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.sysid.flight import Flight, delay_of, prepare_flight
-from cfb_mjx.sysid.tracing.gram import driven_by, residual_blocks
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.innovations import Blocks, driven_by, residual_blocks
 from cfb_mjx.sysid.tracing.search import Search
-from cfb_mjx.sysid.tracing.whitening import Blocks
 
 WIDTH = 0.02
 """Standard deviation of the Gaussian, s: half of what moves at 6 Hz passes."""
@@ -88,9 +88,11 @@ class Residuals:
 
 def residual_rows(search: Search, hypothesis: Hypothesis) -> list[Residuals]:
     """What a hypothesis misses along every flight of a search."""
+    flights = search.flights(hypothesis)
+    found = search.residuals(hypothesis)
     return [
-        _one(search, hypothesis, flight, log.name)
-        for log, flight in zip(search.logs, search.flights(hypothesis), strict=True)
+        _rows(blocks, driven, flight, log.name)
+        for log, flight, (blocks, driven) in zip(search.logs, flights, found, strict=True)
     ]
 
 
@@ -104,16 +106,12 @@ def model_residuals(model: Quadrotor, log: FlightLog, delay: float | None = None
     """
     delay = delay_of(log, model.parameters) if delay is None else delay
     flight = prepare_flight(log, delay, float(model.parameters.gyro_delay))
-    driven = driven_by(model, flight, 0.0)
-    rows = _rows(residual_blocks(model, flight, driven, jnp.zeros(())), driven, flight, log.name)
-    return rows, np.asarray(driven)[: len(log)]
+    (driven,) = driven_by(model, [flight], 0.0)
+    (blocks,) = residual_blocks(model, [flight], [driven], 0.0)
+    return _rows(blocks, driven, flight, log.name), driven[: len(log)]
 
 
-def _one(search: Search, hypothesis: Hypothesis, flight: Flight, name: str) -> Residuals:
-    return _rows(*search.residual(hypothesis, flight), flight, name)
-
-
-def _rows(blocks: Blocks, driven: Array, flight: Flight, name: str) -> Residuals:
+def _rows(blocks: Blocks, driven: np.ndarray, flight: Flight, name: str) -> Residuals:
     # Blocks and padding only serve the compiler: the flight again, in one piece.
     n = int(np.sum(np.asarray(flight.interval) > 0)) + 1
     quantity = np.asarray(blocks.signals.quantity).reshape(-1, 10)[:n]
@@ -193,3 +191,124 @@ def aligned(a: list[Residuals], b: list[Residuals]) -> tuple[list[Residuals], li
         both = one.valid[i] & two.valid[j]
         pairs.append((one.rows(i, both), two.rows(j, both)))
     return [p[0] for p in pairs], [p[1] for p in pairs]
+
+
+SPAN = 4.0
+"""Seconds of one spectrum; those of all flights are averaged."""
+HIGHEST = 12.0
+"""Hz: above, the Gaussian leaves nothing to see."""
+
+
+def spectra(rows: list[Residuals]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Frequency (f,) Hz and power spectral density (f,), unit^2/Hz, by residual axis of the body; rotors together.
+
+    Stretches shorter than `SPAN` are left out, and so are axes of which nothing is long enough.
+    """
+    from scipy.signal import welch
+
+    found: dict[str, list] = {}
+    for flight in rows:
+        step = float(np.median(np.diff(flight.time)))
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], flight.valid.astype(int), [0]])))
+        for begin, end in edges.reshape(-1, 2):
+            time = flight.time[begin:end]
+            grid = np.arange(time[0], time[-1], step)
+            if len(grid) * step < SPAN:
+                continue
+            for name, (values, _) in flight.axes().items():
+                # World axes would only repeat the body's.
+                if name.startswith("world") or not np.isfinite(values[begin:end]).all():
+                    continue
+                even = np.interp(grid, time, values[begin:end])
+                frequency, density = welch(even, 1 / step, nperseg=int(SPAN / step), detrend=False)
+                # Flights are sampled at about the same rate; one grid lets them be averaged.
+                common = np.arange(1, HIGHEST * SPAN + 1) / SPAN
+                key = "rotor" if name.startswith("rotor") else name
+                found.setdefault(key, []).append((np.interp(common, frequency, density), len(grid)))
+    return {
+        key: (common, np.average([d for d, _ in parts], axis=0, weights=[w for _, w in parts]))
+        for key, parts in found.items()
+    }
+
+
+def sensor_spectra(frequency: np.ndarray, noise: dict[str, np.ndarray], interval: float) -> dict[str, np.ndarray]:
+    """Densities (f,) that white noise of the sensors leaves behind the Gaussian, by residual axis.
+
+    Args:
+        frequency: Hz.
+        noise: of a row, as from `sensor_noise`.
+        interval: between rows, s.
+    """
+    turn = 2 * np.pi * frequency
+    passed = 2 * interval * np.exp(-((turn * WIDTH) ** 2))
+    found = {f"torque {a}": passed * turn**2 * float(noise["gyro"][i]) ** 2 for i, a in enumerate("xyz")}
+    found |= {f"force {a}": passed * float(noise["accelerometer"]) ** 2 for a in "xyz"}
+    return found | {"rotor": passed * float(noise["rotor"]) ** 2}
+
+
+LOWEST, SPACING = 0.4, 0.03
+"""Hz: where lines are looked for, up to `HIGHEST`."""
+NEIGHBOURS = 41
+"""Frequencies whose median power is the background of a line."""
+RATE = 40.0
+"""Rows a second that are kept: residuals are smooth beyond."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of one residual axis.
+
+    Attributes:
+        axis: for instance ``torque x``.
+        frequency: Hz.
+        amplitude: rms over the flights, in ``unit``.
+        unit: of the residual.
+        p_value: that so many flights have it by chance, times the number of places looked at.
+    """
+
+    axis: str
+    frequency: float
+    amplitude: float
+    unit: str
+    p_value: float
+
+    def __str__(self) -> str:
+        return (
+            f"{self.axis} swings at {self.frequency:.2f} Hz by {self.amplitude:.2g} {self.unit} rms whatever is flown"
+        )
+
+
+def find_lines(rows: list[Residuals], alpha: float = 1e-4) -> list[Line]:
+    """Lines that two thirds of the flights or more share, the clearest first.
+
+    A manoeuvre has frequencies of its own, which an imperfect model shows too; so a line must stand in most flights.
+    """
+    rows = [r for r in rows if r.valid.sum() > 1000]
+    if len(rows) < 3:
+        return []
+    frequencies = np.arange(LOWEST, HIGHEST, SPACING)
+    enough = int(np.ceil(2 * len(rows) / 3))
+    found = []
+    names = [name for name in rows[0].axes() if not name.startswith("rotor")]
+    for name in names:
+        powers, sizes = zip(*(_spectrum(r, name, frequencies) for r in rows), strict=True)
+        # Of noise each is exponential; the weakest of the flights that must agree decides.
+        weakest = np.sort(np.array(powers), axis=0)[len(rows) - enough]
+        best = int(np.argmax(weakest))
+        chance = comb(len(rows), enough) * np.exp(-enough * weakest[best])
+        p_value = float(min(1.0, chance * len(frequencies) * len(names)))
+        if p_value < alpha:
+            amplitude = float(np.sqrt(np.median([s[best] for s in sizes]) / 2))
+            found.append(Line(name, float(frequencies[best]), amplitude, rows[0].axes()[name][1], p_value))
+    return sorted(found, key=lambda line: line.p_value)
+
+
+def _spectrum(row: Residuals, name: str, frequencies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Power over background, and squared amplitude, at each frequency."""
+    step = max(1, round(1 / RATE / np.median(np.diff(row.time))))
+    keep = np.flatnonzero(row.valid > 0)[::step]
+    values = row.axes()[name][0][keep]
+    values = values - values.mean()
+    power = lombscargle(row.time[keep], values, 2 * np.pi * frequencies)
+    background = median_filter(power, NEIGHBOURS, mode="nearest") / np.log(2)
+    return power / np.maximum(background, 1e-12), 4 * power / len(keep)

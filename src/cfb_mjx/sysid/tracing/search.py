@@ -9,28 +9,49 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import CATALOGUE, Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.sensor_faults import SensorFaults
-from cfb_mjx.sysid.tracing import columns as cols
-from cfb_mjx.sysid.tracing.columns import LEAD, Column
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, evidence, solve
-from cfb_mjx.sysid.tracing.gram import (
+from cfb_mjx.sysid.tracing.hypothesis import (
+    FORMULA,
+    LEAD,
+    LEAD_RANGE,
+    LEAD_SPREAD,
+    LEAD_USUAL,
+    SHIFT,
+    Column,
+    Hypothesis,
+    Linear,
+    bounds,
+    coarse,
+    moved,
+    moves,
+    neutral_effects,
+    sensible,
+    shapes,
+    shift_column,
+    strengths,
+    term_columns,
+)
+from cfb_mjx.sysid.tracing.innovations import (
+    Blocks,
+    Signals,
     driven_by,
+    fit_levels,
     inner_products,
+    levels_from,
     residual_blocks,
+    sensor_noise,
     term_slopes,
     term_squares,
     with_slopes,
 )
-from cfb_mjx.sysid.tracing.hypothesis import LEAD_RANGE, LEAD_SPREAD, LEAD_USUAL, Hypothesis, Linear
-from cfb_mjx.sysid.tracing.noise import sensor_noise
+from cfb_mjx.sysid.tracing.rules import RULES, Rules
 from cfb_mjx.sysid.tracing.sensors import SensorCheck
-from cfb_mjx.sysid.tracing.whitening import Blocks, Signals, fit_levels, levels_from
 
 STILL = 0.3
 """Steps below this share of a standard deviation end a fit."""
@@ -42,6 +63,8 @@ FILTERED_GYRO = 0.1
 """Level given to a low-pass filtered gyro, rad/s: only what it shows slowly is believed."""
 SAMPLE = 32
 """Blocks from which noise levels are learned: about a minute, many times longer than what wanders."""
+KNOWN = 2
+"""Hypotheses whose residuals are kept."""
 PAD = 16
 """Columns are padded to a multiple of this with copies of the lead, so that one compiled program serves all rounds."""
 
@@ -58,7 +81,14 @@ class Search:
     names: tuple[str, ...]
     declared: tuple[Effect, ...] = ()
     """Effects the declared model has already."""
+    rules: Rules = RULES
     _flights: dict[float, list[Flight]] = field(default_factory=dict)
+    _known: list[tuple[Hypothesis, list]] = field(default_factory=list)
+    """The last `residuals`."""
+
+    def __post_init__(self):
+        # A search that replaces another knows nothing of its residuals.
+        self._known = []
 
     @classmethod
     def start(
@@ -69,6 +99,7 @@ class Search:
         sensors: SensorCheck,
         declared: tuple[Effect, ...] = (),
         named: Sequence[str] = (),
+        rules: Rules = RULES,
     ) -> Search:
         """Prepare flights, with what is known of their sensors taken out, for a search over the catalogue.
 
@@ -78,7 +109,7 @@ class Search:
         noise = sensor_noise(logs, FILTERED_GYRO if sensors.faults.gyro_lag else 1e-3)
         asked_for = {*named, *(type(effect).name for effect in declared)}
         looked_for = tuple(name for name, kind in CATALOGUE.items() if kind.searched or name in asked_for)
-        return cls(parameters, logs, delay, noise, looked_for, declared)
+        return cls(parameters, logs, delay, noise, looked_for, declared, rules)
 
     @property
     def delays(self) -> tuple[float, float]:
@@ -93,11 +124,27 @@ class Search:
             self._flights[key] = [prepare_flight(faults.repaired(log), *self.delays) for log in self.logs]
         return self._flights[key]
 
-    def residual(self, hypothesis: Hypothesis, flight: Flight) -> tuple[Blocks, Array]:
-        """What a hypothesis misses along one of `flights`, and the rotor speeds (n, 4) that drove the body."""
+    def residuals(
+        self, hypothesis: Hypothesis, flights: Sequence[Flight] | None = None
+    ) -> list[tuple[Blocks, np.ndarray]]:
+        """What a hypothesis misses along `flights` (or others), and the rotor speeds (n, 4) that drove the body."""
+        if flights is None:
+            # One after another is compared with the same corrected model.
+            kept = [found for known, found in self._known if known is hypothesis]
+            if kept:
+                self._keep(hypothesis, kept[0])
+                return kept[0]
         model = hypothesis.model(self.parameters)
-        driven = driven_by(model, flight, hypothesis.lead)
-        return residual_blocks(model, flight, driven, jnp.asarray(hypothesis.lead)), driven
+        own = self.flights(hypothesis) if flights is None else flights
+        driven = driven_by(model, own, hypothesis.lead)
+        found = list(zip(residual_blocks(model, own, driven, hypothesis.lead), driven, strict=True))
+        if flights is None:
+            self._keep(hypothesis, found)
+        return found
+
+    def _keep(self, hypothesis: Hypothesis, found: list[tuple[Blocks, np.ndarray]]) -> None:
+        others = [pair for pair in self._known if pair[0] is not hypothesis]
+        self._known = [(hypothesis, found), *others[: KNOWN - 1]]
 
     def beside(self, logs: list[FlightLog], sensors: SensorCheck) -> Search:
         """The same search on other flights of the drone."""
@@ -106,12 +153,12 @@ class Search:
     def nothing(self) -> Hypothesis:
         """The declared model."""
         given = {type(e).name: e for e in self.declared}
-        effects = tuple(given.get(type(e).name, e) for e in cols.neutral_effects(self.names))
+        effects = tuple(given.get(type(e).name, e) for e in neutral_effects(self.names))
         return Hypothesis(effects, origin=effects)
 
     def learned(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis with the noise levels that fit what it leaves."""
-        pieces = [self.residual(hypothesis, flight)[0] for flight in self.flights(hypothesis)]
+        pieces = [blocks for blocks, _ in self.residuals(hypothesis)]
         blocks = Blocks(*(_joined([getattr(p, k) for p in pieces]) for k in ("signals", "interval", "valid")))
         return replace(hypothesis, levels=fit_levels(_sample(blocks), self.noise, hypothesis.levels))
 
@@ -128,7 +175,7 @@ class Search:
         sizes = np.sqrt(np.mean(squares, axis=0))
         found = []
         for axis in range(6):
-            library = cols.term_columns(axis, sizes)
+            library = term_columns(axis, sizes)
             signals = []
             for flight, speed, some in zip(self.flights(hypothesis), driven, beside, strict=True):
                 terms = term_slopes(model, flight, speed, jnp.asarray(axis))
@@ -136,9 +183,8 @@ class Search:
             found.append(Linear(columns + library, self._products(hypothesis, signals)))
         return found
 
-    def _driven(self, hypothesis: Hypothesis) -> list[Array]:
-        model = hypothesis.model(self.parameters)
-        return [driven_by(model, flight, hypothesis.lead) for flight in self.flights(hypothesis)]
+    def _driven(self, hypothesis: Hypothesis) -> list[np.ndarray]:
+        return driven_by(hypothesis.model(self.parameters), self.flights(hypothesis), hypothesis.lead)
 
     def _products(self, hypothesis: Hypothesis, signals: list[Signals]) -> np.ndarray:
         levels = levels_from(jnp.asarray(hypothesis.levels), self.noise)
@@ -146,35 +192,39 @@ class Search:
         return np.concatenate([np.asarray(inner_products(flight, one, levels)) for flight, one in pairs])
 
     def _slopes(
-        self, hypothesis: Hypothesis, wanted: list[Column], driven: list[Array], width: int = 0
+        self, hypothesis: Hypothesis, wanted: list[Column], driven: list[np.ndarray], width: int = 0
     ) -> tuple[list[Signals], list[Column]]:
         """Residuals and derivatives of every flight, and the (padded) columns they belong to."""
         lead = Column(LEAD, LEAD, None, (), 0.25)
         columns = [lead, *wanted]
         padded = columns + [lead] * max(-(len(columns) + 1) % PAD, width - 1 - len(columns))
-        moves = cols.moves(hypothesis.effects, hypothesis.lead, padded, set(hypothesis.present))
+        changed = moves(hypothesis.effects, hypothesis.lead, padded, set(hypothesis.present))
         model = hypothesis.model(self.parameters)
-        models = eqx.tree_at(lambda m: m.effects, model, moves.effects)
-        steps = [jnp.asarray(x) for x in (moves.lead, moves.shift, moves.step)]
+        models = eqx.tree_at(lambda m: m.effects, model, changed.effects)
+        steps = [jnp.asarray(x) for x in (changed.lead, changed.shift, changed.step)]
         pairs = zip(self.flights(hypothesis), driven, strict=True)
         return [with_slopes(models, *pair, *steps) for pair in pairs], padded
 
     # -- one hypothesis -------------------------------------------------------------------------------------------
 
+    def stands(self, found: Evidence) -> bool:
+        """Whether evidence for an effect is beyond chance after a look at all of them."""
+        return self.rules.significant(found, len(self.names))
+
     def candidates(self) -> list[list[Column]]:
         """Columns of every effect and probe."""
-        return [[cols.shift_column()]] + [variant for name in self.names for variant in cols.strengths(name)]
+        return [[shift_column()]] + [variant for name in self.names for variant in strengths(name)]
 
     def own_columns(self, hypothesis: Hypothesis, guessed: bool = False) -> list[Column]:
         """Columns of what is there: strengths and shapes, but no shapes where the strength may be a mere guess."""
         found = []
         for name in hypothesis.present:
-            if name == cols.SHIFT:
-                found.append(cols.shift_column())
+            if name == SHIFT:
+                found.append(shift_column())
                 continue
-            found += cols.strengths(name)[0]
-            if not (guessed and cols.coarse(name)):
-                found += cols.shapes(hypothesis.effect(name))
+            found += strengths(name)[0]
+            if not (guessed and coarse(name)):
+                found += shapes(hypothesis.effect(name))
         return [replace(c, probe=()) for c in found] + list(hypothesis.terms)
 
     def whole(self, hypothesis: Hypothesis) -> Linear:
@@ -225,7 +275,7 @@ class Search:
         """Of steps: that numbers are not far, by half the range of what is plausible, from the declared ones."""
         away = []
         for column in columns:
-            if column.effect == cols.SHIFT:
+            if column.effect == SHIFT:
                 away.append(-hypothesis.shift / column.scale)
                 continue
             here, there = (
@@ -240,14 +290,14 @@ class Search:
         effects = {type(e).name: e for e in hypothesis.effects}
         shift = hypothesis.shift
         for column, change in zip(own, by[1:], strict=True):
-            if column.effect == cols.SHIFT:
+            if column.effect == SHIFT:
                 shift = float(np.clip(shift + change, -0.05, 0.05))
                 continue
-            if column.effect == cols.FORMULA:
-                effects[column.effect] = cols.moved(effects[column.effect], column, float(change), True)
+            if column.effect == FORMULA:
+                effects[column.effect] = moved(effects[column.effect], column, float(change), True)
                 continue
-            effect = cols.moved(effects[column.effect], column, float(change), True)
-            value = np.clip(getattr(effect, column.field), *cols.bounds(column.effect, column.field))
+            effect = moved(effects[column.effect], column, float(change), True)
+            value = np.clip(getattr(effect, column.field), *bounds(column.effect, column.field))
             effects[column.effect] = eqx.tree_at(lambda e, f=column.field: getattr(e, f), effect, jnp.asarray(value))
         lead = float(np.clip(hypothesis.lead + by[0], *LEAD_RANGE))
         found = tuple(effects[type(e).name] for e in hypothesis.effects)
@@ -258,7 +308,7 @@ class Search:
         # Not beside a free lead: late commands would look like one.
         base = linear.index(self.own_columns(hypothesis))
         found = evidence(linear.blocks, base, linear.index(variant), linear.scale)
-        return found if cols.sensible(variant, found.values) else None
+        return found if sensible(variant, found.values) else None
 
     def probes(self, hypothesis: Hypothesis, linear: Linear) -> dict[str, tuple[Evidence, list[Column]]]:
         """Every absent effect whose sign makes sense, at the probe that gains most."""
@@ -275,12 +325,12 @@ class Search:
     def with_candidate(self, hypothesis: Hypothesis, variant: list[Column], found: Evidence) -> Hypothesis:
         """The hypothesis with a candidate at the values the linear fit gives it."""
         name = variant[0].effect
-        if name == cols.SHIFT:
+        if name == SHIFT:
             shift = hypothesis.shift + float(found.values[0]) * variant[0].scale
             return replace(hypothesis, present=(*hypothesis.present, name), shift=shift)
         effect = hypothesis.effect(name)
         for column, value in zip(variant, found.values, strict=True):
-            effect = cols.moved(effect, column, float(value) * column.scale, False)
+            effect = moved(effect, column, float(value) * column.scale, False)
         return hypothesis.having(effect)
 
 

@@ -1,4 +1,9 @@
-"""Which sensors are at fault, by comparing them with each other (`kinematics`), pooled over flights."""
+"""What the sensors say about each other, without any model of the drone: biases, lags and scales.
+
+A gyro integrated over a while must turn the attitude as far as the pose says it turned, an accelerometer integrated
+must change the velocity as it changed, and velocity must move the position. Where they do not, a sensor is at fault,
+not the physics; and what is found here is taken out before any effect is looked for.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +13,185 @@ import numpy as np
 from scipy.stats import norm
 
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.resample import interpolate
+from cfb_mjx.logs.rotation import tidy
+from cfb_mjx.logs.rotation import to_world as rotate
 from cfb_mjx.model.effects import SENSOR_FAULTS
+from cfb_mjx.sysid.flight import with_gyro_in_time
 from cfb_mjx.sysid.sensor_faults import ATTRIBUTES, SensorFaults
-from cfb_mjx.sysid.tracing.kinematics import Kinematics, compare_sensors
+
+SHORT, LONG = 0.12, 0.6
+"""Spans of the comparisons, s: short ones show lags, long ones biases and scales."""
+LAGS = np.arange(-0.024, 0.0681, 0.004)
+
+
+@dataclass(frozen=True)
+class Kinematics:
+    """Of one log.
+
+    Attributes:
+        gyro_bias: (3,) rad/s.
+        accelerometer_bias: (3,) m/s^2, body axes.
+        attitude_lag: pose behind gyro beyond the declared delay, s.
+        velocity_lag: velocity behind accelerometer beyond the declared delay, s.
+        velocity_scale: velocity over slope of position.
+        horizontal_scale: the same of the horizontal components alone.
+        vertical_scale: the same of the vertical component alone.
+        weight: how much motion there was to tell each of the five from (inverse variances), for pooling.
+    """
+
+    gyro_bias: np.ndarray
+    accelerometer_bias: np.ndarray
+    attitude_lag: float
+    velocity_lag: float
+    velocity_scale: float
+    horizontal_scale: float
+    vertical_scale: float
+    weight: np.ndarray
+
+
+def compare_sensors(log: FlightLog, delay: float, gyro_delay: float, gravity: float = 9.81) -> Kinematics:
+    """Compare the sensors of one log.
+
+    Args:
+        log: the flight.
+        delay: declared age of pose and velocity, s.
+        gyro_delay: declared age of the gyro's reading, s.
+        gravity: m/s^2.
+    """
+    log = with_gyro_in_time(log, gyro_delay)
+    step = log.nominal_interval
+    grid = np.arange(log.time[0], log.time[-1], step)
+    covered = _covered(log, grid)
+
+    def at(values, shift=0.0):
+        return interpolate(log.time, values, grid + shift)
+
+    quaternion = tidy(at(tidy(log.quaternion), delay))
+    velocity, position = at(log.velocity, delay), at(log.position, delay)
+    world = rotate(quaternion, at(log.specific_force)) - [0, 0, gravity]
+    gyro = at(log.body_rate)
+
+    long = max(4, round(LONG / step))
+    ok_long = _spans(covered, long, 0.1, step)
+    gyro_bias = _gyro_bias(quaternion, gyro, long, step, ok_long)
+    accelerometer_bias = _accelerometer_bias(quaternion, velocity, world, long, step, ok_long)
+    scale, scale_weight = _scale(position, velocity, long, step, ok_long)
+    horizontal, horizontal_weight = _scale(position[:, :2], velocity[:, :2], long, step, ok_long)
+    vertical, vertical_weight = _scale(position[:, 2:], velocity[:, 2:], long, step, ok_long)
+
+    short = max(4, round(SHORT / step))
+    ok = _spans(covered, short, LAGS[-1] + step, step)
+    turned = _turned(quaternion, short)
+    gyro_sum = _integral(gyro - gyro_bias, step)
+    attitude_lag, attitude_weight = _lag(lambda lag: turned - _span(gyro_sum, short, lag, step), ok)
+    gained = (velocity[short:] - velocity[:-short]) / scale
+
+    def unexplained(lag):
+        # Attitude and velocity come late together; only the accelerometer is moved to meet them.
+        force = at(log.specific_force, -lag) - accelerometer_bias
+        return gained - _span(_integral(rotate(quaternion, force) - [0, 0, gravity], step), short, 0.0, step)
+
+    velocity_lag, velocity_weight = _lag(unexplained, ok)
+    return Kinematics(
+        gyro_bias,
+        accelerometer_bias,
+        attitude_lag,
+        velocity_lag,
+        scale,
+        horizontal,
+        vertical,
+        np.array([attitude_weight, velocity_weight, scale_weight, horizontal_weight, vertical_weight]),
+    )
+
+
+def _covered(log: FlightLog, grid: np.ndarray) -> np.ndarray:
+    """Whether an instant lies in no gap."""
+    inside = np.ones(len(grid), dtype=bool)
+    for i in log.gaps():
+        inside &= ~((grid > log.time[i] - 0.02) & (grid < log.time[i + 1] + 0.02))
+    return inside
+
+
+def _spans(covered: np.ndarray, rows: int, margin: float, step: float) -> np.ndarray:
+    """Starts (len - rows) of spans that touch no gap, with a margin on both sides."""
+    reach = int(np.ceil(margin / step))
+    bad = np.concatenate([[0], np.cumsum(~covered)])
+    starts = np.arange(len(covered) - rows)
+    low, high = starts - reach, starts + rows + reach
+    inside = (low >= 0) & (high < len(covered))
+    return inside & (bad[np.clip(high, 0, len(covered) - 1)] - bad[np.clip(low, 0, len(covered) - 1)] == 0)
+
+
+def _integral(values: np.ndarray, step: float) -> np.ndarray:
+    begin = np.zeros((1, values.shape[1]))
+    return np.concatenate([begin, np.cumsum(0.5 * (values[1:] + values[:-1]) * step, axis=0)])
+
+
+def _span(total: np.ndarray, rows: int, lag: float, step: float) -> np.ndarray:
+    """Differences of an integral over spans that begin ``lag`` seconds earlier."""
+    index = np.arange(len(total))
+    moved = interpolate(index, total, index - lag / step)
+    return moved[rows:] - moved[:-rows]
+
+
+def _turned(quaternion: np.ndarray, rows: int) -> np.ndarray:
+    """Rotation vectors over spans, body axes of the middle (a gyro integral without commutator to second order)."""
+    p, q = quaternion[:-rows], quaternion[rows:]
+    w = np.sum(p * q, axis=1)
+    vector = p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - np.cross(p[:, 1:], q[:, 1:])
+    vector = np.where(w[:, None] < 0, -vector, vector)
+    size = np.linalg.norm(vector, axis=1)
+    angle = 2 * np.arctan2(size, np.abs(w))
+    return vector * (angle / np.maximum(size, 1e-12))[:, None]
+
+
+def _gyro_bias(quaternion, gyro, rows, step, ok) -> np.ndarray:
+    # Short spans chained: over long ones rotation vectors do not add up.
+    short = max(2, rows // 8)
+    missing = _span(_integral(gyro, step), short, 0.0, step) - _turned(quaternion, short)
+    ok = np.append(ok, np.zeros(rows - short, dtype=bool)) if len(ok) < len(missing) else ok[: len(missing)]
+    return np.mean(missing[ok], axis=0) / (short * step) if ok.any() else np.zeros(3)
+
+
+def _accelerometer_bias(quaternion, velocity, world, rows, step, ok) -> np.ndarray:
+    missing = _span(_integral(world, step), rows, 0.0, step) - (velocity[rows:] - velocity[:-rows])
+    axes = [_integral(rotate(quaternion, np.tile(np.eye(3)[i], (len(quaternion), 1))), step) for i in range(3)]
+    columns = np.stack([_span(axis, rows, 0.0, step) for axis in axes], axis=-1)
+    if ok.sum() < 3 * rows:
+        return np.zeros(3)
+    pick = np.flatnonzero(ok)[:: max(1, rows // 8)]
+    a, b = columns[pick].reshape(-1, 3), missing[pick].reshape(-1)
+    # Plausible biases are below 0.2 m/s^2; level flight alone cannot tell the scale of gravity from a bias along z.
+    return np.linalg.solve(a.T @ a + np.eye(3) * 1e-9, a.T @ b)
+
+
+def _scale(position, velocity, rows, step, ok) -> tuple[float, float]:
+    """Velocity over slope of position, and the inverse variance of that number."""
+    moved = position[rows:] - position[:-rows]
+    said = _span(_integral(velocity, step), rows, 0.0, step)
+    pick = np.flatnonzero(ok)[:: max(1, rows // 4)]
+    if len(pick) < 8:
+        return 1.0, 0.0
+    x, y = moved[pick].reshape(-1), said[pick].reshape(-1)
+    scale = float(x @ y / (x @ x))
+    left = y - scale * x
+    return scale, float(x @ x / max(np.mean(left**2), 1e-12)) / 4
+
+
+def _lag(missing, ok) -> tuple[float, float]:
+    """The lag with the smallest sum of squares, between grid points by a parabola, and its inverse variance."""
+    if ok.sum() < 50:
+        return 0.0, 0.0
+    losses = np.array([np.mean(missing(lag)[ok] ** 2) for lag in LAGS])
+    best = int(np.clip(np.argmin(losses), 1, len(LAGS) - 2))
+    before, here, after = losses[best - 1 : best + 2]
+    curve = before - 2 * here + after
+    width = LAGS[1] - LAGS[0]
+    lag = LAGS[best] + (0.5 * width * (before - after) / curve if curve > 0 else 0.0)
+    samples = ok.sum() / 8
+    return float(lag), float(samples * max(curve, 0.0) / width**2 / max(here, 1e-12))
+
 
 SMALLEST = {"sensor_delay": 0.003, "sensor_gyro_lowpass": 0.0025, "sensor_velocity_scale": 0.01}
 """Faults below this are left alone: every estimator and filter has some."""

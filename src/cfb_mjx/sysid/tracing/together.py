@@ -34,12 +34,10 @@ from cfb_mjx.sysid.refinement import Number, Refinement, plausible_numbers, refi
 from cfb_mjx.sysid.refinement.numbers import HELD, PLANT
 from cfb_mjx.sysid.refinement.predictions import kinds_alike
 from cfb_mjx.sysid.rotors.flown_motors import Motors, flown_motors
-from cfb_mjx.sysid.tracing import columns as cols
-from cfb_mjx.sysid.tracing.acceptance import CLEAR
-from cfb_mjx.sysid.tracing.columns import SHIFT, Column
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
 from cfb_mjx.sysid.tracing.fits import beside_hold
-from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Column, Hypothesis, moved, neutral_effects, strengths
+from cfb_mjx.sysid.tracing.rules import Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.trace import line_of
 
@@ -49,45 +47,6 @@ OF_MOTORS = ("command_delay", "motor_asymmetry", "battery_sag")
 """Of `OWN`, what measured rotor speeds tell."""
 MOTORS = (*OF_MOTORS, "motor_gain_mismatch", "motor_time_constant", "motor_second_order", "motor_thermal_drift")
 """Effects that are not looked for where the motors were fitted to rotor speeds."""
-
-
-@dataclass(frozen=True)
-class Rules:
-    """What is tried and what stays; shares of the loss, an error over what `hold` errs."""
-
-    steps: int = 12
-    """Of a fit at most."""
-    tried: int = 2
-    """Candidates of step 3 tried at a time, the likeliest first."""
-    rounds: int = 3
-    """Of step 3 at most."""
-    trial_steps: int = 5
-    """Of a trial at most."""
-    better: float = 0.2
-    """The whole must lower a search's error beside hold by this share, or the search's own findings stand."""
-    motor_rows: int = 12_000
-    """That the motors are fitted to, about: the middles of flights."""
-    motor_piece: float = 3.0
-    """Seconds of a flight at least, of so many flights evenly spread as that allows."""
-    windows: int = 400
-    """Predicted at most in a fit."""
-    gain: float = 0.05
-    """A candidate must lower the loss by this share, half of it in its first step."""
-    worth: float = 0.005
-    """An effect must lower it by this share beside all others."""
-    confused: float = 0.9
-    """Correlation of two effects' numbers from which they are hardly told apart."""
-    spreads: float = 2.0
-    """Standard deviations between drones that a declared number may move."""
-    sure: float = 2.3
-    """Standard deviations by which held-out flights must bear an effect out."""
-    contradicts: float = 4.0
-    """Standard deviations from which innovations contradict predictions, if they differ by ``differs`` at least."""
-    differs: float = 0.5
-    """As a share of the larger of both."""
-
-
-RULES = Rules()
 
 
 @dataclass(frozen=True)
@@ -160,17 +119,16 @@ def fit_together(
     base: ModelFile,
     search: Search,
     say: Callable[[str], None] = lambda _: None,
-    rules: Rules = RULES,
 ) -> Together:
     """Fit all that a drone lacks at once.
 
     Args:
         logs: flights to fit, as recorded; run with x64 enabled.
         base: the declared model.
-        search: over the same flights, for what the innovations say.
+        search: over the same flights, for what the innovations say; its rules count.
         say: told what happens.
-        rules: what is tried and what stays.
     """
+    rules = search.rules
     if any(log.rotor_speed is not None for log in logs):
         say("fitting the motors to the rotor speeds")
     motors = flown_motors(logs, base.parameters(), rules.motor_rows, rules.motor_piece)
@@ -191,7 +149,7 @@ def fit_together(
         ranking = ranked(search, found.model, refused)
         tried.append({"present": _names(found.model), "ranking": [line_of(v, e) for e, v in ranking[:8]]})
         better = None
-        clear = [(evidence, variant) for evidence, variant in ranking if evidence.t > CLEAR]
+        clear = [(evidence, variant) for evidence, variant in ranking if evidence.t > rules.clear]
         for evidence, variant in clear[: rules.tried]:
             name = variant[0].effect
             say(f"trying {name} beside the others")
@@ -261,7 +219,7 @@ def _started(base: ModelFile, motors: Motors) -> Quadrotor:
 
 def hypothesis_of(search: Search, model: Quadrotor, absent: Collection[str] = ()) -> Hypothesis:
     """A model as a search has it: every effect of the catalogue, most of them neutral, as are those ``absent``."""
-    neutral = cols.neutral_effects(search.names)
+    neutral = neutral_effects(search.names)
     nothing = Hypothesis(neutral, origin=neutral)
     own = {type(e).name: e for e in model.effects if type(e).name not in absent}
     return replace(
@@ -302,11 +260,11 @@ class Asked:
     contradicts: bool
 
 
-def asked(search: Search, model: Quadrotor, names: Collection[str], rules: Rules = RULES) -> dict[str, list[Asked]]:
+def asked(search: Search, model: Quadrotor, names: Collection[str]) -> dict[str, list[Asked]]:
     """What the innovations ask of the strengths of some effects of a model, all together, by effect."""
     search = replace(search, parameters=model.parameters, _flights={})
     hypothesis = search.learned(hypothesis_of(search, model))
-    columns = [column for name in names for variant in cols.strengths(name)[:1] for column in variant]
+    columns = [column for name in names for variant in strengths(name)[:1] for column in variant]
     columns = [replace(column, probe=()) for column in columns]
 
     def values(of):
@@ -325,7 +283,9 @@ def asked(search: Search, model: Quadrotor, names: Collection[str], rules: Rules
     found: dict[str, list[Asked]] = {name: [] for name in names}
     for column, now, other, std in zip(columns, *map(np.ndarray.tolist, (predicted, others, deviations)), strict=True):
         at = "" if column.index is None else f"[{column.index}]"
-        differs = abs(other - now) > max(rules.contradicts * std, rules.differs * max(abs(now), abs(other)))
+        differs = abs(other - now) > max(
+            search.rules.contradicts * std, search.rules.differs * max(abs(now), abs(other))
+        )
         found[column.effect].append(Asked(f"{column.effect}.{column.field}{at}", other, std, differs))
     return found
 
@@ -379,7 +339,7 @@ def _with(found: Refinement, variant: list[Column], evidence: Evidence) -> tuple
     kind = CATALOGUE[variant[0].effect]
     effect: Effect = kind.neutral()
     for column, value in zip(variant, evidence.values, strict=True):
-        effect = cols.moved(effect, column, 0.1 * float(value) * column.scale, False)
+        effect = moved(effect, column, 0.1 * float(value) * column.scale, False)
     model = Quadrotor(found.model.parameters, (*found.model.effects, effect), body=found.model.body)
     return model, plausible_numbers(model.parameters, [kind.name])
 

@@ -11,26 +11,14 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import KNOWN, Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.sensor_faults import SensorFaults
-from cfb_mjx.sysid.tracing.acceptance import CLEAR, FAR_OFF, LEAST_GAIN, material, significant, worth_it
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint, Progress
-from cfb_mjx.sysid.tracing.columns import SHIFT, Column
-from cfb_mjx.sysid.tracing.confirmation import confirm
-from cfb_mjx.sysid.tracing.contenders import CLOSE, contenders
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, solve
-from cfb_mjx.sysid.tracing.fits import ERRORS, Fit, as_it_is, completed, fitted
-from cfb_mjx.sysid.tracing.hypothesis import LEAD_SPREAD, Hypothesis, Linear
+from cfb_mjx.sysid.tracing.fits import ERRORS, as_it_is, completed, confirm, fitted, prediction_errors
+from cfb_mjx.sysid.tracing.hypothesis import LEAD_SPREAD, SHIFT, Column, Fit, Hypothesis, Linear
 from cfb_mjx.sysid.tracing.jointly import beside_each_other, borne_out, everything, one_by_one
+from cfb_mjx.sysid.tracing.rules import RULES, Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
-
-RIVALS, AS_GOOD = 3, 0.03
-"""So many effects are tried alone in place of several; no error may grow by more than this share."""
-LARGEST = 6
-"""Effects at most."""
-MANY = 3
-"""So many that stand clearly beside each other and what was found are taken in together."""
-PATIENCE = 3
-"""Candidates in a row that stand against chance but lower no error: then the search ends."""
 
 
 @dataclass
@@ -101,7 +89,8 @@ def trace(
     progress: Callable[[str], None] = lambda _: None,
     declared: tuple[Effect, ...] = (),
     checkpoint: Checkpoint | None = None,
-    patience: int = PATIENCE,
+    brief: bool = False,
+    rules: Rules = RULES,
 ) -> Trace:
     """Search the catalogue for what a model lacks.
 
@@ -112,13 +101,14 @@ def trace(
         progress: told what happens.
         declared: effects the declared model has already.
         checkpoint: where the search is kept while it runs, and taken up from.
-        patience: so many candidates in a row that lower no error end the search while the model predicts worse than
-            `hold` does; it ends after `PATIENCE` in any case. With 1 a drone that lacks much is left to the caller.
+        brief: leave a drone that lacks much to the caller: the first candidate that lowers no error ends the search
+            while the model predicts worse than `hold` does.
+        rules: what counts.
     """
     checkpoint = checkpoint or Checkpoint()
     progress("comparing the sensors with each other")
     sensors = check_sensors(logs, delay, float(parameters.gyro_delay))
-    search = Search.start(logs, parameters, delay, sensors, declared)
+    search = Search.start(logs, parameters, delay, sensors, declared, rules=rules)
     progress("replaying the declared model")
     nothing = fitted(search, search.learned(search.nothing()))
     saved = checkpoint.restore(nothing.hypothesis)
@@ -137,13 +127,15 @@ def trace(
             saved.vain,
             dict.fromkeys(saved.left_out),
         )
-    while len(fit.hypothesis.present) < LARGEST and vain < (patience if fit.beside_hold > 1 else PATIENCE):
+    while len(fit.hypothesis.present) < rules.largest:
+        if vain >= (1 if brief and fit.beside_hold > 1 else rules.patience):
+            break
         ranking = rank(search, fit, refused)
         tried.append({"present": list(fit.hypothesis.present), "ranking": [line_of(v, e) for e, v in ranking[:8]]})
-        passing = [(e, v) for e, v in ranking if significant(e, len(search.names))]
+        passing = [(e, v) for e, v in ranking if search.stands(e)]
         if not passing:
             break
-        if (fit.hypothesis.present or vain) and patience > 1:
+        if (fit.hypothesis.present or vain) and not brief:
             many = lacks_many(search, fit, progress)
             if many is not None:
                 fit, left_out = many, {}
@@ -156,7 +148,7 @@ def trace(
         for name, richer in options:
             drop = dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))
             tried[-1] |= {"tried": name, "drop": drop}
-            fit, seen = taken_in(search, nothing, fit, name, richer, statistic[name] >= CLEAR, progress)
+            fit, seen = taken_in(search, nothing, fit, name, richer, statistic[name] >= rules.clear, progress)
             if seen is not None:
                 fit, vain = completed(search, fit), 0
                 # What was too slight beside a large error may matter now.
@@ -185,10 +177,10 @@ def lacks_many(search: Search, fit: Fit, progress: Callable[[str], None]) -> Fit
     It begins with the declared model again, for what was taken in first has taken on what others explain.
     """
     standing = beside_each_other(search, fit.hypothesis, fit.linear)
-    if sum(each.found.t > CLEAR for each in standing) < MANY:
+    if sum(each.found.t > search.rules.clear for each in standing) < search.rules.many:
         return None
     whole = everything(search, progress)
-    if not (np.log(whole.errors / fit.errors).sum() < 0 and whole.beside_hold < FAR_OFF):
+    if not (np.log(whole.errors / fit.errors).sum() < 0 and whole.beside_hold < search.rules.far_off):
         return None
     return completed(search, borne_out(search, whole, progress))
 
@@ -201,9 +193,9 @@ def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, li
 
 def needed(search: Search, less: LeftOut, fit: Fit, nothing: Fit) -> bool:
     """Whether a fit without one of its effects shows that the effect is missed."""
-    if less.own is None or not significant(less.own, len(search.names)):
+    if less.own is None or not search.stands(less.own):
         return False
-    return material(less.fit, fit, nothing, less.own.t >= CLEAR)
+    return search.rules.lowers(less.fit, fit, nothing, less.own.t >= search.rules.clear)
 
 
 def taken_in(
@@ -223,13 +215,13 @@ def taken_in(
         fit: without the effect.
         name: the effect.
         richer: with it.
-        clear: whether its statistic is above `CLEAR`.
+        clear: whether its t is above `Rules.clear`.
         progress: told what happens.
 
     Returns:
         The fit, and what is left of it without each effect looked at; None for that where the effect does not stay.
     """
-    if not worth_it(name, fit, richer, nothing, clear):
+    if not search.rules.worth_it(name, fit, richer, nothing, clear):
         return fit, None
     # Taken out again, for the newcomer's turn has also fitted the others anew, and that is not its merit.
     less = leave_out(search, richer.hypothesis, name)
@@ -269,7 +261,7 @@ def re_examined(
             continue
         seen[name] = less
         rival, variant = less.ranking[0]
-        if variant[0].effect != name and rival.gain > less.own.gain + LEAST_GAIN:
+        if variant[0].effect != name and rival.gain > less.own.gain + search.rules.least_gain:
             other = fitted(search, search.with_candidate(less.fit.hypothesis, variant, rival), whole=False)
             if np.log(other.errors / fit.errors).sum() < 0:
                 fit, seen = other, {}
@@ -289,14 +281,14 @@ def simplified(
         progress: told what happens.
     """
     candidates = search.probes(nothing.hypothesis, nothing.linear)
-    rivals = [item["name"] for item in ranking if item["name"] not in fit.hypothesis.present][:RIVALS]
+    rivals = [item["name"] for item in ranking if item["name"] not in fit.hypothesis.present][: search.rules.rivals]
     for name in rivals:
         if name not in KNOWN or name not in candidates:
             continue
         progress(f"trying {name} in place of {', '.join(fit.hypothesis.present)}")
         found, variant = candidates[name]
         single = fitted(search, search.with_candidate(nothing.hypothesis, variant, found), whole=False)
-        if np.isfinite(single.errors).all() and np.max(single.errors / fit.errors - 1) < AS_GOOD:
+        if np.isfinite(single.errors).all() and np.max(single.errors / fit.errors - 1) < search.rules.as_good:
             return single
     return None
 
@@ -332,11 +324,12 @@ def summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
     """What is reported of an effect, from a fit and what is left of it without the effect."""
     parameters, uncertainty = numbers_of(search, fit.hypothesis, fit.linear, name)
     gain, p_value = (less.own.gain, less.own.p_value) if less.own else (0.0, 1.0)
-    rivals = {v[0].effect: e.gain for e, v in less.ranking if v[0].effect != name and e.gain > (1 - CLOSE) * gain}
+    close = 1 - search.rules.close
+    rivals = {v[0].effect: e.gain for e, v in less.ranking if v[0].effect != name and e.gain > close * gain}
     if rivals:
         # Slopes at neutral understate an effect whose shape was fitted; what it explains as it is counts.
         explained = max(gain, confirm(search, less.fit.hypothesis, fit.hypothesis).gain)
-        rivals = {rival: its for rival, its in rivals.items() if its > (1 - CLOSE) * explained}
+        rivals = {rival: its for rival, its in rivals.items() if its > close * explained}
     buys = float(np.max(1 - fit.errors / less.fit.errors))
     lowers = float(np.log(less.fit.errors / fit.errors).sum())
     return Found(name, p_value, gain, buys, parameters, uncertainty, list(rivals), less.fit.hypothesis, lowers)
@@ -345,3 +338,113 @@ def summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
 def line_of(variant: list[Column], found: Evidence) -> dict:
     """A candidate as reports list it."""
     return {"name": variant[0].effect, "gain": found.gain, "t": found.t, "p_value": found.p_value}
+
+
+def contenders(
+    search: Search, fit: Fit, ranking: list[tuple[Evidence, list[Column]]], progress: Callable[[str], None]
+) -> tuple[list[tuple[str, Fit]], set[str]]:
+    """The candidates that explain the flights best, fitted beside what is there.
+
+    The ranking rests on slopes at neutral, which say little of effects whose shape is still to be fitted: those that
+    come near the best there are fitted too. Of those that gain nearly the same, the ones that predict best come first,
+    and of those the one with the fewest numbers.
+
+    Returns:
+        Their names and the fits with them, in the order to try them, and the names of those that would have to be
+        implausibly strong.
+    """
+    fits, rules = {}, search.rules
+    for found, variant in ranking[: rules.contenders]:
+        if found.gain < rules.contender * ranking[0][0].gain:
+            break
+        name = variant[0].effect
+        progress(f"trying {name} beside {', '.join(fit.hypothesis.present) or 'nothing'}")
+        fits[name] = fitted(search, search.with_candidate(fit.hypothesis, variant, found), whole=False)
+    plausible = [name for name, richer in fits.items() if not rules.stretched(richer.hypothesis, name)]
+    if len(plausible) > 1:
+        gains = {name: confirm(search, fit.hypothesis, fits[name].hypothesis).gain for name in plausible}
+        plausible = [name for name in plausible if np.isfinite(gains[name])]
+    stretched = set(fits) - set(plausible)
+    if len(plausible) < 2:
+        name = (plausible or list(fits))[-1]
+        return [(name, fits[name])], stretched
+    numbers = {variant[0].effect: len(variant) for _, variant in ranking}
+    most = max(gains[name] for name in plausible)
+    rivals = [name for name in plausible if _near(gains[name], most, rules.close)]
+    if len(rivals) > 1:
+        # Innovations hardly tell a lag from a delay beside the unknown age of commands; half a second of flight does.
+        errors = {name: _without_lead(search, fits[name].hypothesis) for name in rivals}
+        rivals = [name for name in rivals if errors[name] <= min(errors.values()) + rules.same_errors]
+    most = max(gains[name] for name in rivals)
+    close = [name for name in rivals if _near(gains[name], most, rules.parsimony)]
+    first = min(close, key=numbers.get)
+    delayed = "command_delay"
+    if first == SHIFT and fits[first].hypothesis.shift < 0 and delayed in plausible:
+        # Commands logged early and commands that act late look the same unless rotor speeds were logged: the
+        # physical cause comes first, and the report names both.
+        first = delayed if gains[delayed] > (1 - rules.close) * gains[first] else first
+    order = sorted(plausible, key=lambda name: (name != first, -gains[name]))
+    return [(name, fits[name]) for name in order], stretched
+
+
+def _near(gain: float, most: float, share: float) -> bool:
+    """Whether a gain is the largest but for a share; all may be negative, where fits do not converge."""
+    return gain >= most - share * abs(most)
+
+
+def _without_lead(search: Search, hypothesis: Hypothesis) -> float:
+    """Mean logarithm of the prediction errors, commands held until the next row in the fit as in predictions.
+
+    A delay is longer by what a lead takes back, and a lag that wants no lead would seem to predict better.
+    Infinite where predictions diverge.
+    """
+    held = search.settled(replace(hypothesis, lead=0.0), lead_free=False)
+    found = float(np.log(prediction_errors(search, held)).mean())
+    return found if np.isfinite(found) else np.inf
+
+
+def with_rare(found: Trace, held_out: Search, progress: Callable[[str], None] = lambda _: None) -> Trace:
+    """What was found, and rarely excited effects that held-out flights bear out.
+
+    Args:
+        found: what the search came to.
+        held_out: over flights nothing is fitted to.
+        progress: told what happens.
+    """
+    search, fit, rules = found.search, found.fit, found.search.rules
+    before, tried, buys = fit.hypothesis, set(), {}
+    while len(fit.hypothesis.present) < rules.largest:
+        ranking = [
+            (evidence, variant)
+            for evidence, variant in rank(search, fit, tried)
+            if evidence.gain > rules.rare_gain and evidence.t > rules.rare_t
+        ]
+        if not ranking or len(tried) == rules.rare_tried:
+            break
+        evidence, variant = ranking[0]
+        name = variant[0].effect
+        tried.add(name)
+        progress(f"trying {name} on the held-out flights")
+        richer = fitted(search, search.with_candidate(fit.hypothesis, variant, evidence), whole=False)
+        share = _share(held_out, fit, richer, name)
+        if share is not None:
+            fit, buys[name] = completed(search, richer), share
+    if fit.hypothesis is before:
+        return found
+    kept = []
+    for name in fit.hypothesis.present:
+        item = summary(search, fit, name, leave_out(search, fit.hypothesis, name))
+        kept.append(replace(item, buys=max(item.buys, buys.get(name, 0.0))))
+    kept.sort(key=lambda item: (-item.lowers, -item.buys))
+    return replace(found, hypothesis=fit.hypothesis, found=kept, errors=fit.errors, fit=fit)
+
+
+def _share(held_out: Search, fit: Fit, richer: Fit, name: str) -> float | None:
+    """Largest share by which an effect lowers an error of the held-out flights; None where it does not stand there."""
+    if not np.isfinite(richer.errors).all() or held_out.rules.stretched(richer.hypothesis, name):
+        return None
+    if confirm(held_out, fit.hypothesis, richer.hypothesis).t < held_out.rules.rare_sure:
+        return None
+    pair = fit.hypothesis, richer.hypothesis
+    old, new, first = (prediction_errors(held_out, each) for each in (*pair, held_out.nothing()))
+    return float(np.max(1 - new / old)) if held_out.rules.lowered(old, new, first) else None

@@ -8,16 +8,25 @@ filters are linear, so the derivative of a residual by a parameter is whitened b
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.quadrotor import Quadrotor
-from cfb_mjx.model.vector import Vec, rotate
-from cfb_mjx.sysid.flight import Flight
-from cfb_mjx.sysid.replay import between, replay
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model.effects import Condition, Wrench
+from cfb_mjx.model.effects.formula import body_signals, place_signals
+from cfb_mjx.model.quadrotor import Quadrotor, at_rotor_center, in_still_air, prepare
+from cfb_mjx.model.state import State, unstack
+from cfb_mjx.model.vector import Vec, rotate, rotate_inverse
+from cfb_mjx.parameters import Parameters
+from cfb_mjx.sysid.flight import Flight, in_groups
+from cfb_mjx.sysid.identification.flight_data import white_noise
+from cfb_mjx.sysid.replay import between, remembered_along, replay, smoothed_rotor_speed
 
 BLOCK = 512
 """Rows that stay together: about two seconds at 250 Hz. A filter starts anew in every block."""
@@ -224,3 +233,125 @@ def fit_levels(blocks: Blocks, noise: dict[str, np.ndarray], start: np.ndarray =
         options={"maxiter": 40 if start is FIRST else 15, "ftol": 1e-6},
     )
     return found.x
+
+
+@eqx.filter_jit
+def _residuals(model: Quadrotor, lead: Array, flights: Flight, driven: Array) -> Blocks:
+    def one(flight, driven):
+        said = predicted(model, flight, driven, lead)
+        return cut(flight, jax.tree.map(lambda a, b: a - b, measured(flight), said))
+
+    return jax.vmap(one)(flights, driven)
+
+
+def driven_by(model: Quadrotor, flights: Sequence[Flight], lead: float) -> list[np.ndarray]:
+    """Rotor speeds (n, 4) that drive the body along each flight: measured, or from commands."""
+    pairs = zip(flights, (speed for speed, _ in remembered_along(model, flights, lead)), strict=True)
+    return [smoothed_rotor_speed(flight, speed) if flight.measured else speed for flight, speed in pairs]
+
+
+def residual_blocks(
+    model: Quadrotor, flights: Sequence[Flight], driven: Sequence[np.ndarray], lead: float
+) -> list[Blocks]:
+    """What the model misses along each flight."""
+    return in_groups(partial(_residuals, model, jnp.asarray(lead)), flights, driven)
+
+
+@eqx.filter_jit
+def with_slopes(models: Quadrotor, flight: Flight, driven: Array, leads: Array, shifts: Array, steps: Array) -> Signals:
+    """The residual of a flight and, side by side along the last axis (c), its derivatives.
+
+    Args:
+        models: leaves of the effects with a leading axis (c): the model as it is, then moved by each step.
+        flight: one flight.
+        driven: of `driven_by`.
+        leads: (c,) command lead of each.
+        shifts: (c,) s by which the motor columns of each are taken to be late.
+        steps: (c - 1,) size of the moves, in the units of the columns.
+
+    Returns:
+        Column 0 is the residual, the others are what the model would say more per unit of each number.
+    """
+    time = flight.time
+    slope = jnp.gradient(driven, axis=0) / jnp.maximum(jnp.gradient(time), 1e-4)[:, None]
+    # Late commands and late rotor speeds agree with each other; only what the body does comes too early.
+    rows = jnp.sum(flight.interval) / jnp.maximum(jnp.sum(flight.interval > 0), 1)
+
+    def one(effects, lead, shift):
+        model = eqx.tree_at(lambda m: m.effects, models, effects)
+        more = (1 - flight.measured) * shift / rows
+        return predicted(model, flight, driven + flight.measured * shift * slope, lead + more)
+
+    said = jax.vmap(one)(models.effects, leads, shifts)
+    seen = measured(flight)
+
+    def side_by_side(m, s):
+        base = m - s[0]
+        slopes = (s[1:] - s[:1]) / steps.reshape(-1, *([1] * base.ndim))
+        return jnp.moveaxis(jnp.concatenate([base[None], slopes]), 0, -1)
+
+    return Signals(*(side_by_side(getattr(seen, k), getattr(said, k)) for k in ("quantity", "acceleration")))
+
+
+def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, Condition]:
+    """The parameters, and the flight condition in the middle of every interval."""
+    prepared = prepare(model)
+    middle = (flight.position, flight.velocity, flight.quaternion, flight.body_rate, driven)
+    at = unstack(State(*map(between, middle)), prepared.parameters.center_of_gravity)
+    return prepared.parameters, in_still_air(prepared, at, at.rotor_speed)
+
+
+@eqx.filter_jit
+def term_squares(model: Quadrotor, flight: Flight, driven: Array) -> Float[Array, " c"]:
+    """Mean squares of the signals of the formulas' library over a flight: body terms, then places."""
+    _, seen = _seen(model, flight, driven)
+    signals = jnp.stack([*body_signals(seen), *place_signals(seen)], axis=-1)
+    return flight.valid @ signals**2 / jnp.maximum(jnp.sum(flight.valid), 1.0)
+
+
+@eqx.filter_jit
+def term_slopes(model: Quadrotor, flight: Flight, driven: Array, axis: Array) -> Signals:
+    """What each term of the formulas' library (c: body terms, then places) along one axis (0..5) adds.
+
+    The same as the derivatives by a `ResidualFormula`'s numbers, without replaying the model for every one of them:
+    a wrench on the body does not change how the rotors run.
+    """
+    parameters, seen = _seen(model, flight, driven)
+    along = jnp.arange(6) == axis
+
+    def signals(force: Vec, torque: Vec) -> Signals:
+        spin, push = at_rotor_center(parameters, Wrench(force, torque), Vec(0.0, 0.0, 0.0))
+        still = jnp.zeros((flight.time.shape[0], 4))
+        return accumulated(flight, spin.stack(), push.stack(), still, jnp.zeros(()))
+
+    found = [signals(Vec(*(a * s for a in along[3:])), Vec(*(a * s for a in along[:3]))) for s in body_signals(seen)]
+    for s in place_signals(seen):
+        pull = rotate_inverse(seen.quaternion, Vec(*(a * s for a in along[3:])))
+        found.append(signals(pull, Vec(0.0, 0.0, 0.0)))
+    return jax.tree.map(lambda *x: jnp.stack(x, axis=-1), *found)
+
+
+@eqx.filter_jit
+def inner_products(flight: Flight, signals: Signals, levels: Levels) -> Float[Array, "b c c"]:
+    """Inner products of whitened signals side by side, per block."""
+    e, _, _ = innovations(cut(flight, signals), levels)
+    return jnp.einsum("brkc,brkd->bcd", e, e)
+
+
+def sensor_noise(logs: list[FlightLog], least_gyro: float = 1e-3) -> dict[str, np.ndarray]:
+    """White noise of gyro (3), velocity, accelerometer and rotor speed rows, medians over the logs.
+
+    ``least_gyro`` is the lowest level believed of a gyro, rad/s: behind a low-pass its rows look better than they are.
+    """
+
+    def level(pick):
+        found = [np.atleast_1d(white_noise(pick(log))) for log in logs if pick(log) is not None]
+        return np.median(found, axis=0) if found else None
+
+    speed = level(lambda log: log.rotor_speed)
+    return {
+        "gyro": np.maximum(level(lambda log: log.body_rate), least_gyro),
+        "velocity": np.maximum(np.mean(level(lambda log: log.velocity)), 1e-3),
+        "accelerometer": np.maximum(np.mean(level(lambda log: log.specific_force)), 1e-2),
+        "rotor": np.array(10.0) if speed is None else np.maximum(np.nanmean(speed), 1.0),
+    }

@@ -1,0 +1,204 @@
+"""Closing the loop: what a model lacks on some flights, judged on others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.parameters import ModelFile
+from cfb_mjx.sysid.evaluation import Evaluation, evaluate
+from cfb_mjx.sysid.flight import usual_delay
+from cfb_mjx.sysid.refinement.numbers import PLANT
+from cfb_mjx.sysid.sensor_faults import HEALTHY
+from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
+from cfb_mjx.sysid.tracing.diagnosis import Diagnosis, Reported, Unexplained
+from cfb_mjx.sysid.tracing.fits import Verdict, confirm, prediction_errors
+from cfb_mjx.sysid.tracing.formula import Proposal, explain, only_there
+from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.residuals import Line, find_lines, residual_rows
+from cfb_mjx.sysid.tracing.rules import RULES, Rules
+from cfb_mjx.sysid.tracing.search import Search
+from cfb_mjx.sysid.tracing.sensors import check_sensors
+from cfb_mjx.sysid.tracing.together import Part, asked, fit_together, hypothesis_of, paired
+from cfb_mjx.sysid.tracing.trace import Found, Trace, numbers_of, trace, with_rare
+
+
+def close_loop(
+    fit: list[FlightLog],
+    held_out: list[FlightLog],
+    base: ModelFile,
+    progress: Callable[[str], None] = lambda _: None,
+    checkpoint: Checkpoint | None = None,
+    rules: Rules = RULES,
+) -> Diagnosis:
+    """Trace what a model lacks on some flights, and judge it on others.
+
+    Args:
+        fit: flights to learn from.
+        held_out: flights of the same drone nothing is learned from.
+        base: the declared model.
+        progress: told what happens.
+        checkpoint: where the search is kept while it runs.
+        rules: what counts.
+    """
+    declared = Quadrotor.from_file(base).effects
+    parameters = base.parameters()
+    delay = usual_delay(fit, parameters)
+    speeds = all(log.rotor_speed is not None for log in fit)
+    found = trace(fit, parameters, delay, progress, declared, checkpoint, speeds, rules)
+    if found.fit.beside_hold > rules.far_off:
+        whole = _whole(found, fit, held_out, base, progress)
+        if whole is not None:
+            return whole
+        if found.fit.beside_hold > 1:
+            # That may have been cut short.
+            found = trace(fit, parameters, delay, progress, declared, rules=rules)
+    # Biases of the held-out sensors come from their own kinematics; no model is fitted.
+    check = replace(check_sensors(held_out, delay, float(parameters.gyro_delay)), faults=found.sensors.faults)
+    judge = found.search.beside(held_out, check)
+    found = with_rare(found, judge, progress)
+    search, proposal = explain(found, progress, judge)
+    progress("judging on held-out flights")
+    before = evaluate(found.search.nothing().model(parameters), held_out)
+    wide = search.beside(held_out, check)
+    if proposal is not None and not _borne_out(wide, proposal):
+        proposal, search, wide = None, found.search, judge
+    hypothesis, reported, unconfirmed = _judged(search, judge, found, proposal)
+    left = proposal.hypothesis if proposal else found.hypothesis
+    unexplained = _unexplained(search, wide, proposal, left, judge)
+    faults = replace(found.sensors.faults, motor_shift=hypothesis.shift)
+    after = evaluate(hypothesis.model(parameters), held_out, faults=faults)
+    return Diagnosis(found, base, reported, unconfirmed, hypothesis, faults, before, after, unexplained)
+
+
+def _whole(
+    found: Trace, fit: list[FlightLog], held_out: list[FlightLog], base: ModelFile, progress: Callable[[str], None]
+) -> Diagnosis | None:
+    """All effects at once; None where that predicts the fit flights hardly better than what the search found."""
+    check = replace(found.sensors, faults=HEALTHY, findings=[])
+    rules = found.search.rules
+    search = Search.start(fit, base.parameters(), found.search.delay, check, found.search.declared, PLANT, rules)
+    whole = fit_together(fit, base, search, progress)
+    if not whole.beside_hold < (1 - rules.better) * found.fit.beside_hold:
+        return None
+    progress("judging on held-out flights")
+    model = whole.model
+    search = replace(search, parameters=model.parameters, _flights={})
+    before, after = evaluate(Quadrotor.from_file(base), held_out), evaluate(model, held_out)
+    reported, unconfirmed = [], []
+    for part in whole.parts:
+        entry = _reported(search, part, after, held_out)
+        (reported if _stands(entry, part, rules) else unconfirmed).append(entry)
+    if unconfirmed:
+        model = whole.without([item.name for item in unconfirmed])
+        after = evaluate(model, held_out)
+        for item in reported:
+            effect = next(e for e in model.effects if type(e).name == item.name)
+            item.parameters = {key: np.asarray(getattr(effect, key)).tolist() for key in item.parameters}
+    told = {part.name for part in whole.parts if part.told}
+    beside_rotors = [item for item in reported if item.name not in told]
+    others = asked(search, model, [item.name for item in beside_rotors]) if beside_rotors else {}
+    for item in beside_rotors:
+        item.asked = others[item.name]
+    gone = {item.name for item in unconfirmed}
+    hypothesis = search.learned(hypothesis_of(search, model, gone))
+    beside = search.beside(held_out, replace(check_sensors(held_out, *search.delays), faults=HEALTHY))
+    for item in reported:
+        poorer = replace(item.found.without, levels=hypothesis.levels)
+        item.verdict = replace(item.verdict, domains=confirm(beside, poorer, hypothesis).domains)
+    lines = _lines(search, beside, hypothesis)
+    left = Unexplained(None, lines) if lines else None
+    traced = replace(found, hypothesis=hypothesis, sensors=check, tried=[*found.tried, *whole.tried], search=search)
+    return Diagnosis(traced, base, reported, unconfirmed, hypothesis, HEALTHY, before, after, left, whole.motors, whole)
+
+
+def _stands(entry: Reported, part: Part, rules: Rules = RULES) -> bool:
+    """Whether held-out flights bear an effect out; one that the rotor speeds tell must only not be refuted by them."""
+    return entry.verdict.t >= (-rules.doubtful if part.told else rules.doubtful)
+
+
+def _reported(search: Search, part: Part, after: Evaluation, held_out: list[FlightLog]) -> Reported:
+    """An effect fitted with others, judged by predictions of held-out flights without it.
+
+    Of one that the rotor speeds tell the p-value is theirs: in predictions other effects may hide what it buys.
+    """
+    t, p_value = paired(evaluate(part.without, held_out, keep_diverged=True), after)
+    without = hypothesis_of(search, part.without, {part.name})
+    found = Found(
+        part.name,
+        part.p_value,
+        None,
+        part.buys,
+        part.parameters,
+        part.uncertainty,
+        part.confusable,
+        without,
+    )
+    verdict = Verdict(None, t, p_value)
+    p_value = part.p_value if part.told else p_value
+    return Reported(part.name, p_value, part.parameters, part.uncertainty, found, verdict, part.at_bound)
+
+
+def _borne_out(wide: Search, proposal: Proposal) -> bool:
+    """Whether held-out flights confirm a formula."""
+    verdict = confirm(wide, proposal.without, proposal.hypothesis)
+    return verdict.t >= wide.rules.formula_sure and _change(wide, proposal.without, proposal.hypothesis) <= 0
+
+
+def _judged(
+    search: Search, judge: Search, found: Trace, proposal: Proposal | None
+) -> tuple[Hypothesis, list[Reported], list[Reported]]:
+    """What held-out flights leave of the hypothesis; what they confirm, sensor faults first; what they do not."""
+    hypothesis = proposal.hypothesis if proposal else found.hypothesis
+    reported, unconfirmed = [], []
+    for fault in found.sensors.findings:
+        reported.append(Reported(fault.name, fault.p_value, fault.parameters, fault.uncertainty))
+    for item in found.found:
+        verdict = confirm(judge, item.without, found.hypothesis)
+        entry = Reported(item.name, verdict.p_value, item.parameters, item.uncertainty, item, verdict)
+        worse = _change(judge, item.without, found.hypothesis) > 0
+        if item.name not in hypothesis.present or verdict.t < judge.rules.doubtful or worse:
+            unconfirmed.append(entry)
+            hypothesis = hypothesis.without(item.name)
+        else:
+            reported.append(entry)
+    if unconfirmed and reported:
+        # What stays was fitted beside what goes.
+        hypothesis, linear = search.refine(hypothesis)
+        for entry in reported:
+            if entry.found is not None:
+                entry.parameters, entry.uncertainty = numbers_of(search, hypothesis, linear, entry.name)
+    return hypothesis, reported, unconfirmed
+
+
+def _unexplained(
+    search: Search, wide: Search, proposal: Proposal | None, hypothesis: Hypothesis, judge: Search
+) -> Unexplained | None:
+    """What is left: a formula, and lines that most flights share, held-out ones too where there are enough of them.
+
+    If neither, what only the held-out flights show.
+    """
+    lines = _lines(search, wide, hypothesis)
+    there = [] if proposal or lines else only_there(judge, hypothesis)
+    return Unexplained(proposal, lines, there) if proposal or lines or there else None
+
+
+def _lines(search: Search, judge: Search, hypothesis: Hypothesis) -> list[Line]:
+    """Lines that most flights share, held-out ones too where there are enough of them."""
+    rules = search.rules
+    lines = find_lines(residual_rows(search, hypothesis), rules.line_alpha)
+    if len(judge.logs) < rules.line_flights:
+        return lines
+    again = find_lines(residual_rows(judge, hypothesis), rules.line_alpha)
+    return [
+        a for a in lines if any(a.axis == b.axis and abs(a.frequency - b.frequency) < rules.same_line for b in again)
+    ]
+
+
+def _change(judge: Search, poorer: Hypothesis, richer: Hypothesis) -> float:
+    """Sum of the logarithms by which the richer hypothesis changes the prediction errors."""
+    return float(np.log(prediction_errors(judge, richer) / prediction_errors(judge, poorer)).sum())
