@@ -49,7 +49,7 @@ def closed(folder):
     """``cfb close-loop`` with the effect alone in the search, which compiles in a fraction of the time."""
     start = Search.start
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(Search, "start", lambda *given: replace(start(*given), names=("air_drag",)))
+        patched.setattr(Search, "start", lambda *given, **more: replace(start(*given, **more), names=("air_drag",)))
         flights = [str(folder / f"flight{i}.mcap") for i in range(4)]
         plugin = ("--plugin", str(folder / "my_effects.py"))
         words = ("close-loop", "--fit", *flights[:2], "--held-out", *flights[2:], *plugin, "-o", str(folder / "closed"))
