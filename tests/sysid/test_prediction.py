@@ -11,7 +11,10 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.sysid import HORIZONS, evaluate
+from cfb_mjx.sysid.flight import GROUP, LENGTHS, in_groups, prepare_flight
 from cfb_mjx.sysid.metrics import geodesic_deg, intervals, metrics
+from cfb_mjx.sysid.prediction import start_of_windows, starts_of_windows
+from cfb_mjx.sysid.windows import find_windows
 
 MASS, INERTIA, LAG, GAIN, ROTOR_INERTIA, HALF = 0.044, np.array([3.3e-5, 3.6e-5, 5.9e-5]), 0.05, 2900.0, 5e-8, 0.03535
 
@@ -155,3 +158,36 @@ def test_bootstrap_intervals_cover_the_mean_of_independent_errors():
         hits += low <= 1.0 <= high
         assert low <= metrics(draw, (0.1,))[key] <= high
     assert 85 <= hits <= 100
+
+
+def test_flights_side_by_side_start_as_one_by_one_whatever_has_no_window(exact_log):
+    """Ten with windows, and one too short for any."""
+    short = exact_log.rows(np.arange(len(exact_log)) < 100)
+    logs = [exact_log.replace(command=exact_log.command * (1 - 0.01 * i)) for i in range(10)]
+    logs[3:3], model = [short], Quadrotor.from_file("cfb-guards")
+    windows = [find_windows(log, HORIZONS, 0.008, 0.0) for log in logs]
+    assert [len(own) > 0 for own in windows] == [log is not short for log in logs]
+    flights = [prepare_flight(log, 0.008, 0.0) if len(own) else None for log, own in zip(logs, windows, strict=True)]
+    found = starts_of_windows(model, logs, windows, flights)
+    for log, own, (speed, memory) in zip(logs, windows, found, strict=True):
+        assert memory == ()
+        assert speed.shape == (len(own), 4)
+        if len(own):
+            np.testing.assert_allclose(speed, start_of_windows(model, log, own, 0.008)[0], rtol=1e-12)
+
+
+def test_long_flights_are_walked_along_in_smaller_groups(exact_log, monkeypatch):
+    """Many long recordings at once would fill the memory; what is said of each stays the same."""
+    flight = prepare_flight(exact_log, 0.008, 0.0)
+    flights = [eqx.tree_at(lambda f: f.time, flight, flight.time + i) for i in range(5)]
+    for longest, size in ((LENGTHS[-1], GROUP), (len(flight.time) // 4, GROUP // 4), (1, 1)):
+        monkeypatch.setattr("cfb_mjx.sysid.flight.LENGTHS", (longest,))
+        shapes = []
+
+        def mean(several, shapes=shapes):
+            shapes.append(several.time.shape[0])
+            return jnp.mean(several.time, axis=1)
+
+        found = in_groups(mean, flights)
+        np.testing.assert_allclose(np.array(found) - found[0], np.arange(5.0))
+        assert set(shapes) == {size}

@@ -14,7 +14,7 @@ from cfb_mjx.logs import FlightLog, require_own_names
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.sysid import metrics
 from cfb_mjx.sysid.disturbance import observed_model
-from cfb_mjx.sysid.flight import delay_of, prepare_flight
+from cfb_mjx.sysid.flight import Flight, delay_of, prepare_flight
 from cfb_mjx.sysid.observer import Observer, at_starts, observe
 from cfb_mjx.sysid.prediction import hold, predict, select, starts_of_windows
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
@@ -112,7 +112,7 @@ def evaluate(
     precise = Quadrotor(model.parameters, model.effects, body=model.body, integrator="rk4", rotor_loads="instant")
     results = []
     recordings = [_Recording.of(precise, log, horizons, faults) for log in logs]
-    began = _starts(precise, recordings)
+    began = starts_of_windows(precise, *([getattr(r, key) for r in recordings] for key in ("log", "windows", "flight")))
     for index, recording in enumerate(recordings):
         results.append(_evaluate_log(precise, recording, began[index], horizons, observer, over))
         if not keep_diverged:
@@ -149,6 +149,11 @@ class _Recording:
     windows: Windows
     faults: SensorFaults
 
+    @property
+    def flight(self) -> Flight | None:
+        """The rows prepared, where there is something to predict."""
+        return prepare_flight(self.log, self.delay, self.gyro_delay) if len(self.windows) else None
+
     @classmethod
     def of(cls, model: Quadrotor, log: FlightLog, horizons: tuple[float, ...], faults: SensorFaults) -> _Recording:
         delay, gyro_delay = delay_of(log, model.parameters), float(model.parameters.gyro_delay)
@@ -156,19 +161,6 @@ class _Recording:
         repaired, reached = faults.repaired(log), faults.reached(horizons)
         windows = recorded if faults.healthy else find_windows(repaired, reached, delay, gyro_delay, recorded.start)
         return cls(log, repaired, delay, gyro_delay, recorded, windows, faults)
-
-
-def _starts(model: Quadrotor, recordings: Sequence[_Recording]) -> list[tuple[np.ndarray, tuple]]:
-    """Rotor speeds and memories at the windows' starts of every log; nothing where there are none."""
-    there = [i for i, each in enumerate(recordings) if len(each.windows)]
-    found: list[tuple[np.ndarray, tuple]] = [(np.zeros((0, 4)), ())] * len(recordings)
-    if there:
-        chosen = [recordings[i] for i in there]
-        flights = [prepare_flight(each.log, each.delay, each.gyro_delay) for each in chosen]
-        began = starts_of_windows(model, [e.log for e in chosen], [e.windows for e in chosen], flights)
-        for i, start in zip(there, began, strict=True):
-            found[i] = start
-    return found
 
 
 def _evaluate_log(

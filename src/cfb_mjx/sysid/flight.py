@@ -19,7 +19,8 @@ from cfb_mjx.parameters import Parameters
 LENGTHS = (2560, 4608, 7680)
 """Rows a flight is padded to (beyond, a multiple of the last): few shapes, so that programs come from the cache."""
 GROUP = 8
-"""Flights walked along side by side, row by row: nearly as fast as one."""
+"""Flights walked along side by side, row by row, are nearly as fast as one: so many of `LENGTHS`, fewer of longer ones,
+which would fill the memory."""
 WARM_UP = 0.3
 """After the start and after every gap rotor speeds are not known from commands for so long, s: six motor lags."""
 MEASURED_SHARE = 0.98
@@ -141,7 +142,7 @@ def in_groups(function: Callable[..., Any], flights: Sequence[Flight], *beside: 
     lengths = np.array([len(flight.time) for flight in flights])
     for length in np.unique(lengths):
         alike = np.flatnonzero(lengths == length)
-        size = GROUP if len(alike) > 1 else 1
+        size = max(1, min(GROUP, GROUP * LENGTHS[-1] // length)) if len(alike) > 1 else 1
         for first in range(0, len(alike), size):
             # The last group repeats its last flight.
             chosen = alike[np.minimum(np.arange(first, first + size), len(alike) - 1)]

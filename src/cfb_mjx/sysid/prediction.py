@@ -104,19 +104,25 @@ def start_of_windows(model: Quadrotor, log: FlightLog, windows: Windows, delay: 
 
 
 def starts_of_windows(
-    model: Quadrotor, logs: Sequence[FlightLog], windows: Sequence[Windows], flights: Sequence[Flight]
+    model: Quadrotor, logs: Sequence[FlightLog], windows: Sequence[Windows], flights: Sequence[Flight | None]
 ) -> list[tuple[np.ndarray, tuple]]:
-    """`start_of_windows` of several logs, walked along side by side; ``flights`` are the same logs, prepared."""
-    known = remembered_along(model, flights)
+    """`start_of_windows` of several logs, walked along side by side.
+
+    ``flights`` are the same logs, prepared; of a log without windows nothing is asked (None), and nothing comes back.
+    """
+    there = [i for i, own in enumerate(windows) if len(own)]
+    nothing: tuple[np.ndarray, tuple] = np.zeros((0, 4)), ()
+    if not there:
+        return [nothing] * len(windows)
+    known = remembered_along(model, [flights[i] for i in there])
     found = []
-    for log, own, (speed, memory) in zip(logs, windows, known, strict=True):
+    for i, (speed, memory) in zip(there, known, strict=True):
+        log, own = logs[i], windows[i]
         # A start that is a row's own time may fall a rounding before it.
         since = np.maximum(own.start - log.time[own.row], 0.0)
         found.append((speed[own.row], jax.tree.map(lambda x, r=own.row: x[r], memory), log.command[own.row], since))
     ends = np.cumsum([len(own) for own in windows])
     count = int(ends[-1])
-    if not count:
-        return [part[:2] for part in found]
     speed, memory, command, since = jax.tree.map(lambda *x: np.concatenate(x), *found)
     inputs = speed, memory, np.clip(command, 0, 1), since
     parts = []
@@ -126,7 +132,7 @@ def starts_of_windows(
         parts.append(jax.tree.map(np.asarray, _advance_rotors(rotors_alone(model), *block)))
     every = jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
     pieces = zip(ends - [len(own) for own in windows], ends, strict=True)
-    return [jax.tree.map(lambda x, a=a, b=b: x[a:b], every) for a, b in pieces]
+    return [jax.tree.map(lambda x, a=a, b=b: x[a:b], every) if b > a else nothing for a, b in pieces]
 
 
 @eqx.filter_jit

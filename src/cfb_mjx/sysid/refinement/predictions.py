@@ -137,8 +137,8 @@ class Predictions:
     """(F,) what flights count, 1 on average."""
     sizes: Array
     """(H, 2) what `hold` errs: attitude rad, velocity m/s."""
-    flown: tuple[tuple[FlightLog, Windows, Flight], ...]
-    """Of every flight: its log, its windows, and its rows prepared."""
+    flown: tuple[tuple[FlightLog, Windows, Flight | None], ...]
+    """Of every flight: its log, its windows, and its rows prepared where there are windows."""
 
     @classmethod
     def of(cls, model: Quadrotor, logs: Sequence[FlightLog], share: np.ndarray, most: int | None = None) -> Predictions:
@@ -147,14 +147,10 @@ class Predictions:
         delays = [delay_of(log, model.parameters) for log in logs]
         starts = [find_starts(log, HORIZONS, delay, gyro_delay) for log, delay in zip(logs, delays, strict=True)]
         each = np.inf if most is None else most / len(logs)
-        flown = [
-            (
-                log,
-                find_windows(log, HORIZONS, delay, gyro_delay, own[:: max(1, round(len(own) / each))]),
-                prepare_flight(log, delay, gyro_delay),
-            )
-            for log, delay, own in zip(logs, delays, starts, strict=True)
-        ]
+        flown = []
+        for log, delay, own in zip(logs, delays, starts, strict=True):
+            windows = find_windows(log, HORIZONS, delay, gyro_delay, own[:: max(1, round(len(own) / each))])
+            flown.append((log, windows, prepare_flight(log, delay, gyro_delay) if len(windows) else None))
         held = [_norms(hold(windows, HORIZONS), windows) for _, windows, _ in flown if len(windows)]
         if not held:
             names = ", ".join(log.name for log in logs)
@@ -164,11 +160,11 @@ class Predictions:
 
     def started(self, model: Quadrotor) -> Predictions:
         """The same windows, with rotor speeds and memories at their starts as a model says they were."""
-        there = [each for each in self.flown if len(each[1])]
         # A trim remembers nothing; without it the program is that of any evaluation.
         plain = Quadrotor(model.parameters, model.effects[:-1], model.body)
-        began = ((speed, (*memory, ())) for speed, memory in starts_of_windows(plain, *zip(*there, strict=True)))
-        flights = [(windows, *(next(began) if len(windows) else ((), ()))) for _, windows, _ in self.flown]
+        began = starts_of_windows(plain, *zip(*self.flown, strict=True))
+        pairs = zip(self.flown, began, strict=True)
+        flights = [(windows, speed, (*memory, ())) for (_, windows, _), (speed, memory) in pairs]
         kinds = (_part(flights, self.share, measured) for measured in (False, True))
         return replace(self, parts=[part for part in kinds if part is not None])
 

@@ -1,9 +1,11 @@
 """What closing the loop comes to: effects borne out by other flights, what was weighed, what is left, the new model.
 
-diagnosis = close_loop(fit, held_out, load_model_file("cfb"))
-for effect in diagnosis.reported:
-    print(effect.name, effect.parameters)
-before, after = diagnosis.held_out.rows  # residuals of every held-out flight
+For example:
+
+    diagnosis = close_loop(fit, held_out, load_model_file("cfb"))
+    for effect in diagnosis.reported:
+        print(effect.name, effect.parameters)
+    before, after = diagnosis.held_out.rows  # residuals of every held-out flight
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from scipy.stats import norm
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.tracing.hypothesis import Fit, Hypothesis
-from cfb_mjx.sysid.tracing.innovations import CHANNELS, Blocks, Levels, innovations, levels_from
+from cfb_mjx.sysid.tracing.innovations import CHANNELS, Blocks, Levels, innovations, joined, levels_from
 from cfb_mjx.sysid.tracing.search import Search
 
 ERRORS = tuple(
@@ -70,8 +70,6 @@ def completed(search: Search, fit: Fit) -> Fit:
 
 DOMAINS = {"rotor_speed": range(6, 10), "force": (*range(3, 6), *range(10, 13)), "torque": range(3)}
 """Channels of the innovations by where an effect acts: commands to rotor speeds, these to forces, and to torques."""
-
-
 TOGETHER = 64
 """Blocks compared at a time: one program serves any number."""
 
@@ -97,16 +95,11 @@ def confirm(search: Search, poorer: Hypothesis, richer: Hypothesis) -> Verdict:
     """Compare two fitted hypotheses on the flights of ``search``, at the noise levels of the poorer one."""
     levels = levels_from(jnp.asarray(poorer.levels), search.noise)
     score, power, noise = np.zeros(CHANNELS + 3), np.zeros(CHANNELS + 3), 0.0
-    # The richer one first: it stays while one poorer after another is compared with it.
     alike = poorer.shift == richer.shift
-    flights = (None, None) if alike else zip(*_matched(search, poorer, richer), strict=True)
-    left = [search.residuals(each, own) for each, own in zip((richer, poorer), reversed(list(flights)), strict=True)][
-        ::-1
-    ]
-    less, more = (
-        jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x]), *(blocks for blocks, _ in side))
-        for side in left
-    )
+    own, other = (None, None) if alike else zip(*_matched(search, poorer, richer), strict=True)
+    # The richer one first: its residuals stay while one poorer after another is compared with it.
+    more = joined(blocks for blocks, _ in search.residuals(richer, other))
+    less = joined(blocks for blocks, _ in search.residuals(poorer, own))
     signals = jax.tree.map(lambda a, b: np.stack([a, b], axis=-1), less.signals, more.signals)
     for first in range(0, len(less.interval), TOGETHER):
         # The last group repeats its last block.

@@ -8,7 +8,7 @@ filters are linear, so the derivative of a residual by a parameter is whitened b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 
 import equinox as eqx
@@ -114,6 +114,11 @@ def cut(flight: Flight, signals: Signals) -> Blocks:
         return x[: count * BLOCK].reshape(count, BLOCK, *x.shape[1:])
 
     return Blocks(jax.tree.map(chop, signals), chop(interval), chop(valid))
+
+
+def joined(pieces: Iterable[Blocks]) -> Blocks:
+    """The blocks of several flights, one after the other."""
+    return jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x]), *pieces)
 
 
 def innovations(blocks: Blocks, levels: Levels) -> tuple[Array, Array, Array]:

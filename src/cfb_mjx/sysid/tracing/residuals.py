@@ -20,6 +20,7 @@ from cfb_mjx.model import Quadrotor
 from cfb_mjx.sysid.flight import Flight, delay_of, prepare_flight
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
 from cfb_mjx.sysid.tracing.innovations import Blocks, driven_by, residual_blocks
+from cfb_mjx.sysid.tracing.rules import RULES
 from cfb_mjx.sysid.tracing.search import Search
 
 WIDTH = 0.02
@@ -278,7 +279,7 @@ class Line:
         )
 
 
-def find_lines(rows: list[Residuals], alpha: float = 1e-4) -> list[Line]:
+def find_lines(rows: list[Residuals], alpha: float = RULES.line_alpha) -> list[Line]:
     """Lines that two thirds of the flights or more share, the clearest first.
 
     A manoeuvre has frequencies of its own, which an imperfect model shows too; so a line must stand in most flights.

@@ -1,6 +1,8 @@
 """When an effect counts: the rules of a search in one place. Beyond chance, plausible, and worth something.
 
-close_loop(fit, held_out, base, rules=replace(RULES, alpha=1e-3))
+For example:
+
+    close_loop(fit, held_out, base, rules=replace(RULES, alpha=1e-3))
 """
 
 from __future__ import annotations

@@ -43,6 +43,7 @@ from cfb_mjx.sysid.tracing.innovations import (
     driven_by,
     fit_levels,
     inner_products,
+    joined,
     levels_from,
     residual_blocks,
     sensor_noise,
@@ -83,12 +84,8 @@ class Search:
     """Effects the declared model has already."""
     rules: Rules = RULES
     _flights: dict[float, list[Flight]] = field(default_factory=dict)
-    _known: list[tuple[Hypothesis, list]] = field(default_factory=list)
-    """The last `residuals`."""
-
-    def __post_init__(self):
-        # A search that replaces another knows nothing of its residuals.
-        self._known = []
+    _known: list[tuple[Hypothesis, list]] = field(default_factory=list, init=False)
+    """The last `residuals`; a search that replaces another knows nothing of them."""
 
     @classmethod
     def start(
@@ -158,8 +155,7 @@ class Search:
 
     def learned(self, hypothesis: Hypothesis) -> Hypothesis:
         """The hypothesis with the noise levels that fit what it leaves."""
-        pieces = [blocks for blocks, _ in self.residuals(hypothesis)]
-        blocks = Blocks(*(_joined([getattr(p, k) for p in pieces]) for k in ("signals", "interval", "valid")))
+        blocks = joined(blocks for blocks, _ in self.residuals(hypothesis))
         return replace(hypothesis, levels=fit_levels(_sample(blocks), self.noise, hypothesis.levels))
 
     def linearise(self, hypothesis: Hypothesis, wanted: list[Column], width: int = 0) -> Linear:
@@ -332,10 +328,6 @@ class Search:
         for column, value in zip(variant, found.values, strict=True):
             effect = moved(effect, column, float(value) * column.scale, False)
         return hypothesis.having(effect)
-
-
-def _joined(parts):
-    return jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x]), *parts)
 
 
 def _sample(blocks: Blocks) -> Blocks:
