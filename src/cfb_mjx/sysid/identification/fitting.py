@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import Array, Float
 
 from cfb_mjx.devices import Devices
 from cfb_mjx.errors import CfbError
@@ -20,7 +20,7 @@ from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import with_gyro_in_time
 from cfb_mjx.sysid.identification.feedback import detect
 from cfb_mjx.sysid.identification.flight_data import Segments, prepare
-from cfb_mjx.sysid.identification.innovation import CHANNELS, as_held, drive, negative_log_likelihood, whitened
+from cfb_mjx.sysid.identification.innovation import CHANNELS, as_held, drive, innovations, negative_log_likelihood
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.result import Fit, summarise
 from cfb_mjx.sysid.identification.robust import tempered
@@ -219,10 +219,37 @@ def fit_noise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_
     return Noise.from_vector(found.value)
 
 
-def _residual(vector, unknowns: Unknowns, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
+class _Weights(NamedTuple):
+    """What a least-squares fit weighs innovations by: it stays while the vector moves.
+
+    If it followed the vector, the sum of squares would fall where variances grow, and no step along its slope (which
+    is that of the innovations alone) would lower it.
+    """
+
+    parameters: Parameters
+    doubt: Float[Array, "s n 4"]
+    variance: Float[Array, "s n 8"]
+
+
+def _weights(
+    unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool
+) -> _Weights:
     parameters = unknowns.apply(vector)
-    segments = as_held(parameters, unknowns.hold(vector), segments)
-    return tempered(whitened(parameters, noise, segments, use_measured, robust), robust)
+    held = as_held(parameters, unknowns.hold(vector), segments)
+    driven = drive(parameters, noise, held, use_measured, robust)
+    _, variance = innovations(parameters, noise, held, driven, use_measured, robust)
+    return jax.lax.stop_gradient(_Weights(parameters, held.doubt, variance))
+
+
+def _residual(
+    vector, weights: _Weights, unknowns: Unknowns, noise: Noise, segments: Segments, use_measured: bool, robust: bool
+):
+    parameters = unknowns.apply(vector)
+    held = as_held(parameters, unknowns.hold(vector), segments)
+    held = eqx.tree_at(lambda s: s.doubt, held, weights.doubt)
+    driven = drive(parameters, noise, held, use_measured, robust)
+    error, _ = innovations(parameters, noise, held, driven, use_measured, robust, weights.parameters)
+    return tempered(error / jnp.sqrt(weights.variance), robust)
 
 
 @eqx.filter_jit
@@ -237,18 +264,20 @@ def _surprise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_
 
 @eqx.filter_jit
 def _fit_vector(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool, ridge):
-    residual = partial(
-        _residual, unknowns=unknowns, noise=noise, segments=segments, use_measured=use_measured, robust=robust
-    )
-    return least_squares(residual, vector, ridge)
+    fixed = (unknowns, noise, segments, use_measured, robust)
+    weights = _weights(unknowns, vector, *fixed[1:])
+    return least_squares(lambda x: _residual(x, weights, *fixed), vector, ridge)
 
 
 @eqx.filter_jit
 def fit_slopes(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
     """Residuals (s, n, 8) of the fit at ``vector``, and their derivatives (s, n, 8, k) by it."""
-    residual = partial(
-        _residual, unknowns=unknowns, noise=noise, segments=segments, use_measured=use_measured, robust=robust
-    )
+    fixed = (unknowns, noise, segments, use_measured, robust)
+    weights = _weights(unknowns, vector, *fixed[1:])
+
+    def residual(x):
+        return _residual(x, weights, *fixed)
+
     return residual(vector), jax.jacfwd(residual)(vector)
 
 

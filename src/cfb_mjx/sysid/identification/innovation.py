@@ -79,6 +79,7 @@ def innovations(
     driven: Drive,
     use_measured: bool = True,
     robust: bool = False,
+    weighed: Parameters | None = None,
 ) -> tuple[Float[Array, "s n 8"], Float[Array, "s n 8"]]:
     """Innovations and their variances (`CHANNELS`), zero and one where a row does not count.
 
@@ -91,11 +92,13 @@ def innovations(
         driven: `drive` of the same parameters and segments.
         use_measured: as it was driven.
         robust: let no reading move a filter by more than three standard deviations.
+        weighed: parameters that say what errors of the commands do to the body; ``parameters`` by default.
     """
+    # As weights these are not differentiated by the parameters.
+    weighed = jax.lax.stop_gradient(parameters if weighed is None else weighed)
 
     def one(piece: Segments, loads: Drive):
-        # As weights these are not differentiated by the parameters (`whitened`).
-        unlogged = _unlogged(jax.lax.stop_gradient(parameters), noise, piece, use_measured)
+        unlogged = _unlogged(weighed, noise, piece, use_measured)
         filters = [
             rate_innovations(parameters, noise, piece, loads.torque, unlogged, robust),
             force_innovations(noise, piece, loads.force, unlogged, robust),
