@@ -10,10 +10,11 @@ from scipy.spatial.transform import Rotation
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.sysid import HORIZONS, evaluate
-from cfb_mjx.sysid.flight import GROUP, LENGTHS, in_groups, prepare_flight
+from cfb_mjx.sysid import HORIZONS, evaluate, replay
+from cfb_mjx.sysid.flight import ROWS, prepare_flight
 from cfb_mjx.sysid.metrics import geodesic_deg, intervals, metrics
 from cfb_mjx.sysid.prediction import start_of_windows, starts_of_windows
+from cfb_mjx.sysid.replay import Lane, replays
 from cfb_mjx.sysid.windows import find_windows
 
 MASS, INERTIA, LAG, GAIN, ROTOR_INERTIA, HALF = 0.044, np.array([3.3e-5, 3.6e-5, 5.9e-5]), 0.05, 2900.0, 5e-8, 0.03535
@@ -178,16 +179,31 @@ def test_flights_side_by_side_start_as_one_by_one_whatever_has_no_window(exact_l
 
 def test_long_flights_are_walked_along_in_smaller_groups(exact_log, monkeypatch):
     """Many long recordings at once would fill the memory; what is said of each stays the same."""
+    flights = [prepare_flight(exact_log.rows(np.arange(len(exact_log)) < n), 0.008, 0.0) for n in (650, 400, 600)]
+    model = Quadrotor.from_file("cfb-guards")
+    lanes = [Lane(flight, flight.rotor_speed, 0.1 * i) for i, flight in enumerate(flights)]
+    together = list(replays(model, lanes))
+    monkeypatch.setattr("cfb_mjx.sysid.replay.MOST", len(flights[0].time) + 1)
+    walked = []
+    advance = replay._advance
+    monkeypatch.setattr(replay, "_advance", lambda *x: walked.append(x) or advance(*x))
+    apart = list(replays(model, lanes))
+    assert len(walked) == sum(len(flight.time) // ROWS for flight in flights)
+    for one, other, flight in zip(together, apart, flights, strict=True):
+        assert len(one.rotor_speed) == len(flight.time)
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_rotor_speeds_run_on_from_block_to_block(exact_log):
+    """Against the exact lag of first order, which knows no blocks."""
+    model = Quadrotor.from_file("cfb")
     flight = prepare_flight(exact_log, 0.008, 0.0)
-    flights = [eqx.tree_at(lambda f: f.time, flight, flight.time + i) for i in range(5)]
-    for longest, size in ((LENGTHS[-1], GROUP), (len(flight.time) // 4, GROUP // 4), (1, 1)):
-        monkeypatch.setattr("cfb_mjx.sysid.flight.LENGTHS", (longest,))
-        shapes = []
-
-        def mean(several, shapes=shapes):
-            shapes.append(several.time.shape[0])
-            return jnp.mean(several.time, axis=1)
-
-        found = in_groups(mean, flights)
-        np.testing.assert_allclose(np.array(found) - found[0], np.arange(5.0))
-        assert set(shapes) == {size}
+    (said,) = replays(model, [Lane(flight, flight.rotor_speed)])
+    lag, gain = (np.asarray(getattr(model.parameters, f"motor_{x}")) for x in ("time_constant", "gain"))
+    speed, n = gain * flight.command[0], len(exact_log)
+    assert n > ROWS
+    for row in range(n):
+        np.testing.assert_allclose(said.rotor_speed[row], speed, rtol=1e-9)
+        target = gain * flight.command[row]
+        speed = target + (speed - target) * np.exp(-flight.interval[row] / lag)

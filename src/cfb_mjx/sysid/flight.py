@@ -1,9 +1,9 @@
-"""A log made ready for replay: every column at the time of its row, padded to one of a few lengths."""
+"""A log made ready for replay: every column at the time of its row, padded to whole blocks of rows."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -16,11 +16,10 @@ from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import tidy
 from cfb_mjx.parameters import Parameters
 
+ROWS = 512
+"""Rows that are looked at together: about two seconds at 250 Hz. Flights are padded to a multiple of it."""
 LENGTHS = (2560, 4608, 7680)
-"""Rows a flight is padded to (beyond, a multiple of the last): few shapes, so that programs come from the cache."""
-GROUP = 8
-"""Flights walked along side by side, row by row, are nearly as fast as one: so many of `LENGTHS`, fewer of longer ones,
-which would fill the memory."""
+"""Rows to which `lengthened` pads (beyond, a multiple of the last): few shapes, for which programs are cached."""
 WARM_UP = 0.3
 """After the start and after every gap rotor speeds are not known from commands for so long, s: six motor lags."""
 MEASURED_SHARE = 0.98
@@ -119,39 +118,26 @@ def prepare_flight(log: FlightLog, delay: float, gyro_delay: float) -> Flight:
         "fresh": fresh,
         "valid": valid.astype(float),
     }
+    return _padded(Flight(**flight, measured=np.array(float(measured))), -(-n // ROWS) * ROWS)
+
+
+def lengthened(flight: Flight, beside: Any) -> tuple[Flight, Any]:
+    """A flight, and arrays with a row for each of its rows, padded to one of `LENGTHS`."""
+    n = len(flight.time)
     length = next((x for x in LENGTHS if x >= n), -(-n // LENGTHS[-1]) * LENGTHS[-1])
-    padded = {key: np.concatenate([v, np.repeat(v[-1:], length - n, axis=0)]) for key, v in flight.items()}
-    padded["valid"][n:] = 0.0
-    padded["fresh"][n:] = 0.0
-    return Flight(**padded, measured=np.array(float(measured)))
+    return _padded(flight, length), jax.tree.map(lambda x: _repeated(x, length), beside)
 
 
-def in_groups(function: Callable[..., Any], flights: Sequence[Flight], *beside: Sequence[Any]) -> list[Any]:
-    """What a function says of flights, several of one length at a time.
+def _padded(flight: Flight, length: int) -> Flight:
+    n = len(flight.time)
+    padded = jax.tree.map(lambda x: _repeated(x, length) if np.ndim(x) else x, flight)
+    own = np.arange(length) < n
+    return dataclasses.replace(padded, valid=padded.valid * own, fresh=padded.fresh * own)
 
-    Args:
-        function: of flights side by side (leading axis), and of what stands beside them; a program compiled for it
-            serves any number of flights.
-        flights: one by one.
-        beside: more arguments, one for each flight.
 
-    Returns:
-        For each flight its part of what the function returns, as NumPy arrays.
-    """
-    found: list[Any] = [None] * len(flights)
-    lengths = np.array([len(flight.time) for flight in flights])
-    for length in np.unique(lengths):
-        alike = np.flatnonzero(lengths == length)
-        size = max(1, min(GROUP, GROUP * LENGTHS[-1] // length)) if len(alike) > 1 else 1
-        for first in range(0, len(alike), size):
-            # The last group repeats its last flight.
-            chosen = alike[np.minimum(np.arange(first, first + size), len(alike) - 1)]
-            rows = [(flights[i], *(each[i] for each in beside)) for i in chosen]
-            stacked = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *rows)
-            result = jax.tree.map(np.asarray, function(*stacked))
-            for row, i in enumerate(alike[first : first + size]):
-                found[i] = jax.tree.map(lambda x, r=row: x[r], result)
-    return found
+def _repeated(x: np.ndarray, length: int) -> np.ndarray:
+    """The last row again and again, up to a length."""
+    return np.concatenate([x, np.repeat(x[-1:], length - len(x), axis=0)])
 
 
 def _rotor_speed(log: FlightLog) -> tuple[np.ndarray, bool]:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.errors import CfbError
@@ -29,7 +28,7 @@ from cfb_mjx.sysid.disturbance import observed_model
 from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.metrics import geodesic_deg
 from cfb_mjx.sysid.observer import Observer, causal_rotor_speed, observe
-from cfb_mjx.sysid.replay import remembered
+from cfb_mjx.sysid.replay import remembered_along
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 
 STEPS = 50
@@ -219,8 +218,8 @@ def _stretch_of_flight(faults: SensorFaults, log: FlightLog, starts: Starts) -> 
 def _memory(model: Quadrotor, log: FlightLog, rows: np.ndarray) -> tuple:
     if not model.effects:
         return ()
-    _, memory = eqx.filter_jit(remembered)(model, prepare_flight(log, 0.0, 0.0), jnp.zeros(()))
-    return jax.tree.map(lambda x: np.asarray(x)[rows], memory)
+    ((_, memory),) = remembered_along(model, [prepare_flight(log, 0.0, 0.0)])
+    return jax.tree.map(lambda x: x[rows], memory)
 
 
 @eqx.filter_jit

@@ -27,8 +27,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import Memory
 from cfb_mjx.model.quadrotor import Quadrotor
-from cfb_mjx.sysid.flight import MEASURED_SHARE, Flight, delay_of, prepare_flight
-from cfb_mjx.sysid.replay import Replay, replay
+from cfb_mjx.sysid.flight import MEASURED_SHARE, Flight, delay_of, lengthened, prepare_flight
+from cfb_mjx.sysid.replay import Lane, Replay, replays
 from cfb_mjx.sysid.windows import Windows
 
 RIDGE = 1e-3
@@ -134,9 +134,8 @@ def observe(model: Quadrotor, log: FlightLog, delay: float, observer: Observer, 
     Returns:
         NumPy arrays, one row per row of the log.
     """
-    found, _ = _observe(
-        model, *replay_inputs(log, delay, float(model.parameters.gyro_delay), use_measured), _numbers(observer)
-    )
+    inputs = replay_inputs(log, delay, float(model.parameters.gyro_delay), use_measured)
+    found = _observe(model, *_replayed(model, *inputs), _numbers(observer))
     return jax.tree.map(lambda x: np.asarray(x)[: len(log)], found)
 
 
@@ -161,10 +160,10 @@ def fit_observer(model: Quadrotor, logs: Sequence[FlightLog], observer: Observer
     if not logs:
         raise CfbError("fit_observer needs at least one log.")
     first = _numbers(observer or Observer())
-    replays = []
+    data = []
     for log in logs:
         flight, driven = replay_inputs(log, delay_of(log, model.parameters), float(model.parameters.gyro_delay))
-        replays.append((model, flight, driven, replayed(model, flight, driven)))
+        data.append((model, *_replayed(model, flight, driven)))
     leaves, structure = jax.tree.flatten(first)
     sizes = [leaf.size for leaf in leaves]
 
@@ -182,7 +181,7 @@ def fit_observer(model: Quadrotor, logs: Sequence[FlightLog], observer: Observer
 
     solver = optx.BFGS(rtol=1e-3, atol=1e-3)
     start = jnp.zeros(sum(sizes), jnp.result_type(float))
-    best = optx.minimise(cost, solver, start, tuple(replays), max_steps=60, throw=False).value
+    best = optx.minimise(cost, solver, start, tuple(data), max_steps=60, throw=False).value
     found = levels(best)
     values = {f.name: np.asarray(getattr(found, f.name)) for f in dataclasses.fields(found)}
     return Observer(**{name: tuple(x.tolist()) if x.ndim else float(x) for name, x in values.items()})
@@ -218,18 +217,18 @@ def causal_rotor_speed(log: FlightLog) -> np.ndarray | None:
     return out
 
 
-@eqx.filter_jit
-def replayed(model: Quadrotor, flight: Flight, driven: Array) -> Replay:
-    """`replay` without a command lead, compiled."""
-    return replay(model, flight, driven, jnp.zeros(()))
+def _replayed(model: Quadrotor, flight: Flight, driven: np.ndarray) -> tuple[Flight, np.ndarray, Replay]:
+    """A flight, the rotor speeds that drive it and what the model says of it, padded so that filters come compiled."""
+    (said,) = replays(model, [Lane(flight, driven)])
+    flight, (driven, said) = lengthened(flight, (driven, said))
+    return flight, driven, said
 
 
 @eqx.filter_jit
-def _observe(model: Quadrotor, flight: Flight, driven: Array, observer: Observer):
-    said = replay(model, flight, driven, jnp.zeros(()))
-    body, body_errors = _body(model, flight, said, observer)
-    motors, motor_errors = _motors(model, flight, driven, said, observer)
-    return Observed(*body, *motors), (*body_errors, *motor_errors)
+def _observe(model: Quadrotor, flight: Flight, driven: Array, said: Replay, observer: Observer) -> Observed:
+    body, _ = _body(model, flight, said, observer)
+    motors, _ = _motors(model, flight, driven, said, observer)
+    return Observed(*body, *motors)
 
 
 def _surprise(model: Quadrotor, flight: Flight, driven: Array, said: Replay, observer: Observer) -> Array:

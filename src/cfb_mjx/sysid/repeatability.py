@@ -11,7 +11,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.sysid.flight import delay_of, with_gyro_in_time
-from cfb_mjx.sysid.observer import replay_inputs, replayed
+from cfb_mjx.sysid.observer import replay_inputs
+from cfb_mjx.sysid.replay import Lane, replays
 
 CORNER = 6.0
 """Hz. Above, the gyro's derivative is noise."""
@@ -50,8 +51,8 @@ def residual_angular_acceleration(model: Quadrotor, log: FlightLog) -> tuple[np.
         (n,) time, s, evenly spaced; (n, 3) residual, rad/s^2; (n, 3) position, m.
     """
     log = with_gyro_in_time(log, float(model.parameters.gyro_delay))
-    said = replayed(model, *replay_inputs(log, delay_of(log, model.parameters), 0.0))
-    said = np.asarray(said.angular_acceleration)[: len(log)]
+    (said,) = replays(model, [Lane(*replay_inputs(log, delay_of(log, model.parameters), 0.0))])
+    said = said.angular_acceleration[: len(log)]
     time = np.arange(log.time[0], log.time[-1], 1 / RATE)
     rate, said, position = (_sampled(time, log.time, x) for x in (log.body_rate, said, log.position))
     low = butter(4, CORNER, fs=RATE, output="sos")

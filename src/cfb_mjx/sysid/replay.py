@@ -2,22 +2,22 @@
 
 The body's state is taken from the log row by row, so nothing diverges and no feedback is broken; only what the log
 cannot show (rotor speeds from commands, memories of effects) is carried along. Every effect takes part with the very
-functions it has in simulation.
+functions it has in simulation. Many flights, or one flight beside many models, are walked along side by side, `ROWS` at
+a time: one compiled program serves flights of any number and length.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.model import rotors
-from cfb_mjx.model.effects import Reading
+from cfb_mjx.model.effects import Effect, Reading
 from cfb_mjx.model.quadrotor import (
     Quadrotor,
     at_rotor_center,
@@ -31,52 +31,58 @@ from cfb_mjx.model.quadrotor import (
 )
 from cfb_mjx.model.state import State, unstack
 from cfb_mjx.model.vector import Vec, rotate
-from cfb_mjx.sysid.flight import Flight, in_groups
+from cfb_mjx.sysid.flight import ROWS, Flight
+
+LANES = 8, 64
+"""So many are walked along side by side: the fewer if that is enough. One row of 64 lanes takes three times as long as
+one row of one."""
+MOST = 500_000
+"""Rows walked along side by side, for many long recordings at once would fill the memory."""
 
 
-def next_row(x: Array) -> Array:
-    """(n, ...) what the following row holds; the last row stays."""
-    return jnp.concatenate([x[1:], x[-1:]])
+def between(x: np.ndarray) -> np.ndarray:
+    """(n, ...) in the middle of the interval after each row; the last row stays."""
+    return 0.5 * (x + np.concatenate([x[1:], x[-1:]]))
 
 
-def between(x: Array) -> Array:
-    """(n, ...) in the middle of the interval after each row."""
-    return 0.5 * (x + next_row(x))
+class Lane(NamedTuple):
+    """One flight beside one model."""
+
+    flight: Flight
+    driven: np.ndarray
+    """(n, 4) rotor speeds that drive the body where the flight's were measured (`smoothed_rotor_speed`), rad/s."""
+    lead: float = 0.0
+    """Share of the next row's command in the mean over an interval: commands sent between two rows are not in the log
+    (0: none are missing; about 1/4: every second one is)."""
+    effects: tuple[Effect, ...] | None = None
+    """In place of the model's, with other numbers."""
 
 
-class Replay(eqx.Module):
+class Replay(NamedTuple):
     """What a model predicts along a flight."""
 
-    rotor_speed: Float[Array, "n 4"]
+    rotor_speed: Float[np.ndarray, "n 4"]
     """From the commands alone, at each row, rad/s."""
-    angular_acceleration: Float[Array, "n 3"]
+    angular_acceleration: Float[np.ndarray, "n 3"]
     """Mean over the interval after a row, body axes, rad/s^2."""
-    specific_force: Float[Array, "n 3"]
+    specific_force: Float[np.ndarray, "n 3"]
     """At the rotors' centre in the middle of that interval, body axes, m/s^2."""
 
 
-def replay(model: Quadrotor, flight: Flight, driven: Float[Array, "n 4"], lead: Float[Array, ""]) -> Replay:
-    """Replay a flight; differentiable, and batched by ``vmap``.
+def replays(model: Quadrotor, lanes: Iterable[Lane]) -> Iterator[Replay]:
+    """Replay flights, one after the other as they are asked for.
 
     Args:
         model: the drone with its effects.
-        flight: the flight.
-        driven: rotor speeds that drive the body where the flight's were measured (`smoothed_rotor_speed`), rad/s.
-        lead: share of the next row's command in the mean over an interval: commands sent between two rows are not
-            in the log (0: none are missing; about 1/4: every second one is).
+        lanes: flights, and with which numbers each.
     """
-    return _scan(model, flight, driven, lead)[0]
-
-
-def remembered(model: Quadrotor, flight: Flight, lead: Float[Array, ""]) -> tuple[Array, tuple]:
-    """Rotor speeds (n, 4) from commands, and the memories of all effects (arrays with leading axis n), at each row."""
-    out, memory = _scan(model, flight, flight.rotor_speed, lead)
-    return out.rotor_speed, memory
+    return _walked(model, lanes, False)
 
 
 def remembered_along(model: Quadrotor, flights: Sequence[Flight], lead: float = 0.0) -> list[tuple[np.ndarray, tuple]]:
-    """`remembered` of several flights, walked along side by side."""
-    return in_groups(partial(_remembered, rotors_alone(model), jnp.asarray(lead)), flights)
+    """Rotor speeds (n, 4) from commands, and the memories of all effects (leading axis n), at each row of flights."""
+    alone = rotors_alone(model)
+    return list(_walked(alone, [Lane(flight, flight.rotor_speed, lead) for flight in flights], True))
 
 
 def rotors_alone(model: Quadrotor) -> Quadrotor:
@@ -84,35 +90,105 @@ def rotors_alone(model: Quadrotor) -> Quadrotor:
     return Quadrotor(model.parameters, model.effects, model.body, dt=model.dt, substeps=model.substeps)
 
 
+def _walked(model: Quadrotor, lanes: Iterable[Lane], remembers: bool) -> Iterator:
+    for some in _grouped(lanes):
+        width = next(count for count in LANES if count >= len(some))
+        # The last lane is walked along more than once where there are fewer.
+        whole = some + some[-1:] * (width - len(some))
+        numbers = [model.effects if lane.effects is None else lane.effects for lane in whole]
+        effects = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *numbers)
+        lead = np.array([lane.lead for lane in whole], float)
+        measured = np.array([lane.flight.measured for lane in whole], float)
+        longest = max(len(lane.flight.time) for lane in some)
+        carry, pieces = None, []
+        for first in range(0, longest, ROWS):
+            # One more, which says what happens in the interval after the last.
+            rows = _rows(whole, first, first + ROWS + 1)
+            if carry is None:
+                carry = _begin(model, effects, {key: x[:, :2] for key, x in rows.items()})
+            carry, found = _advance(model, effects, lead, measured, rows, carry, remembers)
+            pieces.append(found)
+        together = jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x], axis=1), *pieces)
+        for i, lane in enumerate(some):
+            yield jax.tree.map(lambda x, i=i, n=len(lane.flight.time): x[i, :n], together)
+
+
+def _grouped(lanes: Iterable[Lane]) -> Iterator[list[Lane]]:
+    some: list[Lane] = []
+    for lane in lanes:
+        longest = max(len(each.flight.time) for each in [*some, lane])
+        if some and (len(some) == LANES[-1] or longest * (len(some) + 1) > MOST):
+            yield some
+            some = []
+        some.append(lane)
+    if some:
+        yield some
+
+
+_READ = ("time", "interval", "position", "velocity", "quaternion", "body_rate", "specific_force", "command", "voltage")
+
+
+def _rows(lanes: list[Lane], first: int, last: int) -> dict[str, np.ndarray]:
+    """Some rows of every lane's flight; behind its end the last one again, with no time between."""
+    rows = {id(lane.flight): np.minimum(np.arange(first, last), len(lane.flight.time) - 1) for lane in lanes}
+    # Often many lanes are of one flight.
+    flights = {id(lane.flight): lane.flight for lane in lanes}
+    found = {}
+    for key in _READ:
+        some = {at: np.asarray(getattr(flight, key))[rows[at]] for at, flight in flights.items()}
+        found[key] = np.stack([some[id(lane.flight)] for lane in lanes])
+    return found | {"driven": np.stack([np.asarray(lane.driven)[rows[id(lane.flight)]] for lane in lanes])}
+
+
+def _state(rows: dict[str, Array]) -> State:
+    """The body in the middle of the intervals between rows."""
+    names = ("position", "velocity", "quaternion", "body_rate", "driven")
+    return State(*(0.5 * (rows[name][:-1] + rows[name][1:]) for name in names))
+
+
 @eqx.filter_jit
-def _remembered(model: Quadrotor, lead: Array, flights: Flight):
-    return jax.vmap(lambda flight: remembered(model, flight, lead))(flights)
+def _begin(model: Quadrotor, effects: tuple[Effect, ...], rows: dict[str, Array]):
+    """Rotor speeds and memories at the first of two rows, as after long steady flight, of every lane."""
+
+    def one(effects, rows):
+        own = _with(model, effects)
+        center = Vec.unstack(own.changed_parameters().center_of_gravity)
+        first = jax.tree.map(lambda x: x[0], _state(rows))
+        speed = rotors.steady_speed(prepare(own).rotors, Vec.unstack(rows["command"][0]))
+        start = begin(own, State(first.position, first.velocity, first.quaternion, first.body_rate, speed.stack()))
+        return speed, unstack(start, center).memory
+
+    return jax.vmap(one)(effects, rows)
 
 
-def _scan(model: Quadrotor, flight: Flight, driven, lead):
+def _with(model: Quadrotor, effects: tuple[Effect, ...]) -> Quadrotor:
+    return eqx.tree_at(lambda m: m.effects, model, effects) if effects else model
+
+
+@eqx.filter_jit
+def _advance(model: Quadrotor, effects: tuple[Effect, ...], lead, measured, rows, carry, remembers: bool):
+    """Along some rows of every lane: what is carried on, and a `Replay` or what is remembered at each of them."""
+
+    def one(effects, *inputs):
+        return _along(_with(model, effects), *inputs, remembers)
+
+    return jax.vmap(one)(effects, lead, measured, rows, carry)
+
+
+def _along(model: Quadrotor, lead: Array, share: Array, rows: dict[str, Array], carry, remembers: bool):
     center = Vec.unstack(model.changed_parameters().center_of_gravity)
-    command = flight.command + lead * (next_row(flight.command) - flight.command)
-    middle = State(
-        between(flight.position),
-        between(flight.velocity),
-        between(flight.quaternion),
-        between(flight.body_rate),
-        driven,
-    )
-    first = jax.tree.map(lambda x: x[0], middle)
-    steady = prepare(model)
-    speed = rotors.steady_speed(steady.rotors, Vec.unstack(flight.command[0]))
-    start = begin(model, State(first.position, first.velocity, first.quaternion, first.body_rate, speed.stack()))
-    carry = speed, unstack(start, center).memory
+    here, there = (Vec.unstack(rows["driven"][x]) for x in (slice(-1), slice(1, None)))
+    command = rows["command"][:-1] + lead * (rows["command"][1:] - rows["command"][:-1])
+    felt = 0.5 * (rows["specific_force"][:-1] + rows["specific_force"][1:])
     inputs = (
-        middle,
+        _state(rows),
         Vec.unstack(command),
-        flight.interval,
-        Vec.unstack(driven),
-        Vec.unstack(next_row(driven)),
-        flight.voltage,
-        flight.time,
-        Vec.unstack(between(flight.specific_force)),
+        rows["interval"][:-1],
+        here,
+        there,
+        rows["voltage"][:-1],
+        rows["time"][:-1],
+        Vec.unstack(felt),
     )
 
     def row(carry, inputs):
@@ -124,7 +200,6 @@ def _scan(model: Quadrotor, flight: Flight, driven, lead):
         path, moved = commanded_path(prepared, speed, memory, command)
         straight = rotors.path_between(prepared.rotors, here, there)
         # Where rotor speed was measured it drives the body; the commands still tell the rotors' own model.
-        share = flight.measured
         body_speed = share * straight.middle + (1 - share) * path.middle
         rate = share * straight.rate_middle + (1 - share) * ((path.end - path.start) * prepared.rotors.inverse_dt)
         where = remembering(unstack(at, center), moved)
@@ -135,15 +210,14 @@ def _scan(model: Quadrotor, flight: Flight, driven, lead):
         # What remembers accelerations (a slung load) followed the drone, not the model of it.
         missed = rotate(where.quaternion, felt - force)
         moved = followed(prepared, seen, rotate(where.quaternion, felt) - up, missed)
-        return (path.end, moved), (
-            Replay(speed.stack(), angular.stack(), force.stack()),
-            jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec)),
-        )
+        kept = jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec))
+        known = (speed.stack(), kept) if remembers else Replay(speed.stack(), angular.stack(), force.stack())
+        return (path.end, moved), known
 
-    return jax.lax.scan(row, carry, inputs)[1]
+    return jax.lax.scan(row, carry, inputs)
 
 
-def smoothed_rotor_speed(flight: Flight, modelled: Array, width: float = 0.012) -> Array:
+def smoothed_rotor_speed(flight: Flight, modelled: np.ndarray, width: float = 0.012) -> np.ndarray:
     """Measured rotor speeds with the reading noise taken out: the model's, plus its error smoothed over ``width`` s.
 
     Errors in a regressor pull what multiplies it towards zero, most of all the rotors' acceleration.

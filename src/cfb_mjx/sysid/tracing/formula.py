@@ -128,9 +128,6 @@ def _families(library: list[Column]) -> list[list[Column]]:
     return found
 
 
-_WIDTH = 64
-
-
 @dataclass(frozen=True)
 class Term:
     """One term of a formula."""
@@ -166,7 +163,7 @@ def fit_formula(search: Search, hypothesis: Hypothesis, terms: list[Column]) -> 
     richer = replace(hypothesis, terms=tuple(terms))
     for _ in range(2):
         own = search.own_columns(richer)
-        linear = search.linearise(richer, own, _WIDTH)
+        linear = search.linearise(richer, own)
         index = linear.index(own)
         values = solve(linear.blocks.sum(0), index, linear.scale)
         richer = search.moved(richer, own, np.concatenate([[0.0], values * linear.scale[index]]))
@@ -210,7 +207,7 @@ def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Colu
     An effect that the terms cannot say, but that nothing misses beside them, had only stood in for them.
     """
     own = search.own_columns(hypothesis)
-    linear = search.linearise(hypothesis, own, _WIDTH)
+    linear = search.linearise(hypothesis, own)
     total = linear.blocks.sum(0) * np.outer(linear.scale, linear.scale)
     effect = linear.index([c for c in own if c.effect == name and c not in terms])
     term = linear.index(terms)

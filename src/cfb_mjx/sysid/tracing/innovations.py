@@ -8,8 +8,9 @@ filters are linear, so the derivative of a residual by a parameter is whitened b
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from functools import partial
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import islice
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,19 +19,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import Condition, Wrench
+from cfb_mjx.logs.rotation import to_world
+from cfb_mjx.model.effects import Condition, Effect, Wrench
 from cfb_mjx.model.effects.formula import body_signals, place_signals
 from cfb_mjx.model.quadrotor import Quadrotor, at_rotor_center, in_still_air, prepare
 from cfb_mjx.model.state import State, unstack
-from cfb_mjx.model.vector import Vec, rotate, rotate_inverse
+from cfb_mjx.model.vector import Vec, rotate_inverse
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.flight import Flight, in_groups
+from cfb_mjx.sysid.flight import ROWS, Flight, lengthened
 from cfb_mjx.sysid.identification.flight_data import white_noise
-from cfb_mjx.sysid.replay import between, remembered_along, replay, smoothed_rotor_speed
+from cfb_mjx.sysid.replay import Lane, Replay, between, remembered_along, replays, smoothed_rotor_speed
 
-BLOCK = 512
-"""Rows that stay together: about two seconds at 250 Hz. A filter starts anew in every block."""
 CHANNELS = 10
+SIDE_BY_SIDE = 32, 16
+"""Blocks and columns that are whitened at a time: one program serves any number."""
 MOTOR_LAG = 0.05
 
 
@@ -49,53 +51,47 @@ class Levels(eqx.Module):
     """Of the disturbance, s."""
 
 
-class Signals(eqx.Module):
+class Signals(NamedTuple):
     """What the filters read, row by row; the last axis may hold a residual and its derivatives side by side."""
 
-    quantity: Float[Array, "n 10 *c"]
+    quantity: Float[np.ndarray, "n 10 *c"]
     """Body rate, velocity and rotor speed minus what the model accumulates from its accelerations."""
-    acceleration: Float[Array, "n 3 *c"]
+    acceleration: Float[np.ndarray, "n 3 *c"]
     """Accelerometer minus model, world axes."""
 
 
-def predicted(model: Quadrotor, flight: Flight, driven: Array, lead: Array) -> Signals:
-    """What the model says the sensors read, accumulated from its accelerations (so only changes mean something)."""
-    found = replay(model, flight, driven, lead)
-    gravity = model.parameters.gravity
-    return accumulated(flight, found.angular_acceleration, found.specific_force, found.rotor_speed, gravity)
+def predicted(flight: Flight, said: Replay, gravity: float) -> Signals:
+    """What a model says the sensors read, accumulated from its accelerations (so only changes mean something).
 
-
-def accumulated(
-    flight: Flight,
-    angular_acceleration: Float[Array, "n 3"],
-    specific_force: Float[Array, "n 3"],
-    rotor_speed: Float[Array, "n 4"],
-    gravity: Float[Array, ""],
-) -> Signals:
-    """Signals of accelerations in body axes; ``gravity`` is zero for what comes on top of others."""
+    Args:
+        flight: n rows.
+        said: of the model; or of several, along leading axes.
+        gravity: m/s^2; zero for what comes on top of others.
+    """
     dt = flight.interval[:, None]
-    force = Vec.unstack(specific_force)
     middle = between(flight.quaternion)
-    middle = middle / jnp.linalg.norm(middle, axis=1, keepdims=True)
-    world = rotate(Vec.unstack(middle), force).stack()
-    up = jnp.array([0.0, 0.0, 1.0]) * gravity
+    middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)
+    world = to_world(middle, said.specific_force)
+    up = np.array([0.0, 0.0, gravity])
 
     def summed(rate):
-        return jnp.concatenate([jnp.zeros((1, 3)), jnp.cumsum(rate * dt, axis=0)[:-1]])
+        whole = np.zeros_like(rate)
+        np.cumsum((rate * dt)[..., :-1, :], axis=-2, out=whole[..., 1:, :])
+        return whole
 
-    before = jnp.concatenate([world[:1], world[:-1]])
-    quantity = jnp.concatenate([summed(angular_acceleration), summed(world - up), rotor_speed], axis=1)
+    before = np.concatenate([world[..., :1, :], world[..., :-1, :]], axis=-2)
+    quantity = np.concatenate([summed(said.angular_acceleration), summed(world - up), said.rotor_speed], axis=-1)
     return Signals(quantity, 0.5 * (before + world))
 
 
 def measured(flight: Flight) -> Signals:
     """What the sensors read."""
-    world = rotate(Vec.unstack(flight.quaternion), Vec.unstack(flight.specific_force)).stack()
-    return Signals(jnp.concatenate([flight.body_rate, flight.velocity, flight.rotor_speed], axis=1), world)
+    world = to_world(flight.quaternion, flight.specific_force)
+    return Signals(np.concatenate([flight.body_rate, flight.velocity, flight.rotor_speed], axis=1), world)
 
 
 class Blocks(eqx.Module):
-    """Signals cut into B blocks of `BLOCK` rows, with what the filters need to know of each row."""
+    """Signals cut into B blocks of `ROWS` rows, with what the filters need to know of each row."""
 
     signals: Signals
     interval: Float[Array, "b r"]
@@ -104,16 +100,12 @@ class Blocks(eqx.Module):
 
 
 def cut(flight: Flight, signals: Signals) -> Blocks:
-    """Blocks of a padded flight."""
-    count = flight.time.shape[0] // BLOCK
-    interval = jnp.concatenate([jnp.zeros(1), flight.interval[:-1]])
+    """Blocks of a flight; a filter starts anew in every block."""
+    interval = np.concatenate([np.zeros(1), flight.interval[:-1]])
     rotor = flight.valid * flight.measured
-    valid = jnp.concatenate([jnp.repeat(flight.valid[:, None], 6, 1), jnp.repeat(rotor[:, None], 4, 1)], axis=1)
-
-    def chop(x):
-        return x[: count * BLOCK].reshape(count, BLOCK, *x.shape[1:])
-
-    return Blocks(jax.tree.map(chop, signals), chop(interval), chop(valid))
+    valid = np.concatenate([np.repeat(flight.valid[:, None], 6, 1), np.repeat(rotor[:, None], 4, 1)], axis=1)
+    chopped = [x.reshape(-1, ROWS, *x.shape[1:]) for x in (*signals, interval, valid)]
+    return Blocks(Signals(*chopped[:2]), *chopped[2:])
 
 
 def joined(pieces: Iterable[Blocks]) -> Blocks:
@@ -240,15 +232,6 @@ def fit_levels(blocks: Blocks, noise: dict[str, np.ndarray], start: np.ndarray =
     return found.x
 
 
-@eqx.filter_jit
-def _residuals(model: Quadrotor, lead: Array, flights: Flight, driven: Array) -> Blocks:
-    def one(flight, driven):
-        said = predicted(model, flight, driven, lead)
-        return cut(flight, jax.tree.map(lambda a, b: a - b, measured(flight), said))
-
-    return jax.vmap(one)(flights, driven)
-
-
 def driven_by(model: Quadrotor, flights: Sequence[Flight], lead: float) -> list[np.ndarray]:
     """Rotor speeds (n, 4) that drive the body along each flight: measured, or from commands."""
     pairs = zip(flights, (speed for speed, _ in remembered_along(model, flights, lead)), strict=True)
@@ -259,88 +242,144 @@ def residual_blocks(
     model: Quadrotor, flights: Sequence[Flight], driven: Sequence[np.ndarray], lead: float
 ) -> list[Blocks]:
     """What the model misses along each flight."""
-    return in_groups(partial(_residuals, model, jnp.asarray(lead)), flights, driven)
+    gravity = float(model.parameters.gravity)
+    lanes = (Lane(*pair, lead) for pair in zip(flights, driven, strict=True))
+    found = []
+    for flight, said in zip(flights, replays(model, lanes), strict=True):
+        pairs = zip(measured(flight), predicted(flight, said, gravity), strict=True)
+        found.append(cut(flight, Signals(*(a - b for a, b in pairs))))
+    return found
 
 
-@eqx.filter_jit
-def with_slopes(models: Quadrotor, flight: Flight, driven: Array, leads: Array, shifts: Array, steps: Array) -> Signals:
-    """The residual of a flight and, side by side along the last axis (c), its derivatives.
+class Moved(NamedTuple):
+    """A model with one number moved."""
+
+    effects: tuple[Effect, ...]
+    lead: float
+    """Of the commands."""
+    shift: float
+    """By which the motor columns are taken to be late, s."""
+    step: float
+    """Size of the move, in the unit of the number."""
+
+
+def with_slopes(
+    model: Quadrotor, lead: float, moves: Sequence[Moved], flights: Sequence[Flight], driven: Sequence[np.ndarray]
+) -> Iterator[Signals]:
+    """The residual of each flight and, side by side along the last axis (c), its derivatives.
 
     Args:
-        models: leaves of the effects with a leading axis (c): the model as it is, then moved by each step.
-        flight: one flight.
+        model: as it is.
+        lead: of its commands.
+        moves: c - 1 of them.
+        flights: one by one.
         driven: of `driven_by`.
-        leads: (c,) command lead of each.
-        shifts: (c,) s by which the motor columns of each are taken to be late.
-        steps: (c - 1,) size of the moves, in the units of the columns.
 
     Returns:
         Column 0 is the residual, the others are what the model would say more per unit of each number.
     """
-    time = flight.time
-    slope = jnp.gradient(driven, axis=0) / jnp.maximum(jnp.gradient(time), 1e-4)[:, None]
-    # Late commands and late rotor speeds agree with each other; only what the body does comes too early.
-    rows = jnp.sum(flight.interval) / jnp.maximum(jnp.sum(flight.interval > 0), 1)
+    steps = np.array([move.step for move in moves])
 
-    def one(effects, lead, shift):
-        model = eqx.tree_at(lambda m: m.effects, models, effects)
-        more = (1 - flight.measured) * shift / rows
-        return predicted(model, flight, driven + flight.measured * shift * slope, lead + more)
+    def lanes() -> Iterator[Lane]:
+        for flight, speed in zip(flights, driven, strict=True):
+            yield Lane(flight, speed, lead, model.effects)
+            slope = np.gradient(speed, axis=0) / np.maximum(np.gradient(flight.time), 1e-4)[:, None]
+            # Late commands and late rotor speeds agree with each other; only what the body does comes too early.
+            row = np.sum(flight.interval) / max(np.count_nonzero(flight.interval > 0), 1)
+            for move in moves:
+                late, early = flight.measured * move.shift, (1 - flight.measured) * move.shift / row
+                yield Lane(flight, speed + late * slope if late else speed, move.lead + early, move.effects)
 
-    said = jax.vmap(one)(models.effects, leads, shifts)
-    seen = measured(flight)
-
-    def side_by_side(m, s):
-        base = m - s[0]
-        slopes = (s[1:] - s[:1]) / steps.reshape(-1, *([1] * base.ndim))
-        return jnp.moveaxis(jnp.concatenate([base[None], slopes]), 0, -1)
-
-    return Signals(*(side_by_side(getattr(seen, k), getattr(said, k)) for k in ("quantity", "acceleration")))
+    said = replays(model, lanes())
+    for flight in flights:
+        stacked = Replay(*(np.stack(x) for x in zip(*islice(said, 1 + len(moves)), strict=True)))
+        found = []
+        for seen, told in zip(
+            measured(flight), predicted(flight, stacked, float(model.parameters.gravity)), strict=True
+        ):
+            slopes = (told[1:] - told[:1]) / steps[:, None, None]
+            found.append(np.moveaxis(np.concatenate([(seen - told[0])[None], slopes]), 0, -1))
+        yield Signals(*found)
 
 
 def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, Condition]:
     """The parameters, and the flight condition in the middle of every interval."""
     prepared = prepare(model)
-    middle = (flight.position, flight.velocity, flight.quaternion, flight.body_rate, driven)
-    at = unstack(State(*map(between, middle)), prepared.parameters.center_of_gravity)
+    read = (flight.position, flight.velocity, flight.quaternion, flight.body_rate, driven)
+    middle = State(*(0.5 * (x + jnp.concatenate([x[1:], x[-1:]])) for x in read))
+    at = unstack(middle, prepared.parameters.center_of_gravity)
     return prepared.parameters, in_still_air(prepared, at, at.rotor_speed)
 
 
-@eqx.filter_jit
-def term_squares(model: Quadrotor, flight: Flight, driven: Array) -> Float[Array, " c"]:
+def term_squares(model: Quadrotor, flight: Flight, driven: np.ndarray) -> Float[np.ndarray, " c"]:
     """Mean squares of the signals of the formulas' library over a flight: body terms, then places."""
+    return np.asarray(_term_squares(model, *lengthened(flight, driven)))
+
+
+@eqx.filter_jit
+def _term_squares(model: Quadrotor, flight: Flight, driven: Array) -> Array:
     _, seen = _seen(model, flight, driven)
     signals = jnp.stack([*body_signals(seen), *place_signals(seen)], axis=-1)
     return flight.valid @ signals**2 / jnp.maximum(jnp.sum(flight.valid), 1.0)
 
 
-@eqx.filter_jit
-def term_slopes(model: Quadrotor, flight: Flight, driven: Array, axis: Array) -> Signals:
+def term_slopes(model: Quadrotor, flight: Flight, driven: np.ndarray, axis: int) -> Signals:
     """What each term of the formulas' library (c: body terms, then places) along one axis (0..5) adds.
 
     The same as the derivatives by a `ResidualFormula`'s numbers, without replaying the model for every one of them:
     a wrench on the body does not change how the rotors run.
     """
-    parameters, seen = _seen(model, flight, driven)
-    along = jnp.arange(6) == axis
-
-    def signals(force: Vec, torque: Vec) -> Signals:
-        spin, push = at_rotor_center(parameters, Wrench(force, torque), Vec(0.0, 0.0, 0.0))
-        still = jnp.zeros((flight.time.shape[0], 4))
-        return accumulated(flight, spin.stack(), push.stack(), still, jnp.zeros(()))
-
-    found = [signals(Vec(*(a * s for a in along[3:])), Vec(*(a * s for a in along[:3]))) for s in body_signals(seen)]
-    for s in place_signals(seen):
-        pull = rotate_inverse(seen.quaternion, Vec(*(a * s for a in along[3:])))
-        found.append(signals(pull, Vec(0.0, 0.0, 0.0)))
-    return jax.tree.map(lambda *x: jnp.stack(x, axis=-1), *found)
+    found = _term_accelerations(model, *lengthened(flight, driven), jnp.asarray(axis))
+    spin, push = (np.asarray(x)[:, : len(flight.time)] for x in found)
+    told = predicted(flight, Replay(np.zeros((*spin.shape[:2], 4)), spin, push), 0.0)
+    return Signals(*(np.moveaxis(x, 0, -1) for x in told))
 
 
 @eqx.filter_jit
-def inner_products(flight: Flight, signals: Signals, levels: Levels) -> Float[Array, "b c c"]:
+def _term_accelerations(model: Quadrotor, flight: Flight, driven: Array, axis: Array) -> tuple[Array, Array]:
+    """(c, n, 3) angular accelerations, and specific forces."""
+    parameters, seen = _seen(model, flight, driven)
+    along = jnp.arange(6) == axis
+
+    def accelerations(force: Vec, torque: Vec) -> tuple[Array, Array]:
+        spin, push = at_rotor_center(parameters, Wrench(force, torque), Vec(0.0, 0.0, 0.0))
+        return spin.stack(), push.stack()
+
+    found = [
+        accelerations(Vec(*(a * s for a in along[3:])), Vec(*(a * s for a in along[:3]))) for s in body_signals(seen)
+    ]
+    for s in place_signals(seen):
+        pull = rotate_inverse(seen.quaternion, Vec(*(a * s for a in along[3:])))
+        found.append(accelerations(pull, Vec(0.0, 0.0, 0.0)))
+    return jax.tree.map(lambda *x: jnp.stack(x), *found)
+
+
+def inner_products(blocks: Blocks, levels: Levels) -> Float[np.ndarray, "b c c"]:
     """Inner products of whitened signals side by side, per block."""
-    e, _, _ = innovations(cut(flight, signals), levels)
-    return jnp.einsum("brkc,brkd->bcd", e, e)
+    count, columns = len(blocks.interval), blocks.signals.quantity.shape[-1]
+    most, wide = SIDE_BY_SIDE
+    groups = -(-columns // wide)
+
+    def apart(x: np.ndarray) -> np.ndarray:
+        """One row for each block and group of columns."""
+        x = np.pad(x, (*[(0, 0)] * (x.ndim - 1), (0, groups * wide - columns)))
+        return np.moveaxis(x.reshape(*x.shape[:-1], groups, wide), -2, 1).reshape(-1, *x.shape[1:-1], wide)
+
+    signals = Signals(*map(apart, blocks.signals))
+    every = Blocks(signals, *(np.repeat(x, groups, axis=0) for x in (blocks.interval, blocks.valid)))
+    found = []
+    for first in range(0, count * groups, most):
+        # The last ones are whitened more than once.
+        chosen = np.minimum(np.arange(first, first + most), count * groups - 1)
+        found.append(np.asarray(_whitened(jax.tree.map(lambda x, c=chosen: x[c], every), levels)))
+    e = np.concatenate(found)[: count * groups].reshape(count, groups, -1, wide)
+    e = np.moveaxis(e, 1, -2).reshape(count, -1, groups * wide)[..., :columns]
+    return np.swapaxes(e, 1, 2) @ e
+
+
+@eqx.filter_jit
+def _whitened(blocks: Blocks, levels: Levels) -> Array:
+    return innovations(blocks, levels)[0]
 
 
 def sensor_noise(logs: list[FlightLog], least_gyro: float = 1e-3) -> dict[str, np.ndarray]:

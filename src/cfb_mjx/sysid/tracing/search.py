@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
@@ -38,8 +38,10 @@ from cfb_mjx.sysid.tracing.hypothesis import (
     term_columns,
 )
 from cfb_mjx.sysid.tracing.innovations import (
+    SIDE_BY_SIDE,
     Blocks,
     Signals,
+    cut,
     driven_by,
     fit_levels,
     inner_products,
@@ -66,8 +68,7 @@ SAMPLE = 32
 """Blocks from which noise levels are learned: about a minute, many times longer than what wanders."""
 KNOWN = 2
 """Hypotheses whose residuals are kept."""
-PAD = 16
-"""Columns are padded to a multiple of this with copies of the lead, so that one compiled program serves all rounds."""
+LEAD_COLUMN = Column(LEAD, LEAD, None, (), 0.25)
 
 
 @dataclass
@@ -158,48 +159,50 @@ class Search:
         blocks = joined(blocks for blocks, _ in self.residuals(hypothesis))
         return replace(hypothesis, levels=fit_levels(_sample(blocks), self.noise, hypothesis.levels))
 
-    def linearise(self, hypothesis: Hypothesis, wanted: list[Column], width: int = 0) -> Linear:
-        """Residual and derivatives by ``wanted`` at a hypothesis, padded to ``width`` columns at least."""
-        signals, columns = self._slopes(hypothesis, wanted, self._driven(hypothesis), width)
-        return Linear(columns, self._products(hypothesis, signals))
+    def linearise(self, hypothesis: Hypothesis, wanted: list[Column]) -> Linear:
+        """Residual and derivatives by the lead of the commands and by ``wanted`` at a hypothesis."""
+        columns = [LEAD_COLUMN, *wanted]
+        return Linear(columns, self._products(hypothesis, self._slopes(hypothesis, columns)))
 
     def linearise_terms(self, hypothesis: Hypothesis, own: list[Column]) -> list[Linear]:
         """`linearise` by ``own`` and the library of formulas, for each axis (`formula.AXES`)."""
         model, driven = hypothesis.model(self.parameters), self._driven(hypothesis)
-        beside, columns = self._slopes(hypothesis, own, driven)
-        squares = [term_squares(model, *pair) for pair in zip(self.flights(hypothesis), driven, strict=True)]
+        flights, columns = self.flights(hypothesis), [LEAD_COLUMN, *own]
+        beside = list(self._slopes(hypothesis, columns, driven))
+        squares = [term_squares(model, *pair) for pair in zip(flights, driven, strict=True)]
         sizes = np.sqrt(np.mean(squares, axis=0))
         found = []
         for axis in range(6):
-            library = term_columns(axis, sizes)
-            signals = []
-            for flight, speed, some in zip(self.flights(hypothesis), driven, beside, strict=True):
-                terms = term_slopes(model, flight, speed, jnp.asarray(axis))
-                signals.append(jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=-1), some, terms))
-            found.append(Linear(columns + library, self._products(hypothesis, signals)))
+            terms = (term_slopes(model, *pair, axis) for pair in zip(flights, driven, strict=True))
+            signals = (
+                Signals(*(np.concatenate(pair, axis=-1) for pair in zip(some, more, strict=True)))
+                for some, more in zip(beside, terms, strict=True)
+            )
+            found.append(Linear(columns + term_columns(axis, sizes), self._products(hypothesis, signals)))
         return found
 
     def _driven(self, hypothesis: Hypothesis) -> list[np.ndarray]:
         return driven_by(hypothesis.model(self.parameters), self.flights(hypothesis), hypothesis.lead)
 
-    def _products(self, hypothesis: Hypothesis, signals: list[Signals]) -> np.ndarray:
+    def _products(self, hypothesis: Hypothesis, signals: Iterable[Signals]) -> np.ndarray:
         levels = levels_from(jnp.asarray(hypothesis.levels), self.noise)
-        pairs = zip(self.flights(hypothesis), signals, strict=True)
-        return np.concatenate([np.asarray(inner_products(flight, one, levels)) for flight, one in pairs])
+        found, waiting = [], []
+        for pair in zip(self.flights(hypothesis), signals, strict=True):
+            waiting.append(cut(*pair))
+            # Short flights together, so that they fill what is whitened at a time.
+            if sum(len(blocks.interval) for blocks in waiting) >= SIDE_BY_SIDE[0]:
+                found.append(inner_products(joined(waiting), levels))
+                waiting = []
+        return np.concatenate([*found, *([inner_products(joined(waiting), levels)] if waiting else [])])
 
     def _slopes(
-        self, hypothesis: Hypothesis, wanted: list[Column], driven: list[np.ndarray], width: int = 0
-    ) -> tuple[list[Signals], list[Column]]:
-        """Residuals and derivatives of every flight, and the (padded) columns they belong to."""
-        lead = Column(LEAD, LEAD, None, (), 0.25)
-        columns = [lead, *wanted]
-        padded = columns + [lead] * max(-(len(columns) + 1) % PAD, width - 1 - len(columns))
-        changed = moves(hypothesis.effects, hypothesis.lead, padded, set(hypothesis.present))
-        model = hypothesis.model(self.parameters)
-        models = eqx.tree_at(lambda m: m.effects, model, changed.effects)
-        steps = [jnp.asarray(x) for x in (changed.lead, changed.shift, changed.step)]
-        pairs = zip(self.flights(hypothesis), driven, strict=True)
-        return [with_slopes(models, *pair, *steps) for pair in pairs], padded
+        self, hypothesis: Hypothesis, columns: list[Column], driven: list[np.ndarray] | None = None
+    ) -> Iterator[Signals]:
+        """Residual and derivatives of every flight."""
+        changes = moves(hypothesis.effects, hypothesis.lead, columns, set(hypothesis.present))
+        driven = self._driven(hypothesis) if driven is None else driven
+        model, flights = hypothesis.model(self.parameters), self.flights(hypothesis)
+        return with_slopes(model, hypothesis.lead, changes, flights, driven)
 
     # -- one hypothesis -------------------------------------------------------------------------------------------
 
