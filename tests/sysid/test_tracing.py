@@ -22,7 +22,7 @@ from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.closing import close_loop
-from cfb_mjx.sysid.tracing.evidence import evidence
+from cfb_mjx.sysid.tracing.evidence import dealt, evidence
 from cfb_mjx.sysid.tracing.formula import with_library
 from cfb_mjx.sysid.tracing.given import fit_given
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, moved, neutral_effects, shapes, strengths, term_columns
@@ -317,6 +317,15 @@ def test_what_was_searched_for_can_be_given_up_again(closed):
     np.testing.assert_array_equal(given_up.effect("rotor_drag").coefficient, 0.0)
 
 
+def test_a_fold_leaves_out_another_part_of_every_flight():
+    """Whatever the number of blocks of a flight: never the same of each, and as many in every fold as can be."""
+    for count in range(1, 13):
+        fold = dealt([count] * 5)
+        assert set(np.bincount(fold, minlength=5)) == {count}
+        for position in range(count):
+            assert set(fold[position::count]) == set(range(5))
+
+
 def test_named_effects_are_fitted_to_innovations(campaigns, base):
     campaign = campaigns["drag"]
     found = fit_given(campaign.fit, base.parameters(), ("rotor_drag", "thrust_scale"))
@@ -460,7 +469,7 @@ def test_what_stands_beside_others_is_told_from_what_stands_in_for_them(campaign
     search = Search.start(campaign.fit, base.parameters(), 0.008, check_sensors(campaign.fit, 0.008, 0.0))
     nothing = search.learned(search.nothing())
     linear = search.whole(nothing)
-    alone = {name for name, (found, _) in search.probes(nothing, linear).items() if found.gain > 20 and found.t > 4}
+    alone = {name for name, (found, _) in search.probes(nothing, linear).items() if found.gain > 20 and found.t > 5}
     assert {"rotor_drag", "parasitic_drag"} <= alone
     assert beside_each_other(search, nothing, linear, {"sensor_time_shift"})[0].name == "rotor_drag"
     found = everything(search).hypothesis

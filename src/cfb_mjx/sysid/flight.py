@@ -125,17 +125,17 @@ def lengthened(flight: Flight, beside: Any) -> tuple[Flight, Any]:
     """A flight, and arrays with a row for each of its rows, padded to one of `LENGTHS`."""
     n = len(flight.time)
     length = next((x for x in LENGTHS if x >= n), -(-n // LENGTHS[-1]) * LENGTHS[-1])
-    return _padded(flight, length), jax.tree.map(lambda x: _repeated(x, length), beside)
+    return _padded(flight, length), jax.tree.map(lambda x: last_repeated(x, length), beside)
 
 
 def _padded(flight: Flight, length: int) -> Flight:
     n = len(flight.time)
-    padded = jax.tree.map(lambda x: _repeated(x, length) if np.ndim(x) else x, flight)
+    padded = jax.tree.map(lambda x: last_repeated(x, length) if np.ndim(x) else x, flight)
     own = np.arange(length) < n
     return dataclasses.replace(padded, valid=padded.valid * own, fresh=padded.fresh * own)
 
 
-def _repeated(x: np.ndarray, length: int) -> np.ndarray:
+def last_repeated(x: np.ndarray, length: int) -> np.ndarray:
     """The last row again and again, up to a length."""
     return np.concatenate([x, np.repeat(x[-1:], length - len(x), axis=0)])
 

@@ -15,7 +15,7 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.quadrotor import Quadrotor, begin, commanded_path, integrate_commanded, integrate_measured, prepare
 from cfb_mjx.model.state import State, stack, unstack
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.sysid.flight import Flight, prepare_flight
+from cfb_mjx.sysid.flight import Flight, last_repeated, prepare_flight
 from cfb_mjx.sysid.replay import remembered_along, rotors_alone
 from cfb_mjx.sysid.windows import Windows
 
@@ -56,7 +56,7 @@ def predict(
     rows = -(-WINDOWS_PER_BLOCK // over.count) * over.count
     for first in range(0, count, rows):
         chosen = slice(first, min(first + rows, count))
-        padded = [jax.tree.map(lambda x, c=chosen: _pad(x[c], rows), x) for x in (state, step, inputs)]
+        padded = [jax.tree.map(lambda x, c=chosen: last_repeated(x[c], rows), x) for x in (state, step, inputs)]
         trajectory = over.here(_predict_batch(model, *over.along(padded), measured, over))
         index = np.arange(chosen.stop - first)[:, None], windows.at[chosen]
         found.append(jax.tree.map(lambda x, i=index: np.asarray(x)[i], trajectory))
@@ -128,7 +128,7 @@ def starts_of_windows(
     parts = []
     for first in range(0, count, WINDOWS_PER_BLOCK):
         # One program serves any number of windows.
-        block = jax.tree.map(lambda x, f=first: _pad(x[f : f + WINDOWS_PER_BLOCK], WINDOWS_PER_BLOCK), inputs)
+        block = jax.tree.map(lambda x, f=first: last_repeated(x[f : f + WINDOWS_PER_BLOCK], WINDOWS_PER_BLOCK), inputs)
         parts.append(jax.tree.map(np.asarray, _advance_rotors(rotors_alone(model), *block)))
     every = jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
     pieces = zip(ends - [len(own) for own in windows], ends, strict=True)
@@ -170,9 +170,3 @@ def hold(windows: Windows, horizons: tuple[float, ...]) -> State:
 def select(windows: Windows, chosen: np.ndarray) -> Windows:
     """The windows where ``chosen`` (W,) is true."""
     return Windows(**{f.name: getattr(windows, f.name)[chosen] for f in dataclasses.fields(windows)})
-
-
-def _pad(x: np.ndarray, rows: int) -> np.ndarray:
-    x = np.asarray(x)
-    fill = x[-1:] if len(x) else np.ones((1, *x.shape[1:]))
-    return np.concatenate([x, np.repeat(fill, rows - len(x), axis=0)])

@@ -40,9 +40,9 @@ MOST = 500_000
 """Rows walked along side by side, for many long recordings at once would fill the memory."""
 
 
-def between(x: np.ndarray) -> np.ndarray:
-    """(n, ...) in the middle of the interval after each row; the last row stays."""
-    return 0.5 * (x + np.concatenate([x[1:], x[-1:]]))
+def between(x):
+    """(n, ...) in the middle of the interval after each row, of NumPy's or jax's rows; the last row stays."""
+    return 0.5 * (x + x[np.minimum(np.arange(1, len(x) + 1), len(x) - 1)])
 
 
 class Lane(NamedTuple):
@@ -116,7 +116,7 @@ def _walked(model: Quadrotor, lanes: Iterable[Lane], remembers: bool) -> Iterato
 def _grouped(lanes: Iterable[Lane]) -> Iterator[list[Lane]]:
     some: list[Lane] = []
     for lane in lanes:
-        longest = max(len(each.flight.time) for each in [*some, lane])
+        longest = max(len(each.flight.time) for each in (*some, lane))
         if some and (len(some) == LANES[-1] or longest * (len(some) + 1) > MOST):
             yield some
             some = []

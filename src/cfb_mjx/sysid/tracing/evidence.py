@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,8 +87,22 @@ def covariance(
     return inverse * np.outer(ratio, ratio)
 
 
+def dealt(counts: Sequence[int]) -> np.ndarray:
+    """The fold of every block of flights with so many blocks each.
+
+    A fold leaves out some of every flight, and of each flight another part of the way: dealt one after the other, what
+    only the same few blocks of alike flights show could end up in one fold.
+    """
+    return np.concatenate([(np.arange(count) - i) % FOLDS for i, count in enumerate(counts)])
+
+
 def evidence(
-    blocks: np.ndarray, base: list[int], added: list[int], scale: np.ndarray, prior: Prior | None = None
+    blocks: np.ndarray,
+    base: list[int],
+    added: list[int],
+    scale: np.ndarray,
+    prior: Prior | None = None,
+    fold: np.ndarray | None = None,
 ) -> Evidence:
     """Compare a fit of ``base`` with one of ``base`` and ``added`` columns, on blocks left out.
 
@@ -97,11 +112,11 @@ def evidence(
         added: columns in question.
         scale: (c,) unit of each column.
         prior: of ``base`` and ``added``, in this order.
+        fold: (b,) of each block, `dealt`; None where all are of one flight.
     """
     prior = prior or Prior.weak(len(base) + len(added))
     few = prior.of(list(range(len(base))))
-    count = len(blocks)
-    fold = np.arange(count) % FOLDS
+    fold = dealt([len(blocks)]) if fold is None else fold
     total = blocks.sum(0)
     both = base + added
     gain, score, noise, white = 0.0, 0.0, 0.0, 0.0

@@ -78,7 +78,8 @@ class _Axis:
 
     def gaining(self, columns: list[Column], beside: list[Column]) -> Evidence:
         index = self.linear.index
-        return evidence(self.linear.blocks, self.base + index(beside), index(columns), self.linear.scale)
+        linear = self.linear
+        return evidence(linear.blocks, self.base + index(beside), index(columns), linear.scale, fold=linear.fold)
 
     def forward(self, picked: list[Column], stands: Callable[[Evidence], bool]):
         """Groups added one after the other while one stands, and the gain of each of their terms."""

@@ -139,6 +139,11 @@ def term_columns(axis: int, sizes: np.ndarray | None = None) -> list[Column]:
     return found
 
 
+def lead_column() -> Column:
+    """The column of `LEAD`, a share of an interval."""
+    return Column(LEAD, LEAD, None, (), 0.25)
+
+
 def shift_column() -> Column:
     """The column of `SHIFT`, in units of 10 ms."""
     return Column(SHIFT, "shift", None, (), 0.01)
@@ -224,11 +229,13 @@ class Linear:
     Attributes:
         columns: one fewer than c: the residual itself comes first. Of columns that occur twice the first counts.
         blocks: (b, c, c).
+        fold: (b,) of each block (`evidence.dealt`); None where all are of one flight.
         scale: (c,) unit of each.
     """
 
     columns: list[Column]
     blocks: np.ndarray
+    fold: np.ndarray | None = None
     scale: np.ndarray = field(init=False)
 
     def __post_init__(self):

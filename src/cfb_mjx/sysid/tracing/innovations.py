@@ -306,8 +306,7 @@ def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, 
     """The parameters, and the flight condition in the middle of every interval."""
     prepared = prepare(model)
     read = (flight.position, flight.velocity, flight.quaternion, flight.body_rate, driven)
-    middle = State(*(0.5 * (x + jnp.concatenate([x[1:], x[-1:]])) for x in read))
-    at = unstack(middle, prepared.parameters.center_of_gravity)
+    at = unstack(State(*map(between, read)), prepared.parameters.center_of_gravity)
     return prepared.parameters, in_still_air(prepared, at, at.rotor_speed)
 
 

@@ -51,7 +51,7 @@ def beside_each_other(
         columns = [column for each in others for column in each.variant]
         index = base + linear.index(columns)
         known = prior + _near_zero(len(columns) + len(variant))
-        return evidence(linear.blocks, index, linear.index(variant), linear.scale, known)
+        return evidence(linear.blocks, index, linear.index(variant), linear.scale, known, linear.fold)
 
     def stands(variant: list[Column], found: Evidence) -> bool:
         return search.stands(found) and sensible(variant, found.values)
@@ -187,7 +187,7 @@ def _for_what_is_there(
     others = [c for c in own if c.effect != name and c.effect not in gone]
     blocks = _put_back(search, hypothesis, linear, [c for c in own if c in added or c.effect in gone])
     prior = search.prior(hypothesis, others) + _near_zero(len(added))
-    return evidence(blocks, linear.index(others), linear.index(added), linear.scale, prior)
+    return evidence(blocks, linear.index(others), linear.index(added), linear.scale, prior, linear.fold)
 
 
 def _taken_out(search: Search, hypothesis: Hypothesis, linear: Linear, own: list[Column], name: str) -> Hypothesis:

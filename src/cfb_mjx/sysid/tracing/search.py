@@ -15,10 +15,9 @@ from cfb_mjx.model.effects import CATALOGUE, Effect
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.sensor_faults import SensorFaults
-from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, evidence, solve
+from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, dealt, evidence, solve
 from cfb_mjx.sysid.tracing.hypothesis import (
     FORMULA,
-    LEAD,
     LEAD_RANGE,
     LEAD_SPREAD,
     LEAD_USUAL,
@@ -28,6 +27,7 @@ from cfb_mjx.sysid.tracing.hypothesis import (
     Linear,
     bounds,
     coarse,
+    lead_column,
     moved,
     moves,
     neutral_effects,
@@ -68,7 +68,6 @@ SAMPLE = 32
 """Blocks from which noise levels are learned: about a minute, many times longer than what wanders."""
 KNOWN = 2
 """Hypotheses whose residuals are kept."""
-LEAD_COLUMN = Column(LEAD, LEAD, None, (), 0.25)
 
 
 @dataclass
@@ -161,13 +160,13 @@ class Search:
 
     def linearise(self, hypothesis: Hypothesis, wanted: list[Column]) -> Linear:
         """Residual and derivatives by the lead of the commands and by ``wanted`` at a hypothesis."""
-        columns = [LEAD_COLUMN, *wanted]
-        return Linear(columns, self._products(hypothesis, self._slopes(hypothesis, columns)))
+        columns = [lead_column(), *wanted]
+        return self._linear(hypothesis, columns, self._slopes(hypothesis, columns))
 
     def linearise_terms(self, hypothesis: Hypothesis, own: list[Column]) -> list[Linear]:
         """`linearise` by ``own`` and the library of formulas, for each axis (`formula.AXES`)."""
         model, driven = hypothesis.model(self.parameters), self._driven(hypothesis)
-        flights, columns = self.flights(hypothesis), [LEAD_COLUMN, *own]
+        flights, columns = self.flights(hypothesis), [lead_column(), *own]
         beside = list(self._slopes(hypothesis, columns, driven))
         squares = [term_squares(model, *pair) for pair in zip(flights, driven, strict=True)]
         sizes = np.sqrt(np.mean(squares, axis=0))
@@ -178,22 +177,25 @@ class Search:
                 Signals(*(np.concatenate(pair, axis=-1) for pair in zip(some, more, strict=True)))
                 for some, more in zip(beside, terms, strict=True)
             )
-            found.append(Linear(columns + term_columns(axis, sizes), self._products(hypothesis, signals)))
+            found.append(self._linear(hypothesis, columns + term_columns(axis, sizes), signals))
         return found
 
     def _driven(self, hypothesis: Hypothesis) -> list[np.ndarray]:
         return driven_by(hypothesis.model(self.parameters), self.flights(hypothesis), hypothesis.lead)
 
-    def _products(self, hypothesis: Hypothesis, signals: Iterable[Signals]) -> np.ndarray:
+    def _linear(self, hypothesis: Hypothesis, columns: list[Column], signals: Iterable[Signals]) -> Linear:
         levels = levels_from(jnp.asarray(hypothesis.levels), self.noise)
-        found, waiting = [], []
+        found, waiting, counts = [], [], []
         for pair in zip(self.flights(hypothesis), signals, strict=True):
             waiting.append(cut(*pair))
+            counts.append(len(waiting[-1].interval))
             # Short flights together, so that they fill what is whitened at a time.
             if sum(len(blocks.interval) for blocks in waiting) >= SIDE_BY_SIDE[0]:
                 found.append(inner_products(joined(waiting), levels))
                 waiting = []
-        return np.concatenate([*found, *([inner_products(joined(waiting), levels)] if waiting else [])])
+        if waiting:
+            found.append(inner_products(joined(waiting), levels))
+        return Linear(columns, np.concatenate(found), dealt(counts))
 
     def _slopes(
         self, hypothesis: Hypothesis, columns: list[Column], driven: list[np.ndarray] | None = None
@@ -306,7 +308,7 @@ class Search:
         """Evidence for a candidate beside what is there; None where its sign makes no sense."""
         # Not beside a free lead: late commands would look like one.
         base = linear.index(self.own_columns(hypothesis))
-        found = evidence(linear.blocks, base, linear.index(variant), linear.scale)
+        found = evidence(linear.blocks, base, linear.index(variant), linear.scale, fold=linear.fold)
         return found if sensible(variant, found.values) else None
 
     def probes(self, hypothesis: Hypothesis, linear: Linear) -> dict[str, tuple[Evidence, list[Column]]]:
