@@ -129,28 +129,6 @@ class Devices:
 
         return call
 
-    def summed(self, function: Callable, whole: tuple, batch: tuple) -> Callable:
-        """Of the first argument x of ``function(x, *whole, *batch)``, a sum over examples: that sum over all shares.
-
-        Differentiable in reverse, by x alone: each device differentiates its own share, as jax 0.10 cannot transpose a
-        divided function that was linearised before.
-        """
-
-        def share(x, *rest):
-            return jax.tree.map(lambda part: part[None], jax.value_and_grad(function)(x, *rest))
-
-        axes = (None,) * (1 + len(whole)) + (0,) * len(batch)
-
-        @jax.custom_vjp
-        def total(x):
-            return both(x)[0]
-
-        def both(x):
-            return jax.tree.map(lambda parts: jnp.sum(parts, axis=0), self.divided(share, axes, 0)(x, *whole, *batch))
-
-        total.defvjp(both, lambda slope, cotangent: (jax.tree.map(lambda part: cotangent * part, slope),))
-        return total
-
     def shared(self, batch: Any) -> Any:
         """A batch (an `equinox.Module` with a field ``over``) placed on these devices, and knowing it: see `mapped`."""
         if not self.several:

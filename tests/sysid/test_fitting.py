@@ -181,12 +181,12 @@ def test_a_round_ends_at_its_minimum_where_commands_were_not_logged(campaign):
     data = prepare(logs[:1])
     unknowns, noise = choose("inertia,rotor_inertia,motor,command_hold", NOMINAL), Noise.first(data)
     segments, ridge = jax.tree.map(jnp.asarray, data.segments), jnp.full(len(unknowns.names), RIDGE)
-    weights = fitting._weights(unknowns, unknowns.start, noise, segments, True, False)
-    assert jnp.max(weights.doubt) > 0
+    weighed = fitting._weights(unknowns, unknowns.start, noise, segments, True, False)
+    assert jnp.max(weighed.doubt) > 0
     vector = fitting._fit_vector(unknowns, unknowns.start, noise, segments, True, False, ridge)
 
     def residual(x):
-        return fitting._residual(x, weights, unknowns, noise, segments, True, False).ravel()
+        return fitting._residual(x, unknowns, noise, segments, True, False, weighed).ravel()
 
     jacobian = np.asarray(jax.jacfwd(residual)(vector))
     slope = jacobian.T @ np.asarray(residual(vector)) + RIDGE**2 * vector

@@ -1,12 +1,13 @@
-"""The least-squares solver against SciPy's, on a problem with a curved valley, a bad start and a scale of its own."""
+"""The solver against SciPy's: a curved valley, a bad start, a scale of its own, and noise levels that had vanished."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import least_squares as scipys
+from scipy.optimize import minimize
 
-from cfb_mjx.sysid.identification.solver import RIDGE, least_squares
+from cfb_mjx.sysid.identification.solver import RIDGE, least_squares, most_likely
 
 TIME = np.linspace(0.0, 2.0, 200)
 DATA = 3.0 * np.exp(-2.0 * TIME) + 0.5 + 0.01 * np.random.default_rng(0).normal(size=TIME.shape)
@@ -45,3 +46,27 @@ def test_a_start_without_a_cost_is_left_alone():
 def test_a_direction_nobody_sees_stays_where_it_was():
     found = least_squares(lambda x: 100.0 * (x[:1] - 2.0), jnp.zeros(2))
     assert np.asarray(found) == pytest.approx([2.0, 0.0], abs=1e-4)
+
+
+ERRORS = np.hypot(0.3, 2.0 * (0.1 + TIME)) * np.random.default_rng(1).normal(size=TIME.shape)
+
+
+def noisy(x):
+    """Errors about a mean, of a level that stays and one that grows with time."""
+    return ERRORS - x[2], jnp.log(jnp.exp(2 * x[0]) + jnp.exp(2 * x[1]) * (0.1 + TIME) ** 2)
+
+
+@pytest.mark.parametrize("start", [[0.0, 0.0, 0.0], [1.0, -6.0, 3.0], [-8.0, 2.0, 0.0]])
+@pytest.mark.parametrize("robust", [False, True])
+def test_it_finds_the_most_likely_noise(start, robust):
+    def cost(x):
+        error, variance = noisy(x)
+        squared = (error * jnp.exp(-0.5 * variance)) ** 2
+        if robust:  # one reading in a hundred is an outlier, of fifty times the noise
+            squared = -2 * jnp.logaddexp(jnp.log(0.99) - 0.5 * squared, jnp.log(0.01 / 50) - 0.5 * squared / 2500)
+        return jnp.sum(variance + squared) + jnp.sum((RIDGE * x) ** 2)
+
+    theirs = minimize(jax.jit(cost), [np.log(0.3), np.log(2.0), 0.0], jac=jax.jit(jax.grad(cost)), tol=1e-10)
+    found = np.asarray(jax.jit(lambda x: most_likely(noisy, x, robust))(jnp.asarray(start)))
+    assert float(cost(found)) - theirs.fun < 1e-4
+    assert found == pytest.approx(theirs.x, abs=2e-3)

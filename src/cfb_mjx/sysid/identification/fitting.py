@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float
 
 from cfb_mjx.devices import Devices
 from cfb_mjx.errors import CfbError
@@ -20,12 +18,20 @@ from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import with_gyro_in_time
 from cfb_mjx.sysid.identification.feedback import detect
 from cfb_mjx.sysid.identification.flight_data import Segments, prepare
-from cfb_mjx.sysid.identification.innovation import CHANNELS, as_held, drive, innovations, negative_log_likelihood
+from cfb_mjx.sysid.identification.innovation import (
+    CHANNELS,
+    Weights,
+    as_held,
+    drive,
+    innovations,
+    weights,
+    whitened,
+)
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.result import Fit, summarise
-from cfb_mjx.sysid.identification.robust import tempered
+from cfb_mjx.sysid.identification.robust import surprise, tempered
 from cfb_mjx.sysid.identification.shooting import shoot
-from cfb_mjx.sysid.identification.solver import RIDGE, least_squares
+from cfb_mjx.sysid.identification.solver import RIDGE, least_squares, most_likely
 from cfb_mjx.sysid.identification.uncertainty import assess, most_contradicted
 from cfb_mjx.sysid.identification.unknowns import GROUPS, OFFSETS, UNITS, Unknowns, at_the_border, choose
 
@@ -144,7 +150,10 @@ def fit(
     missing = 1 - min(max(float(unknowns.hold(vector)) / interval, 0.0), 1.0) ** 2
     blur *= (interval / 0.01) ** 2 * missing * (use_measured is False or not np.all(np.asarray(data.segments.measured)))
     uncertainty = assess(blocks[0], blocks[1][..., columns], judged, priors, blur[columns])
-    impossible = {} if not set(GROUPS["inertia"]) & set(fitted) else at_the_border(unknowns.apply(vector))
+    axes = set(GROUPS["inertia"]) & set(fitted)
+    # An axis that the flights cannot tell may have wandered to the border: they do not ask for that.
+    asks = axes and not axes & set(uncertainty.names)
+    impossible = at_the_border(unknowns.apply(vector)) if asks else {}
     return summarise(
         unknowns,
         vector,
@@ -204,52 +213,36 @@ def _on_devices(segments: Segments, over: Devices | None) -> Segments:
 
 @eqx.filter_jit
 def fit_noise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool) -> Noise:
-    """Noise levels of largest likelihood at ``vector``, from ``noise`` on; at most some forty steps."""
+    """Noise levels of largest likelihood at ``vector``, from ``noise`` on."""
     parameters = unknowns.apply(vector)
     segments = as_held(parameters, unknowns.hold(vector), segments)
     # The smoothed rotor speeds stay those of the last round's noise: the rotors' own readings say how noisy they are.
     driven = drive(parameters, noise, segments, use_measured, robust)
 
-    def loss(x, _):
-        return negative_log_likelihood(parameters, Noise.from_vector(x), segments, driven, use_measured, robust)
+    def predicted(levels):
+        error, variance = innovations(parameters, Noise.from_vector(levels), segments, driven, use_measured, robust)
+        return error, jnp.log(variance)
 
-    # BFGS may stop short where a level does not matter; the rounds that follow go on from there.
-    solver = optx.BFGS(rtol=1e-5, atol=1e-6)
-    found = optx.minimise(loss, solver, noise.to_vector(), max_steps=40, throw=False)
-    return Noise.from_vector(found.value)
-
-
-class _Weights(NamedTuple):
-    """What a least-squares fit weighs innovations by: it stays while the vector moves.
-
-    If it followed the vector, the sum of squares would fall where variances grow, and no step along its slope (which
-    is that of the innovations alone) would lower it.
-    """
-
-    parameters: Parameters
-    doubt: Float[Array, "s n 4"]
-    variance: Float[Array, "s n 8"]
-
-
-def _weights(
-    unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool
-) -> _Weights:
-    parameters = unknowns.apply(vector)
-    held = as_held(parameters, unknowns.hold(vector), segments)
-    driven = drive(parameters, noise, held, use_measured, robust)
-    _, variance = innovations(parameters, noise, held, driven, use_measured, robust)
-    return jax.lax.stop_gradient(_Weights(parameters, held.doubt, variance))
+    return Noise.from_vector(most_likely(predicted, noise.to_vector(), robust))
 
 
 def _residual(
-    vector, weights: _Weights, unknowns: Unknowns, noise: Noise, segments: Segments, use_measured: bool, robust: bool
+    vector,
+    unknowns: Unknowns,
+    noise: Noise,
+    segments: Segments,
+    use_measured: bool,
+    robust: bool,
+    weighed: Weights | None = None,
 ):
     parameters = unknowns.apply(vector)
-    held = as_held(parameters, unknowns.hold(vector), segments)
-    held = eqx.tree_at(lambda s: s.doubt, held, weights.doubt)
-    driven = drive(parameters, noise, held, use_measured, robust)
-    error, _ = innovations(parameters, noise, held, driven, use_measured, robust, weights.parameters)
-    return tempered(error / jnp.sqrt(weights.variance), robust)
+    segments = as_held(parameters, unknowns.hold(vector), segments)
+    return tempered(whitened(parameters, noise, segments, use_measured, robust, weighed), robust)
+
+
+def _weights(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool) -> Weights:
+    parameters = unknowns.apply(vector)
+    return weights(parameters, noise, as_held(parameters, unknowns.hold(vector), segments), use_measured, robust)
 
 
 @eqx.filter_jit
@@ -259,24 +252,23 @@ def _surprise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_
     segments = as_held(parameters, unknowns.hold(vector), segments)
     segments = eqx.tree_at(lambda s: s.doubt, segments, jnp.zeros_like(segments.doubt))
     driven = drive(parameters, noise, segments, use_measured, robust)
-    return negative_log_likelihood(parameters, noise, segments, driven, use_measured, robust)
+    error, variance = innovations(parameters, noise, segments, driven, use_measured, robust)
+    return 0.5 * jnp.sum(jnp.log(variance) + surprise(error / jnp.sqrt(variance), robust)) / jnp.sum(segments.valid)
 
 
 @eqx.filter_jit
 def _fit_vector(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool, ridge):
-    fixed = (unknowns, noise, segments, use_measured, robust)
-    weights = _weights(unknowns, vector, *fixed[1:])
-    return least_squares(lambda x: _residual(x, weights, *fixed), vector, ridge)
+    fixed = (noise, segments, use_measured, robust)
+    weighed = _weights(unknowns, vector, *fixed)
+    return least_squares(lambda x: _residual(x, unknowns, *fixed, weighed), vector, ridge)
 
 
 @eqx.filter_jit
 def fit_slopes(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
     """Residuals (s, n, 8) of the fit at ``vector``, and their derivatives (s, n, 8, k) by it."""
-    fixed = (unknowns, noise, segments, use_measured, robust)
-    weights = _weights(unknowns, vector, *fixed[1:])
 
     def residual(x):
-        return _residual(x, weights, *fixed)
+        return _residual(x, unknowns, noise, segments, use_measured, robust)
 
     return residual(vector), jax.jacfwd(residual)(vector)
 

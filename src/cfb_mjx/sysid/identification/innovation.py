@@ -13,7 +13,7 @@ the gyro and the accelerometer say is predicted from the past alone.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,7 +34,6 @@ from cfb_mjx.sysid.identification.filters import (
 )
 from cfb_mjx.sysid.identification.flight_data import Segments
 from cfb_mjx.sysid.identification.noise import Noise
-from cfb_mjx.sysid.identification.robust import surprise
 
 CHANNELS = ("rate_x", "rate_y", "rate_z", "specific_force_z", "rotor_1", "rotor_2", "rotor_3", "rotor_4")
 
@@ -200,31 +199,40 @@ def as_held(parameters: Parameters, hold: Float[Array, ""] | None, segments: Seg
     return eqx.tree_at(lambda s: (s.command, s.excess, s.doubt), segments, (command, excess, doubt))
 
 
-def whitened(
+class Weights(NamedTuple):
+    """What innovations are weighed by; while a least-squares fit runs, by what it began with.
+
+    If the weights followed the parameters, the sum of squares would fall where variances grow, and no step along its
+    slope (which is that of the innovations alone) would lower it.
+    """
+
+    parameters: Parameters
+    doubt: Float[Array, "s n 4"]
+    """Of the commands (`Segments.doubt`)."""
+    variance: Float[Array, "s n 8"]
+
+
+def weights(
     parameters: Parameters, noise: Noise, segments: Segments, use_measured: bool = True, robust: bool = False
-) -> Float[Array, "s n 8"]:
-    """Innovations over their standard deviations, which as weights are not differentiated."""
+) -> Weights:
+    """Of the innovations of these parameters."""
     driven = drive(parameters, noise, segments, use_measured, robust)
-    error, variance = innovations(parameters, noise, segments, driven, use_measured, robust)
-    # The variance follows the parameters a little (the motors' lag); as a weight it must not be fitted.
-    return error / jnp.sqrt(jax.lax.stop_gradient(variance))
+    _, variance = innovations(parameters, noise, segments, driven, use_measured, robust)
+    return jax.lax.stop_gradient(Weights(parameters, segments.doubt, variance))
 
 
-def negative_log_likelihood(
-    parameters, noise, segments, driven: Drive, use_measured: bool = True, robust: bool = False
-) -> Float[Array, ""]:
-    """Of all innovations, per row, without the constant; over devices differentiable by the noise alone."""
-    rows = jnp.maximum(jnp.sum(segments.valid), 1.0)
-    if segments.over is None:
-        return _surprisal(parameters, noise, segments, driven, use_measured, robust) / rows
-
-    def share(noise, parameters, segments, driven):
-        return _surprisal(parameters, noise, segments, driven, use_measured, robust)
-
-    batch = replace(segments, over=None), driven
-    return segments.over.summed(share, (parameters,), batch)(noise) / rows
-
-
-def _surprisal(parameters, noise, segments, driven: Drive, use_measured: bool, robust: bool) -> Float[Array, ""]:
-    error, variance = innovations(parameters, noise, segments, driven, use_measured, robust)
-    return 0.5 * jnp.sum(jnp.log(variance) + surprise(error / jnp.sqrt(variance), robust))
+def whitened(
+    parameters: Parameters,
+    noise: Noise,
+    segments: Segments,
+    use_measured: bool = True,
+    robust: bool = False,
+    weighed: Weights | None = None,
+) -> Float[Array, "s n 8"]:
+    """Innovations over their standard deviations, which are not differentiated: as ``weighed``, or their own."""
+    if weighed is not None:
+        segments = eqx.tree_at(lambda s: s.doubt, segments, weighed.doubt)
+    driven = drive(parameters, noise, segments, use_measured, robust)
+    known = None if weighed is None else weighed.parameters
+    error, variance = innovations(parameters, noise, segments, driven, use_measured, robust, known)
+    return error / jnp.sqrt(jax.lax.stop_gradient(variance) if weighed is None else weighed.variance)

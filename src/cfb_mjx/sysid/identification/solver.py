@@ -1,7 +1,8 @@
-"""The one nonlinear least-squares solver of the fits: Gauss-Newton, damped only where a step fails.
+"""The fits' one solver: Gauss-Newton and Fisher's scoring, damped only where a step fails.
 
 Residuals come by the hundred thousand and unknowns by the ten, so that one linearisation costs as much as all else
-together: a library's Levenberg-Marquardt, which starts damped and stops on the size of a step, spends twice as many.
+together: a library's Levenberg-Marquardt, which starts damped and stops on the size of a step, spends twice as many,
+and its BFGS, which knows nothing of how errors and variances make the likelihood, ten times as many.
 """
 
 from __future__ import annotations
@@ -11,6 +12,8 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
+
+from cfb_mjx.sysid.identification.robust import surprise
 
 RIDGE = 0.1
 """Every unknown has a prior of 1 / RIDGE = 10 units about the preset (a factor of e^10): far too wide to matter where
@@ -32,19 +35,62 @@ def least_squares(
     Marquardt (1963) until a step lowers it. Normal equations, not QR: they are what costs, and the uncertainty, which
     condition numbers would spoil, is computed elsewhere by QR (`uncertainty`).
     """
-    directions = jnp.eye(start.shape[0], dtype=start.dtype)
 
     def linearised(x):
-        def both(direction):
-            return jax.jvp(residual, (x,), (direction,))
-
-        values, slopes = jax.vmap(both, out_axes=(None, 0))(directions)
-        prior = jnp.broadcast_to(jnp.asarray(ridge) ** 2, x.shape)
-        cost, slope, curvature = x @ (prior * x), prior * x, jnp.diag(prior)
+        values, slopes = _slopes(residual, x)
+        cost, slope, curvature = _prior(ridge, x)
         for value, part in zip(jax.tree.leaves(values), jax.tree.leaves(slopes), strict=True):
-            value, part = value.ravel(), part.reshape(directions.shape[0], -1)
+            value, part = value.ravel(), part.reshape(len(x), -1)
             cost, slope, curvature = cost + value @ value, slope + part @ value, curvature + part @ part.T
         return cost, slope, curvature
+
+    return _descended(linearised, start)
+
+
+def most_likely(
+    predicted: Callable[[Array], tuple[Array, Array]], start: Float[Array, " k"], robust: bool, ridge: float = RIDGE
+) -> Float[Array, " k"]:
+    """The maximum of a Gaussian likelihood whose variances move too, from ``start``: Fisher's scoring.
+
+    ``predicted`` gives errors and the logarithms of their variances. A level that hardly counts has next to no slope;
+    the expected curvature, which vanishes faster, still leads back from there, where a line search would stay.
+    """
+
+    def surprising(whitened):
+        return jnp.sum(surprise(whitened, robust))
+
+    def linearised(x):
+        (error, variance), (moved, spread) = _slopes(predicted, x)
+        scale = jnp.exp(-0.5 * variance)
+        moved, spread = ((part * by).reshape(len(x), -1) for part, by in ((moved, scale), (spread, 1.0)))
+        whitened = (error * scale).ravel()
+        surprised, pull = jax.value_and_grad(surprising)(whitened)
+        cost, slope, curvature = _prior(ridge, x)
+        return (
+            cost + jnp.sum(variance) + surprised,
+            slope + 0.5 * (jnp.sum(spread, axis=1) + (moved - 0.5 * whitened * spread) @ pull),
+            curvature + moved @ moved.T + 0.5 * spread @ spread.T,
+        )
+
+    return _descended(linearised, start)
+
+
+def _slopes(function, x):
+    """Values at ``x`` and, in front, the derivatives by each unknown."""
+
+    def both(direction):
+        return jax.jvp(function, (x,), (direction,))
+
+    return jax.vmap(both, out_axes=(None, 0))(jnp.eye(len(x), dtype=x.dtype))
+
+
+def _prior(ridge, x):
+    prior = jnp.broadcast_to(jnp.asarray(ridge) ** 2, x.shape)
+    return x @ (prior * x), prior * x, jnp.diag(prior)
+
+
+def _descended(linearised: Callable, start: Float[Array, " k"]) -> Float[Array, " k"]:
+    """Where ``linearised`` (cost, half its slope, half its curvature) is least, from ``start``."""
 
     def proposed(slope, curvature, damping):
         raised = curvature + damping * jnp.diag(jnp.diag(curvature))
@@ -68,7 +114,8 @@ def least_squares(
     # Nothing is known at first and the first step leads nowhere, so that the linearisation is compiled once only.
     zero = jnp.zeros_like(start)
     unknown = jnp.full_like(zero[0], jnp.inf)
-    carry = (start, (unknown, zero, directions), jnp.zeros_like(unknown), (zero, unknown), 0)
+    nothing = unknown, zero, jnp.eye(len(start), dtype=start.dtype)
+    carry = (start, nothing, jnp.zeros_like(unknown), (zero, unknown), 0)
     x, _, _, (step, gain), _ = jax.lax.while_loop(unsettled, advance, carry)
     # The last step is too short to be worth another linearisation, and is taken on trust.
     return jnp.where(gain <= SETTLED, x + step, x)
