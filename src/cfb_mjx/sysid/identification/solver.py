@@ -1,8 +1,8 @@
 """The fits' one solver: Gauss-Newton and Fisher's scoring, damped only where a step fails.
 
 Residuals come by the hundred thousand and unknowns by the ten, so that one linearisation costs as much as all else
-together: a library's Levenberg-Marquardt, which starts damped and stops on the size of a step, spends twice as many,
-and its BFGS, which knows nothing of how errors and variances make the likelihood, ten times as many.
+together: a library's Levenberg-Marquardt, which starts damped and stops on the size of a step, spends twice as many.
+Its BFGS, which knows nothing of how errors and variances make the likelihood, took 150 to 270 steps to noise levels.
 """
 
 from __future__ import annotations
