@@ -90,7 +90,7 @@ class Devices:
 
     def padded(self, tree: Any) -> Any:
         """``tree`` with the last example repeated until the leading axis can be divided; numpy arrays."""
-        return jax.tree.map(lambda x: _repeat_last(x, -(-len(x) // self.count) * self.count), tree)
+        return jax.tree.map(lambda x: last_repeated(x, -(-len(x) // self.count) * self.count), tree)
 
     def divided(self, function: Callable, in_axes: tuple, out_axes: Any) -> Callable:
         """``function``, each device working on its share alone.
@@ -173,6 +173,7 @@ def _placed(x: Any, sharding: NamedSharding) -> Any:
     return jax.make_array_from_callback(held.shape, sharding, lambda index: held[index])
 
 
-def _repeat_last(x: Any, count: int) -> np.ndarray:
+def last_repeated(x: Any, count: int) -> np.ndarray:
+    """``x`` with its last row again and again, up to so many rows."""
     x = np.asarray(x)
     return np.concatenate([x, np.repeat(x[-1:], count - len(x), axis=0)])

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from cfb_mjx.devices import last_repeated
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import tidy
@@ -133,11 +134,6 @@ def _padded(flight: Flight, length: int) -> Flight:
     padded = jax.tree.map(lambda x: last_repeated(x, length) if np.ndim(x) else x, flight)
     own = np.arange(length) < n
     return dataclasses.replace(padded, valid=padded.valid * own, fresh=padded.fresh * own)
-
-
-def last_repeated(x: np.ndarray, length: int) -> np.ndarray:
-    """The last row again and again, up to a length."""
-    return np.concatenate([x, np.repeat(x[-1:], length - len(x), axis=0)])
 
 
 def _rotor_speed(log: FlightLog) -> tuple[np.ndarray, bool]:

@@ -23,6 +23,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from cfb_mjx.devices import last_repeated
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import Memory
@@ -201,8 +202,7 @@ def replay_inputs(log: FlightLog, delay: float, gyro_delay: float, use_measured:
     driven = causal_rotor_speed(log) if use_measured else None
     used = 1.0 if driven is not None else 0.0
     driven = np.zeros((len(log), 4)) if driven is None else driven
-    driven = np.concatenate([driven, np.repeat(driven[-1:], len(flight.time) - len(log), axis=0)])
-    return eqx.tree_at(lambda f: f.measured, flight, np.array(used)), driven
+    return eqx.tree_at(lambda f: f.measured, flight, np.array(used)), last_repeated(driven, len(flight.time))
 
 
 def causal_rotor_speed(log: FlightLog) -> np.ndarray | None:

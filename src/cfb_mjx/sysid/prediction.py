@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.devices import Devices
+from cfb_mjx.devices import Devices, last_repeated
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.quadrotor import Quadrotor, begin, commanded_path, integrate_commanded, integrate_measured, prepare
 from cfb_mjx.model.state import State, stack, unstack
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.sysid.flight import Flight, last_repeated, prepare_flight
+from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.replay import remembered_along, rotors_alone
 from cfb_mjx.sysid.windows import Windows
 

@@ -211,11 +211,16 @@ def _on_devices(segments: Segments, over: Devices | None) -> Segments:
     return eqx.tree_at(lambda s: s.valid, over.shared(segments), over.along(valid))
 
 
+def _at(unknowns: Unknowns, vector, segments: Segments) -> tuple[Parameters, Segments]:
+    """The drone of a vector, and its commands as it says they acted."""
+    parameters = unknowns.apply(vector)
+    return parameters, as_held(parameters, unknowns.hold(vector), segments)
+
+
 @eqx.filter_jit
 def fit_noise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool) -> Noise:
     """Noise levels of largest likelihood at ``vector``, from ``noise`` on."""
-    parameters = unknowns.apply(vector)
-    segments = as_held(parameters, unknowns.hold(vector), segments)
+    parameters, segments = _at(unknowns, vector, segments)
     # The smoothed rotor speeds stay those of the last round's noise: the rotors' own readings say how noisy they are.
     driven = drive(parameters, noise, segments, use_measured, robust)
 
@@ -235,21 +240,19 @@ def _residual(
     robust: bool,
     weighed: Weights | None = None,
 ):
-    parameters = unknowns.apply(vector)
-    segments = as_held(parameters, unknowns.hold(vector), segments)
+    parameters, segments = _at(unknowns, vector, segments)
     return tempered(whitened(parameters, noise, segments, use_measured, robust, weighed), robust)
 
 
 def _weights(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool) -> Weights:
-    parameters = unknowns.apply(vector)
-    return weights(parameters, noise, as_held(parameters, unknowns.hold(vector), segments), use_measured, robust)
+    parameters, segments = _at(unknowns, vector, segments)
+    return weights(parameters, noise, segments, use_measured, robust)
 
 
 @eqx.filter_jit
 def _surprise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
     """Negative logarithm of the likelihood per row, of commands that are what `as_held` makes of them and no other."""
-    parameters = unknowns.apply(vector)
-    segments = as_held(parameters, unknowns.hold(vector), segments)
+    parameters, segments = _at(unknowns, vector, segments)
     segments = eqx.tree_at(lambda s: s.doubt, segments, jnp.zeros_like(segments.doubt))
     driven = drive(parameters, noise, segments, use_measured, robust)
     error, variance = innovations(parameters, noise, segments, driven, use_measured, robust)

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfb_mjx.devices import Devices
+from cfb_mjx.devices import Devices, last_repeated
 from cfb_mjx.logs import FlightLog
 
 ROWS_PER_SEGMENT = 641
@@ -121,21 +121,18 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> di
 
     doubt = _unforetold(log.time[rows], np.clip(log.command[rows], 0, 1))
 
-    def pad(values):
-        return np.concatenate([values, np.repeat(values[-1:], width - count, axis=0)])
-
     padding = np.arange(width) >= count
     return {
-        "interval": np.where(padding, 0.0, pad(np.concatenate([[0.0], np.diff(log.time[rows])]))),
+        "interval": np.where(padding, 0.0, last_repeated(np.concatenate([[0.0], np.diff(log.time[rows])]), width)),
         "valid": (~padding).astype(float),
-        "command": pad(np.clip(log.command[rows], 0, 1)),
+        "command": last_repeated(np.clip(log.command[rows], 0, 1), width),
         "doubt": np.concatenate([doubt, np.zeros((1 + width - count, 4))]),
         "excess": np.zeros((width, 4)),
-        "rotor_speed": pad(speed),
+        "rotor_speed": last_repeated(speed, width),
         "measured": np.array(float(measured)),
         "warm_up": (np.arange(width) < lead).astype(float),
-        "body_rate": pad(log.body_rate[rows]),
-        "specific_force": pad(log.specific_force[rows]),
+        "body_rate": last_repeated(log.body_rate[rows], width),
+        "specific_force": last_repeated(log.specific_force[rows], width),
     }
 
 

@@ -60,14 +60,14 @@ def most_likely(
         return jnp.sum(surprise(whitened, robust))
 
     def linearised(x):
-        (error, variance), (moved, spread) = _slopes(predicted, x)
-        scale = jnp.exp(-0.5 * variance)
-        moved, spread = ((part * by).reshape(len(x), -1) for part, by in ((moved, scale), (spread, 1.0)))
-        whitened = (error * scale).ravel()
+        (error, log_variance), (moved, spread) = _slopes(predicted, x)
+        weight = jnp.exp(-0.5 * log_variance)
+        whitened = (error * weight).ravel()
+        moved, spread = (moved * weight).reshape(len(x), -1), spread.reshape(len(x), -1)
         surprised, pull = jax.value_and_grad(surprising)(whitened)
         cost, slope, curvature = _prior(ridge, x)
         return (
-            cost + jnp.sum(variance) + surprised,
+            cost + jnp.sum(log_variance) + surprised,
             slope + 0.5 * (jnp.sum(spread, axis=1) + (moved - 0.5 * whitened * spread) @ pull),
             curvature + moved @ moved.T + 0.5 * spread @ spread.T,
         )
