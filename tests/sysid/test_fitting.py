@@ -90,6 +90,15 @@ def test_start_is_the_nominal_drone_and_names_are_checked():
         choose("", NOMINAL)
 
 
+def test_what_a_fit_works_with_has_types_of_its_own(campaign):
+    """A number as weakly typed as Python's becomes another in the first round, and the second compiles anew."""
+    data = prepare(campaign[1][:1])
+    timed = dataclasses.replace(choose("inertia", NOMINAL), timed=1.0)
+    for tree in (choose("inertia", NOMINAL), timed, Noise.first(data)):
+        kinds = {(x.dtype, x.weak_type) for x in jax.tree.leaves(tree)}
+        assert kinds == {(jnp.dtype(float), False)}
+
+
 def test_uncertainty_of_a_linear_problem_matches_its_closed_form():
     rng = np.random.default_rng(2)
     jacobian = rng.normal(size=(40, 50, 3)) * [1.0, 5.0, 20.0]

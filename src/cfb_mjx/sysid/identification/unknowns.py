@@ -7,6 +7,8 @@ no impossible one.
 
 from __future__ import annotations
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -63,7 +65,8 @@ class Unknowns(eqx.Module):
 
     names: tuple[str, ...] = eqx.field(static=True)
     nominal: Parameters
-    timed: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.0)
+    # An explicit type: a weakly typed number would compile every program of a fit twice.
+    timed: Float[Array, ""] = eqx.field(converter=partial(jnp.asarray, dtype=float), default=0.0)
     """1 where every command acts until the next row, whatever ``command_hold`` says."""
 
     @property
