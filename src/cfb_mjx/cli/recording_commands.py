@@ -22,6 +22,7 @@ def import_log(
     topics_yaml: File = None,
     robot: str | None = None,
     time_unit: str | None = None,
+    motion_capture: bool = False,
     keep_ground: bool = False,
     cut: Spans = (),
     fix: Pairs = (),
@@ -42,6 +43,7 @@ def import_log(
         topics_yaml: crazyflies.yaml with the variable names of the custom topics of a Crazyswarm2 bag.
         robot: whose flight to read from a Crazyswarm2 bag or a table of several.
         time_unit: unit of the time column of a radio csv: s, ms, us or ns.
+        motion_capture: take pose and velocity from motion capture that was logged beside the estimate.
         keep_ground: leave in what was recorded on the ground and in the hand.
         cut: seconds of the recording to leave out, for instance 12.5:15, :3 (all up to 3 s) or 40: (all from then on).
         fix: a change of unit, axes or order, as a refusal names it, for instance velocity-frame=body.
@@ -57,6 +59,7 @@ def import_log(
         raise CfbError("import needs a log and -o FILE.mcap; see 'cfb import --help'.")
     options = {"motor_shift": motor_shift, "mapping": mapping, "topics_yaml": topics_yaml, "robot": robot}
     options |= {"time_unit": time_unit, "keep_ground": keep_ground, "cut": flat(cut), "fix": flat(fix)}
+    options |= {"motion_capture": motion_capture or None}
     run_import(list(sources), output, None if format == "auto" else format, options)
 
 
@@ -68,6 +71,7 @@ def check(
     topics_yaml: File = None,
     robot: str | None = None,
     time_unit: str | None = None,
+    motion_capture: bool = False,
     keep_ground: bool = False,
     cut: Spans = (),
     fix: Pairs = (),
@@ -84,6 +88,7 @@ def check(
         topics_yaml: as for import.
         robot: as for import.
         time_unit: as for import.
+        motion_capture: as for import.
         keep_ground: as for import.
         cut: as for import.
         fix: as for import.
@@ -94,5 +99,6 @@ def check(
 
     options = {"mapping": mapping, "topics_yaml": topics_yaml, "robot": robot, "time_unit": time_unit}
     options |= {"keep_ground": keep_ground, "cut": flat(cut), "fix": flat(fix)}
+    options |= {"motion_capture": motion_capture or None}
     if refused := run_check(list(logs), output, json, options):
         raise CfbError(f"{refused} of {len(logs)} recordings were refused, for the reasons above.")

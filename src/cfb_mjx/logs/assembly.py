@@ -12,6 +12,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
 from cfb_mjx.logs.alignment import nominal_command
 from cfb_mjx.logs.flight_log import REQUIRED, FlightLog, quantise_time
+from cfb_mjx.logs.motion_capture import Capture, compared, with_pose_of
 from cfb_mjx.logs.streams import Stream, central_difference, fresh, hold, neighbours
 from cfb_mjx.logs.variables import Choice, VariableMap
 
@@ -26,6 +27,8 @@ _DERIVED = {
     "speeds. Log the duty.",
 }
 _GRAVITY = np.array([0.0, 0.0, 9.81])
+SLOWEST, FEWEST = 0.02, 100
+"""Interval, s, and number of samples of motion capture that an estimate is compared with unasked."""
 _LATE = 0.002  # s of average age of a held pose worth a note: a quarter of the observation delay assumed otherwise
 COMMAND_NOTE = (
     "motor.m1..m4 is what the ESC is told: the command after battery compensation and thrust limit, where the firmware "
@@ -120,7 +123,37 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
             **read.metadata,
         },
     )
-    return log.replace(metadata={"notes": read.notes, "warnings": read.warnings})
+    log = log.replace(metadata={"notes": read.notes, "warnings": read.warnings})
+    return _with_capture(log, home, chosen, mapping, path)
+
+
+def _with_capture(log: FlightLog, home: dict[str, Stream], chosen: dict[str, Choice], mapping: VariableMap, path: Path):
+    """The log with pose and velocity by motion capture if that was asked for, or a note where it would differ."""
+    for choices in mapping.motion_capture:
+        names = [name for choice in choices for name in choice.variables]
+        if not all(name in home for name in names) or len({home[name].name for name in names}) > 1:
+            continue
+        if not mapping.by_motion_capture and chosen["quaternion"].variables == choices[1].variables:
+            return log
+        stream = home[names[0]]
+        pose = (_in_si(np.stack([stream.values[v] for v in choice.variables], axis=1), choice) for choice in choices)
+        capture = Capture(stream.time - log.metadata["merging"]["time_of_first_row"], *pose)
+        if mapping.by_motion_capture:
+            return with_pose_of(log, capture)
+        if stream.interval > SLOWEST or len(stream.time) < FEWEST:
+            return log
+        try:
+            said = compared(log, with_pose_of(log, capture))
+        except CfbError:
+            return log
+        return log.replace(metadata={"notes": [*log.metadata["notes"], said]}) if said else log
+    if mapping.by_motion_capture:
+        wanted = " or ".join(" ".join(v for c in choices for v in c.variables) for choices in mapping.motion_capture)
+        raise CfbError(
+            f"{path}: no motion capture with position and attitude was logged ({wanted or 'the mapping names none'}); "
+            "leave out --motion-capture to take the estimate."
+        )
+    return log
 
 
 def _homes(streams: Sequence[Stream]) -> dict[str, Stream]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,20 +32,18 @@ from cfb_mjx.logs.gate import Verdict
 from cfb_mjx.logs.mcap_stream import MAGIC
 from cfb_mjx.logs.proposal import UnknownNames, lacking, propose
 from cfb_mjx.logs.validation import examine
-from cfb_mjx.logs.variables import MissingNames, load_mapping, mapping_of
+from cfb_mjx.logs.variables import MissingNames, VariableMap, load_mapping, mapping_of
 
 FORMATS = ("mcap", "tabular", "idsia", "usd_card", "crazyswarm", "radio_csv", "ulog", "foxglove")
 _OPTIONS = {
     "idsia": ("motor_shift",),
-    "usd_card": ("mapping",),
-    "crazyswarm": ("mapping", "topics_yaml", "robot"),
-    "radio_csv": ("mapping", "time_unit", "robot"),
+    "usd_card": ("mapping", "motion_capture"),
+    "crazyswarm": ("mapping", "topics_yaml", "robot", "motion_capture"),
+    "radio_csv": ("mapping", "time_unit", "robot", "motion_capture"),
     "ulog": ("mapping",),
-    "foxglove": ("mapping",),
+    "foxglove": ("mapping", "motion_capture"),
 }
-_FLAGS = {
-    name: "--" + name.replace("_", "-") for name in ("motor_shift", "mapping", "topics_yaml", "robot", "time_unit")
-}
+_FLAGS = {name: "--" + name.replace("_", "-") for names in _OPTIONS.values() for name in names}
 
 
 def read_log(
@@ -73,8 +72,8 @@ def read_log(
         **options: ``motor_shift`` for ``idsia`` (`cfb_mjx.logs.read_idsia`); ``mapping`` for ``usd_card``,
             ``crazyswarm``, ``radio_csv``, ``ulog`` and ``foxglove``; ``topics_yaml`` for ``crazyswarm``
             (`cfb_mjx.logs.read_crazyswarm`); ``time_unit`` for ``radio_csv`` (`cfb_mjx.logs.read_radio_csv`); ``robot``
-            for both. An
-            option that is None counts as not given.
+            for both; ``motion_capture=True`` takes pose and velocity from motion capture that a Crazyflie logged beside
+            its estimate (`cfb_mjx.logs.motion_capture`). An option that is None counts as not given.
 
     Raises:
         UnknownNames: a table with names of its own, for which a mapping can be proposed.
@@ -141,6 +140,11 @@ def _checked(
 
 def _read(paths: list[Path], format: str, options: dict[str, Any], tables: dict[Path, tabular.Table]) -> FlightLog:
     path = paths[0]
+    if options.get("motion_capture"):
+        mapping = options.get("mapping")
+        mapping = mapping if isinstance(mapping, VariableMap) else load_mapping(mapping)
+        options = options | {"mapping": dataclasses.replace(mapping, by_motion_capture=True)}
+    options = {name: value for name, value in options.items() if name != "motion_capture"}
     if format == "mcap":
         return mcap_reader.read_mcap(path)
     if format == "usd_card":

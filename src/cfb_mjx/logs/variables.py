@@ -45,6 +45,7 @@ DERIVED_FROM = {
 }
 """What a field can be derived from where it was not logged: its derivative is it, or holds it."""
 _CHOICE_KEYS = {"variables", "unit", "sign", "frame", "form", "invalid"}
+_CAPTURED = ("position", "quaternion")
 _FIRMWARE_KEYS = ("version", "battery_compensation", "thrust_limit")
 
 
@@ -95,6 +96,10 @@ class VariableMap:
     observation_delay: float | None
     recognised_by: tuple[str, ...] = ()
     """Columns that tell a table of this kind; none for mappings that a user names."""
+    motion_capture: tuple[tuple[Choice, Choice], ...] = ()
+    """Position and attitude by motion capture, in order of preference."""
+    by_motion_capture: bool = False
+    """Whether pose and velocity are to come from there."""
 
     def choose(self, available: Collection[str], path: Path) -> dict[str, Choice]:
         """The first choice of each field whose variables are all available; optional fields may be absent.
@@ -143,7 +148,8 @@ def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
     """
     path = shipped("configs", "logs", f"{DEFAULT}.yaml") if source is None else Path(source)
     document = load_yaml(path)
-    _only(document, {"format", "name", "fields", "firmware", "observation_delay", "recognised_by"}, path, "the file")
+    known = {"format", "name", "fields", "firmware", "observation_delay", "recognised_by", "motion_capture"}
+    _only(document, known, path, "the file")
     if document.get("format") != FORMAT:
         raise CfbError(f"{path}: 'format' must be '{FORMAT}', found {document.get('format')!r}.")
     fields = document.get("fields")
@@ -165,12 +171,16 @@ def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
     marks = document.get("recognised_by", [])
     if not isinstance(marks, list) or not all(isinstance(m, str) for m in marks):
         raise CfbError(f"{path}: 'recognised_by' must be a list of columns; found {told(marks)}.")
+    captures = document.get("motion_capture", [])
+    if not isinstance(captures, list) or not all(isinstance(c, dict) and set(c) == set(_CAPTURED) for c in captures):
+        raise CfbError(f"{path}: 'motion_capture' must be a list of choices, each with position and quaternion.")
     return VariableMap(
         name=str(document.get("name", path.stem)),
         choices=choices,
         firmware={k: firmware.get(k) for k in _FIRMWARE_KEYS},
         observation_delay=None if delay is None else float(delay),
         recognised_by=tuple(marks),
+        motion_capture=tuple(tuple(_choice(f, _mapping(c[f], f, path), path) for f in _CAPTURED) for c in captures),
     )
 
 
@@ -214,6 +224,12 @@ def _choice(field: str, raw: dict, path: Path) -> Choice:
         raise CfbError(f"{path}: {where}: 'invalid' must be a list of numbers; found {told(invalid)}.")
     factors = tuple(s * UNITS[field][unit] for s in sign)
     return Choice(tuple(names), unit, factors, frame, form, tuple(float(v) for v in invalid))
+
+
+def _mapping(value: Any, field: str, path: Path) -> dict:
+    if not isinstance(value, dict) or "derived" in value:
+        raise CfbError(f"{path}: motion_capture.{field} must be a mapping with 'variables'; found {told(value)}.")
+    return value
 
 
 def _only(mapping: dict, allowed: set[str], path: Path, where: str) -> None:
