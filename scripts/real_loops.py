@@ -35,7 +35,8 @@ the corrected model on flights nothing was fitted to. *Buys*: by which share an 
 fitted flights' predictions (attitude and velocity, 0.1 to 0.5 s ahead, over what hold errs), the others having moved to
 make up for it. *t*: standard deviations by which predictions of the other flights are better with it. *Accelerations
 ask for*: the same numbers from one-step innovations, which a controller's answers to disturbances do not bias; bold
-where they contradict what predictions ask for: such a number stands in for something else.
+where they contradict what predictions ask for: such a number stands in for something else. A drone called *captured*
+flies the same flights, imported with `--motion-capture` ([logs](logs.md)): pose and velocity are not the estimate's.
 """
 
 
