@@ -59,7 +59,7 @@ def import_log(
         raise CfbError("import needs a log and -o FILE.mcap; see 'cfb import --help'.")
     options = {"motor_shift": motor_shift, "mapping": mapping, "topics_yaml": topics_yaml, "robot": robot}
     options |= {"time_unit": time_unit, "keep_ground": keep_ground, "cut": flat(cut), "fix": flat(fix)}
-    options |= {"motion_capture": motion_capture or None}
+    options |= {"motion_capture": motion_capture}
     run_import(list(sources), output, None if format == "auto" else format, options)
 
 
@@ -99,6 +99,6 @@ def check(
 
     options = {"mapping": mapping, "topics_yaml": topics_yaml, "robot": robot, "time_unit": time_unit}
     options |= {"keep_ground": keep_ground, "cut": flat(cut), "fix": flat(fix)}
-    options |= {"motion_capture": motion_capture or None}
+    options |= {"motion_capture": motion_capture}
     if refused := run_check(list(logs), output, json, options):
         raise CfbError(f"{refused} of {len(logs)} recordings were refused, for the reasons above.")

@@ -27,8 +27,6 @@ _DERIVED = {
     "speeds. Log the duty.",
 }
 _GRAVITY = np.array([0.0, 0.0, 9.81])
-SLOWEST, FEWEST = 0.02, 100
-"""Interval, s, and number of samples of motion capture that an estimate is compared with unasked."""
 _LATE = 0.002  # s of average age of a held pose worth a note: a quarter of the observation delay assumed otherwise
 COMMAND_NOTE = (
     "motor.m1..m4 is what the ESC is told: the command after battery compensation and thrust limit, where the firmware "
@@ -127,7 +125,9 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
     return _with_capture(log, home, chosen, mapping, path)
 
 
-def _with_capture(log: FlightLog, home: dict[str, Stream], chosen: dict[str, Choice], mapping: VariableMap, path: Path):
+def _with_capture(
+    log: FlightLog, home: dict[str, Stream], chosen: dict[str, Choice], mapping: VariableMap, path: Path
+) -> FlightLog:
     """The log with pose and velocity by motion capture if that was asked for, or a note where it would differ."""
     for choices in mapping.motion_capture:
         names = [name for choice in choices for name in choice.variables]
@@ -140,11 +140,9 @@ def _with_capture(log: FlightLog, home: dict[str, Stream], chosen: dict[str, Cho
         capture = Capture(stream.time - log.metadata["merging"]["time_of_first_row"], *pose)
         if mapping.by_motion_capture:
             return with_pose_of(log, capture)
-        if stream.interval > SLOWEST or len(stream.time) < FEWEST:
-            return log
         try:
             said = compared(log, with_pose_of(log, capture))
-        except CfbError:
+        except CfbError:  # Nobody asked for it: a capture of positions alone, say.
             return log
         return log.replace(metadata={"notes": [*log.metadata["notes"], said]}) if said else log
     if mapping.by_motion_capture:

@@ -15,6 +15,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.gaps import longest_step
+from cfb_mjx.logs.resample import interpolate
 
 POSITION, ATTITUDE = (0.045, 3), (0.025, 2)
 """Half a span, s, over which a polynomial of this degree smooths the samples: a tenth of a second is how fast a
@@ -23,6 +24,10 @@ JUMP = 0.1
 """rad by which two samples turn otherwise than the gyro where markers were taken for others: ten times their noise."""
 LATEST, SPAN = 0.03, 0.1
 """How late motion capture may be behind the gyro, s, and the span over which the two are compared, s."""
+SLOWEST, FEWEST = 0.02, 100
+"""Interval of the samples, s, and their number."""
+UNLIKE = 0.2
+"""Unexplained share (as in `consistency.CONTRADICTS`) from which an attitude is not that of the gyro's body."""
 TURNING = 0.03
 """rad in `SPAN`, rms: what turns less does not tell where the markers' axes are."""
 SLOW = 0.3
@@ -59,11 +64,16 @@ def with_pose_of(log: FlightLog, capture: Capture) -> FlightLog:
         capture: at least 50 Hz, so that a span of smoothing holds enough.
 
     Raises:
-        CfbError: no row is left.
+        CfbError: too few samples with an attitude, an attitude that does not turn as the gyro, or no row left.
     """
     known = np.isfinite(capture.position).all(axis=1) & np.isfinite(capture.quaternion).all(axis=1)
     known &= np.abs(np.linalg.norm(capture.quaternion, axis=1) - 1) < 0.05
     good = capture.only(known)
+    if len(good.time) < FEWEST or np.median(np.diff(good.time)) > SLOWEST:
+        raise CfbError(
+            f"{log.name}: motion capture has {len(good.time)} samples with an attitude, and {FEWEST} at 50 Hz are "
+            "needed; leave out --motion-capture to take the estimate."
+        )
     good = dataclasses.replace(good, quaternion=rotation.tidy(good.quaternion))
     turned = turned_by_gyro(log)
     late = delay_behind(log, turned, good)
@@ -71,6 +81,12 @@ def with_pose_of(log: FlightLog, capture: Capture) -> FlightLog:
     good = good.only(keep)
     axes = marker_axes(log, turned, good, late)
     good = dataclasses.replace(good, quaternion=rotation.multiply(good.quaternion, axes))
+    gyro, seen = turns(log, turned, good, late, SPAN)
+    if np.sum((seen - gyro) ** 2) > UNLIKE * np.sum(gyro**2 + seen**2) / 2 and _rms(gyro) > TURNING:
+        raise CfbError(
+            f"{log.name}: the attitude by motion capture does not turn as the gyro does, so it is no attitude of the "
+            "drone; leave out --motion-capture to take the estimate."
+        )
     (position, velocity), placed = _smoothed(good.time, good.position, log.time, *POSITION)
     (quaternion, _), faced = _smoothed(good.time, good.quaternion, log.time, *ATTITUDE)
     rows = placed & faced
@@ -79,10 +95,11 @@ def with_pose_of(log: FlightLog, capture: Capture) -> FlightLog:
     quaternion[~rows] = [1.0, 0.0, 0.0, 0.0]
     found = log.replace(position=position, velocity=velocity, quaternion=rotation.tidy(quaternion)).rows(rows)
     lost = f", {int((~rows).sum())} rows of the log have none" if not rows.all() else ""
+    blind = f", {int((~known).sum())} without an attitude" if not known.all() else ""
     wrong = f", {int((~keep).sum())} that turn otherwise than the gyro left out" if not keep.all() else ""
     sits = ", ".join(f"{x + 0.0:.1f}" for x in np.rad2deg(rotation.rotation_vector(axes)).round(1))
     said = (
-        f"pose and velocity by motion capture: {len(capture.time)} samples{wrong}{lost}; smoothed over "
+        f"pose and velocity by motion capture: {len(capture.time)} samples{blind}{wrong}{lost}; smoothed over "
         f"{2e3 * POSITION[0]:.0f} ms (attitude {2e3 * ATTITUDE[0]:.0f} ms), {1e3 * late:.1f} ms behind the gyro, "
         f"its axes turned by {sits} deg against the gyro's."
     )
@@ -94,7 +111,7 @@ def compared(estimate: FlightLog, captured: FlightLog) -> str | None:
     """In a sentence how far an estimate leans and how fast it moves beside motion capture; None where they agree."""
     rows = np.searchsorted(estimate.time, captured.time)
     speed, true_speed = estimate.velocity[rows, :2], captured.velocity[:, :2]
-    if np.sqrt(np.mean(np.sum(true_speed**2, axis=1))) < SLOW:
+    if _rms(true_speed) < SLOW:
         return None
     pairs = (lean(estimate.quaternion[rows]), lean(captured.quaternion)), (speed, true_speed)
     further, faster = (float(np.sum(a * b) / np.sum(b * b)) for a, b in pairs)
@@ -117,21 +134,22 @@ def turned_by_gyro(log: FlightLog) -> np.ndarray:
     """(n, 4) how the gyro says the drone turned since the first row."""
     steps = np.diff(log.time)[:, None]
     middle = 0.5 * (log.body_rate[1:] + log.body_rate[:-1])
-    whole = [np.array([1.0, 0.0, 0.0, 0.0])]
-    for step in rotation.exponential(middle * np.where(steps > log.gap_threshold, 0.0, steps)):
-        whole.append(rotation.multiply(whole[-1], step))
-    return rotation.tidy(np.array(whole))
+    steps = rotation.exponential(middle * np.where(steps > log.gap_threshold, 0.0, steps))
+    whole, span = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], steps]), 1
+    while span < len(whole):  # Products of all before each row, by twice as many at a time.
+        whole[span:] = rotation.multiply(whole[:-span], whole[span:])
+        span *= 2
+    return rotation.tidy(whole)
 
 
 def _offsets(log: FlightLog, turned: np.ndarray, capture: Capture, late: float) -> np.ndarray:
     """(m, 4) attitude by motion capture over that by the gyro, which drifts but never jumps."""
-    own = _interpolated(log, turned, capture.time - late)
+    own = rotation.tidy(interpolate(log.time, turned, capture.time - late))
     return rotation.multiply(capture.quaternion, rotation.conjugate(own))
 
 
-def _interpolated(log: FlightLog, quaternion: np.ndarray, when: np.ndarray) -> np.ndarray:
-    found = np.stack([np.interp(when, log.time, column) for column in quaternion.T], axis=1)
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+def _rms(vectors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1)))) if len(vectors) else 0.0
 
 
 def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -166,7 +184,7 @@ def turns(
     there = np.searchsorted(log.time, capture.time - late).clip(0, len(log.time) - 1)
     whole = (away[there[first]] == away[there[last]]) & (capture.time[last] - capture.time[first] < 1.2 * span)
     first, last = first[whole], last[whole]
-    own = _interpolated(log, turned, capture.time - late)
+    own = rotation.tidy(interpolate(log.time, turned, capture.time - late))
 
     def between(q: np.ndarray) -> np.ndarray:
         return rotation.rotation_vector(rotation.multiply(rotation.conjugate(q[first]), q[last]))
@@ -179,7 +197,7 @@ def marker_axes(log: FlightLog, turned: np.ndarray, capture: Capture, late: floa
     from scipy.spatial.transform import Rotation
 
     gyro, seen = turns(log, turned, capture, late, SPAN)
-    if len(gyro) < 50 or np.sqrt(np.mean(np.sum(gyro**2, axis=1))) < TURNING:
+    if len(gyro) < 50 or _rms(gyro) < TURNING:
         return np.array([1.0, 0.0, 0.0, 0.0])
     off = np.sum((seen - gyro) ** 2, axis=1)
     usual = off <= np.quantile(off, 0.9)
@@ -191,7 +209,7 @@ def marker_axes(log: FlightLog, turned: np.ndarray, capture: Capture, late: floa
 
 def _believed(log: FlightLog, offsets: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Which samples are of the drone as most are: pieces without a jump that stand where the longest one stands."""
-    gaps = log.time[log.gaps()] if len(log.gaps()) else np.zeros(0)
+    gaps = log.time[log.gaps()]
     # Nothing is known of how the drone turned in a gap of the log.
     across = np.searchsorted(gaps, time[1:]) > np.searchsorted(gaps, time[:-1])
     jumps = (_between(offsets[:-1], offsets[1:]) > JUMP) & ~across

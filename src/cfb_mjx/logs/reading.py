@@ -73,7 +73,7 @@ def read_log(
             ``crazyswarm``, ``radio_csv``, ``ulog`` and ``foxglove``; ``topics_yaml`` for ``crazyswarm``
             (`cfb_mjx.logs.read_crazyswarm`); ``time_unit`` for ``radio_csv`` (`cfb_mjx.logs.read_radio_csv`); ``robot``
             for both; ``motion_capture=True`` takes pose and velocity from motion capture that a Crazyflie logged beside
-            its estimate (`cfb_mjx.logs.motion_capture`). An option that is None counts as not given.
+            its estimate (`cfb_mjx.logs.motion_capture`). An option that is None or False counts as not given.
 
     Raises:
         UnknownNames: a table with names of its own, for which a mapping can be proposed.
@@ -96,7 +96,7 @@ def read_judged(
     paths = [Path(p) for p in path] if several else [Path(path)]
     if not paths:
         raise CfbError("no log was given; give one.")
-    options = {k: v for k, v in options.items() if v is not None}
+    options = {k: v for k, v in options.items() if v is not None and v is not False}
     first, tables = paths[0], {}
     if format is None:
         format = _detect(paths, options, tables)
