@@ -8,13 +8,15 @@ PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13; do \
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
 
-.PHONY: demo test test-long lint bench accuracy logs docs clean help
+.PHONY: demo test test-long lint bench gpu gpu-wheels accuracy logs docs clean help
 
 help:
 	@echo "make demo      set up and run the main job; the page is out/demo/index.html"
 	@echo "make test      set up and run the tests"
 	@echo "make test-long the few tests that take minutes each"
 	@echo "make bench     measure speed beside crazyflow, write docs/performance.md"
+	@echo "make gpu       measure speed on a GPU, write docs/performance-gpu.md"
+	@echo "make gpu-wheels  fetch into wheels/ what a GPU machine without network may lack (Python 3.12)"
 	@echo "make accuracy  measure the integrators, write docs/accuracy.md"
 	@echo "make logs      generate the shipped flight logs anew"
 	@echo "make docs      build the documentation; open site/index.html"
@@ -32,6 +34,19 @@ test-long: $(INSTALLED)
 
 bench: $(INSTALLED) .venv-peers/.installed
 	$(BIN)/cfb bench --roofline --peer-python .venv-peers/bin/python --json benchmarks/results.json --markdown docs/performance.md
+
+# On a machine with an NVIDIA GPU, jax for CUDA and no network: what it lacks comes along in wheels/.
+GPU_PYTHON ?= python3
+WHEELS = mujoco mujoco-core mujoco-mjx brax tyro mcap mcap-ros2-support beartype typeguard docstring_parser \
+  ml_collections tensorboardX trimesh jaxopt glfw PyOpenGL dm_env
+
+gpu:
+	@test ! -d wheels || $(GPU_PYTHON) -m pip install --quiet --no-index --no-deps --upgrade --target .gpu-site wheels/*.whl
+	PYTHONPATH=.gpu-site:src $(GPU_PYTHON) scripts/gpu.py
+
+gpu-wheels: $(INSTALLED)
+	$(BIN)/python -m pip download --quiet --no-deps --only-binary=:all: --python-version 3.12 --implementation cp \
+	  --platform manylinux_2_28_x86_64 --platform manylinux2014_x86_64 -c constraints.txt -d wheels $(WHEELS)
 
 accuracy: $(INSTALLED)
 	$(BIN)/python scripts/accuracy.py

@@ -1,7 +1,7 @@
 """The kernel of a rollout, carried out in plain JAX: what it computes, when it is chosen, and that CUDA can have it.
 
 No test here needs a GPU. That the kernel compiles and computes the same on one is tried where one is, once per process
-(`acceleration.kernel_works`); `scripts/tune_kernel.py` compares and times it there.
+(`acceleration.kernel_works`), and by `test_on_gpu.py`.
 """
 
 from __future__ import annotations

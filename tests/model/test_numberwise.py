@@ -26,7 +26,9 @@ def _moves(a, b):
     turned = jax.lax.optimization_barrier((a.T, b))
     sums = [jnp.sum(a), jnp.sum(a, axis=0), jnp.sum(a[:, None] * a, axis=(0, 2))]
     chosen = jax.jit(lambda x: jax.jit(jnp.clip)(x, 0.0, 2.0))(turned[0])
-    return [stacked, joined, chosen + turned[1][:, None], jnp.squeeze(a[:1], 0), jnp.float32(7.0) + 0 * b[0], *sums]
+    apart = [*jnp.unstack(a, axis=1), *jnp.unstack(b)]
+    merged = [stacked, joined, chosen + turned[1][:, None], jnp.squeeze(a[:1], 0), jnp.float32(7.0) + 0 * b[0]]
+    return [*merged, *apart, *sums]
 
 
 def test_arrays_taken_apart_give_the_same():

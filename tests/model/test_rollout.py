@@ -174,6 +174,12 @@ def test_in_chunks_refuses_empty_chunks(size):
         in_chunks(lambda x: x, size, jnp.arange(3.0))
 
 
+def test_a_single_precision_drone_hovers_in_single_precision():
+    """Also where jax is set to doubles, as in these tests: a closed loop begins with this command."""
+    model = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), Quadrotor.from_file("cf21b-500"))
+    assert model.hover_command().dtype == jnp.float32
+
+
 @pytest.mark.parametrize("x64", [False, True])
 @pytest.mark.parametrize("body", ["rigid", "mjx", "mjx floor"])
 def test_precision_follows_the_setting(x64, body):

@@ -80,7 +80,7 @@ def page(result: dict, flags: str) -> str:
         )
     from cfb_mjx.cli.roofline import section
 
-    gpu = "" if jax.default_backend() != "cpu" else "GPU: not measured (none on this machine).\n"
+    gpu = "" if jax.default_backend() != "cpu" else "On a GPU: [performance-gpu.md](performance-gpu.md).\n"
     comparison = "\n".join(f"- {line}" for line in ratios(result))
     return f"""# Performance
 

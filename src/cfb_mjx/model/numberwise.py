@@ -48,6 +48,12 @@ def _sum(array: np.ndarray, axes, **_) -> np.ndarray:
     return total.reshape(kept)
 
 
+def _unstack(array: np.ndarray, axis: int) -> tuple[np.ndarray, ...]:
+    rows = np.moveaxis(array, axis, 0)
+    # A slice stays an array where a row of one number would not.
+    return tuple(rows[i : i + 1].reshape(rows.shape[1:]) for i in range(len(rows)))
+
+
 MOVES: dict[str, Callable[..., np.ndarray]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda *arrays, dimension: np.concatenate(arrays, axis=dimension),
@@ -60,6 +66,7 @@ MOVES: dict[str, Callable[..., np.ndarray]] = {
     "squeeze": lambda array, dimensions: array.squeeze(dimensions),
     "stack": lambda *arrays, axis: np.stack(arrays, axis=axis),
     "transpose": lambda array, permutation: array.transpose(permutation),
+    "unstack": _unstack,
 }
 """Operations that move numbers about, or add them up, on arrays of objects."""
 

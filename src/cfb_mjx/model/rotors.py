@@ -196,8 +196,9 @@ def hover_rotor_speed(parameters: Parameters) -> Float[Array, "4"]:
     is convex where it matters, so it converges without a bracket; differentiable.
     """
     half = parameters.rotor_spacing / 2
-    cog = parameters.center_of_gravity
-    share = 0.25 * (1 + cog[0] * jnp.array(POSITION_SIGNS_X) / half + cog[1] * jnp.array(POSITION_SIGNS_Y) / half)
+    cog = jnp.asarray(parameters.center_of_gravity)
+    x, y = (jnp.array(signs, cog.dtype) for signs in (POSITION_SIGNS_X, POSITION_SIGNS_Y))
+    share = 0.25 * (1 + cog[0] * x / half + cog[1] * y / half)
     wanted = parameters.mass * parameters.gravity * share / parameters.thrust_scale
     c3, c2, c1 = parameters.thrust_polynomial
 
