@@ -1,6 +1,6 @@
 """Tasks to train on: what the controller sees, what it is rewarded for, how episodes begin and end."""
 
-from cfb_mjx.envs.episode import Episode, Noise, Task, observe, reset, step, with_room
+from cfb_mjx.envs.episode import Episode, Noise, Task, observe, privileged, reset, step, with_room
 from cfb_mjx.envs.flip import FlipReward, FlipStarts, FlipTask, Setpoints
 from cfb_mjx.envs.observation import Estimate, Layout, Memory
 from cfb_mjx.envs.reward import PaperReward
@@ -22,6 +22,7 @@ __all__ = [
     "TargetTask",
     "Task",
     "observe",
+    "privileged",
     "reset",
     "step",
     "with_room",

@@ -21,7 +21,7 @@ from cfb_mjx.envs.observation import Estimate, Layout, Memory
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
-from cfb_mjx.model.randomised import require_possible, sample_drone
+from cfb_mjx.model.randomised import differences, require_possible, sample_drone
 from cfb_mjx.model.rotors import steady_command
 from cfb_mjx.model.state import AnyArray, Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec, exponential, multiply
@@ -304,6 +304,24 @@ def choose(condition: Array, yes: Any, no: Any) -> Any:
 def observe(task: Task, episode: Episode) -> Float[Array, " size"]:
     """What the controller's network is given now."""
     return seen.observation(task.layout, episode.memory, episode.estimate, episode.setpoint)
+
+
+def privileged(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array, " n"]:
+    """What a value network may know: true frame, errors, rotor speeds, integral, set-points, how the drone differs.
+
+    The reward falls with lengths of errors, whose tips at zero a small network is slow to form by itself.
+    """
+    state, parameters = episode.state, episode.model.parameters
+    position = state.position - episode.target
+    true = seen.frame(task.layout, Estimate(position, state.velocity, state.quaternion, state.body_rate))
+    errors = task.errors(state, episode.target, episode.setpoint)
+    parts = [true, errors, jnp.sqrt(errors), state.rotor_speed / parameters.reference_rotor_speed]
+    parts.append(episode.memory.integral / task.layout.integral_limit_ms)
+    if task.layout.setpoint_scales:
+        parts.append(episode.setpoint / jnp.asarray(task.layout.setpoint_scales))
+    if task.randomisation is not None:
+        parts.append(differences(nominal, episode.model, task.randomisation))
+    return jnp.concatenate(parts)
 
 
 def step(

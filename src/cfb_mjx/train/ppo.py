@@ -20,10 +20,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import Network, NeuralController
 from cfb_mjx.devices import Devices
-from cfb_mjx.envs.episode import Episode, Task, choose, observe, reset, step
-from cfb_mjx.envs.observation import Estimate, frame
+from cfb_mjx.envs.episode import Episode, Task, choose, observe, privileged, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor
-from cfb_mjx.model.randomised import differences
 from cfb_mjx.train.algorithm import in_progress, strong
 from cfb_mjx.train.brax_compat import parts
 from cfb_mjx.train.config import PpoSettings
@@ -91,7 +89,7 @@ class Ppo:
         return NeuralController(state.actor.network, self.task.layout)
 
     def _show(self, episode: Episode) -> dict[str, Array]:
-        return {"seen": observe(self.task, episode), "hidden": hidden(self.task, self.nominal, episode)}
+        return {"seen": observe(self.task, episode), "hidden": privileged(self.task, self.nominal, episode)}
 
     def _update(self, state: PpoState) -> tuple[PpoState, dict]:
         of_flight, of_learning, key = jax.random.split(state.key, 3)
@@ -199,24 +197,6 @@ class Ppo:
 
     def _value(self, critic: Network, shown: Array) -> Array:
         return self.ideal + critic(shown)[..., 0]
-
-
-def hidden(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array, " n"]:
-    """What the value network is shown: true frame, rotor speeds, integral, how the drone differs, set-points, errors.
-
-    The reward falls with lengths of errors, whose tips at zero a small network is slow to form by itself.
-    """
-    state, parameters = episode.state, episode.model.parameters
-    position = state.position - episode.target
-    true = frame(task.layout, Estimate(position, state.velocity, state.quaternion, state.body_rate))
-    errors = task.errors(state, episode.target, episode.setpoint)
-    parts = [true, errors, jnp.sqrt(errors), state.rotor_speed / parameters.reference_rotor_speed]
-    parts.append(episode.memory.integral / task.layout.integral_limit_ms)
-    if task.layout.setpoint_scales:
-        parts.append(episode.setpoint / jnp.asarray(task.layout.setpoint_scales))
-    if task.randomisation is not None:
-        parts.append(differences(nominal, episode.model, task.randomisation))
-    return jnp.concatenate(parts)
 
 
 def _logits(actor: Actor, seen: Array) -> Array:
