@@ -9,15 +9,16 @@ a time: one compiled program serves flights of any number and length.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from cfb_mjx.devices import over_cores
 from cfb_mjx.model import rotors
-from cfb_mjx.model.effects import Effect, Reading
+from cfb_mjx.model.effects import Effect, Reading, overrides
 from cfb_mjx.model.quadrotor import (
     Quadrotor,
     at_rotor_center,
@@ -76,13 +77,29 @@ def replays(model: Quadrotor, lanes: Iterable[Lane]) -> Iterator[Replay]:
         model: the drone with its effects.
         lanes: flights, and with which numbers each.
     """
-    return _walked(model, lanes, False)
+    return _walked(model, lanes, "sensors")
+
+
+def speeds_along(model: Quadrotor, flights: Sequence[Flight], lead: float = 0.0) -> list[np.ndarray]:
+    """Rotor speeds (n, 4) from commands at each row of flights, rad/s: the first that `remembered_along` returns.
+
+    Of the body only what the rotors feel is walked along, a small part of the model.
+    """
+    alone = rotors_alone(model)
+    # Where what the rotors feel hangs on what the whole model misses, all of it is needed.
+    if any(_drives(effect) and overrides(effect, "follow") for effect in model.effects):
+        return [speed for speed, _ in remembered_along(model, flights, lead)]
+    return list(_walked(alone, [Lane(flight, flight.rotor_speed, lead) for flight in flights], "speed"))
+
+
+def _drives(effect: Effect) -> bool:
+    return overrides(effect, "motors") or overrides(effect, "command")
 
 
 def remembered_along(model: Quadrotor, flights: Sequence[Flight], lead: float = 0.0) -> list[tuple[np.ndarray, tuple]]:
     """Rotor speeds (n, 4) from commands, and the memories of all effects (leading axis n), at each row of flights."""
     alone = rotors_alone(model)
-    return list(_walked(alone, [Lane(flight, flight.rotor_speed, lead) for flight in flights], True))
+    return list(_walked(alone, [Lane(flight, flight.rotor_speed, lead) for flight in flights], "memory"))
 
 
 def rotors_alone(model: Quadrotor) -> Quadrotor:
@@ -90,27 +107,37 @@ def rotors_alone(model: Quadrotor) -> Quadrotor:
     return Quadrotor(model.parameters, model.effects, model.body, dt=model.dt, substeps=model.substeps)
 
 
-def _walked(model: Quadrotor, lanes: Iterable[Lane], remembers: bool) -> Iterator:
-    for some in _grouped(lanes):
-        width = next(count for count in LANES if count >= len(some))
-        # The last lane is walked along more than once where there are fewer.
-        whole = some + some[-1:] * (width - len(some))
-        numbers = [model.effects if lane.effects is None else lane.effects for lane in whole]
-        effects = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *numbers)
-        lead = np.array([lane.lead for lane in whole], float)
-        measured = np.array([lane.flight.measured for lane in whole], float)
-        longest = max(len(lane.flight.time) for lane in some)
-        carry, pieces = None, []
-        for first in range(0, longest, ROWS):
-            # One more, which says what happens in the interval after the last.
-            rows = _rows(whole, first, first + ROWS + 1)
-            if carry is None:
-                carry = _begin(model, effects, {key: x[:, :2] for key, x in rows.items()})
-            carry, found = _advance(model, effects, lead, measured, rows, carry, remembers)
-            pieces.append(found)
-        together = jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x], axis=1), *pieces)
-        for i, lane in enumerate(some):
-            yield jax.tree.map(lambda x, i=i, n=len(lane.flight.time): x[i, :n], together)
+Wanted = Literal["sensors", "memory", "speed"]
+"""What is kept of every row: a `Replay`, rotor speeds and memories, or rotor speeds alone."""
+
+
+def _walked(model: Quadrotor, lanes: Iterable[Lane], wanted: Wanted) -> Iterator:
+    def walked(some: list[Lane]) -> list:
+        return _side_by_side(model, some, wanted)
+
+    for found in over_cores(walked, _grouped(lanes)):
+        yield from found
+
+
+def _side_by_side(model: Quadrotor, some: list[Lane], wanted: Wanted) -> list:
+    width = next(count for count in LANES if count >= len(some))
+    # The last lane is walked along more than once where there are fewer.
+    whole = some + some[-1:] * (width - len(some))
+    numbers = [model.effects if lane.effects is None else lane.effects for lane in whole]
+    effects = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *numbers)
+    lead = np.array([lane.lead for lane in whole], float)
+    measured = np.array([lane.flight.measured for lane in whole], float)
+    longest = max(len(lane.flight.time) for lane in some)
+    carry, pieces = None, []
+    for first in range(0, longest, ROWS):
+        # One more, which says what happens in the interval after the last.
+        rows = _rows(whole, first, first + ROWS + 1)
+        if carry is None:
+            carry = _begin(model, effects, {key: x[:, :2] for key, x in rows.items()})
+        carry, found = _advance(model, effects, lead, measured, rows, carry, wanted)
+        pieces.append(found)
+    together = jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x], axis=1), *pieces)
+    return [jax.tree.map(lambda x, i=i, n=len(lane.flight.time): x[i, :n], together) for i, lane in enumerate(some)]
 
 
 def _grouped(lanes: Iterable[Lane]) -> Iterator[list[Lane]]:
@@ -158,7 +185,8 @@ def _begin(model: Quadrotor, effects: tuple[Effect, ...], rows: dict[str, Array]
         start = begin(own, State(first.position, first.velocity, first.quaternion, first.body_rate, speed.stack()))
         return speed, unstack(start, center).memory
 
-    return jax.vmap(one)(effects, rows)
+    # Weak types would become strong after some rows, and the next be a program of its own.
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), jax.vmap(one)(effects, rows))
 
 
 def _with(model: Quadrotor, effects: tuple[Effect, ...]) -> Quadrotor:
@@ -166,16 +194,16 @@ def _with(model: Quadrotor, effects: tuple[Effect, ...]) -> Quadrotor:
 
 
 @eqx.filter_jit
-def _advance(model: Quadrotor, effects: tuple[Effect, ...], lead, measured, rows, carry, remembers: bool):
-    """Along some rows of every lane: what is carried on, and a `Replay` or what is remembered at each of them."""
+def _advance(model: Quadrotor, effects: tuple[Effect, ...], lead, measured, rows, carry, wanted: Wanted):
+    """Along some rows of every lane: what is carried on, and what is wanted of each of them."""
 
     def one(effects, *inputs):
-        return _along(_with(model, effects), *inputs, remembers)
+        return _along(_with(model, effects), *inputs, wanted)
 
     return jax.vmap(one)(effects, lead, measured, rows, carry)
 
 
-def _along(model: Quadrotor, lead: Array, share: Array, rows: dict[str, Array], carry, remembers: bool):
+def _along(model: Quadrotor, lead: Array, share: Array, rows: dict[str, Array], carry, wanted: Wanted):
     center = Vec.unstack(model.changed_parameters().center_of_gravity)
     here, there = (Vec.unstack(rows["driven"][x]) for x in (slice(-1), slice(1, None)))
     command = rows["command"][:-1] + lead * (rows["command"][1:] - rows["command"][:-1])
@@ -204,14 +232,18 @@ def _along(model: Quadrotor, lead: Array, share: Array, rows: dict[str, Array], 
         rate = share * straight.rate_middle + (1 - share) * ((path.end - path.start) * prepared.rotors.inverse_dt)
         where = remembering(unstack(at, center), moved)
         seen = conditions(prepared, where, body_speed)
+        acceleration = rotate(where.quaternion, felt) - Vec(0.0, 0.0, prepared.parameters.gravity)
+        if wanted == "speed":
+            advanced = followed(prepared, seen, acceleration, Vec(0.0, 0.0, 0.0))
+            pairs = zip(model.effects, advanced, moved, strict=True)
+            return (path.end, tuple(new if _drives(effect) else old for effect, new, old in pairs)), speed.stack()
         wrench = loaded(model, prepared.parameters, rotors.loads_at(prepared.rotors, body_speed, rate), seen)
         angular, force = at_rotor_center(prepared.parameters, wrench, where.body_rate)
-        up = Vec(0.0, 0.0, prepared.parameters.gravity)
         # What remembers accelerations (a slung load) followed the drone, not the model of it.
         missed = rotate(where.quaternion, felt - force)
-        moved = followed(prepared, seen, rotate(where.quaternion, felt) - up, missed)
+        moved = followed(prepared, seen, acceleration, missed)
         kept = jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec))
-        known = (speed.stack(), kept) if remembers else Replay(speed.stack(), angular.stack(), force.stack())
+        known = (speed.stack(), kept) if wanted == "memory" else Replay(speed.stack(), angular.stack(), force.stack())
         return (path.end, moved), known
 
     return jax.lax.scan(row, carry, inputs)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from cfb_mjx.devices import over_cores
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.rotation import to_world
 from cfb_mjx.model.effects import Condition, Effect, Wrench
@@ -28,7 +29,7 @@ from cfb_mjx.model.vector import Vec, rotate_inverse
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import ROWS, Flight, lengthened
 from cfb_mjx.sysid.identification.flight_data import white_noise
-from cfb_mjx.sysid.replay import Lane, Replay, between, remembered_along, replays, smoothed_rotor_speed
+from cfb_mjx.sysid.replay import Lane, Replay, between, replays, smoothed_rotor_speed, speeds_along
 
 CHANNELS = 10
 SIDE_BY_SIDE = 32, 16
@@ -234,7 +235,7 @@ def fit_levels(blocks: Blocks, noise: dict[str, np.ndarray], start: np.ndarray =
 
 def driven_by(model: Quadrotor, flights: Sequence[Flight], lead: float) -> list[np.ndarray]:
     """Rotor speeds (n, 4) that drive the body along each flight: measured, or from commands."""
-    pairs = zip(flights, (speed for speed, _ in remembered_along(model, flights, lead)), strict=True)
+    pairs = zip(flights, speeds_along(model, flights, lead), strict=True)
     return [smoothed_rotor_speed(flight, speed) if flight.measured else speed for flight, speed in pairs]
 
 
@@ -366,11 +367,13 @@ def inner_products(blocks: Blocks, levels: Levels) -> Float[np.ndarray, "b c c"]
 
     signals = Signals(*map(apart, blocks.signals))
     every = Blocks(signals, *(np.repeat(x, groups, axis=0) for x in (blocks.interval, blocks.valid)))
-    found = []
-    for first in range(0, count * groups, most):
+
+    def whitened(first: int) -> np.ndarray:
         # The last ones are whitened more than once.
         chosen = np.minimum(np.arange(first, first + most), count * groups - 1)
-        found.append(np.asarray(_whitened(jax.tree.map(lambda x, c=chosen: x[c], every), levels)))
+        return np.asarray(_whitened(jax.tree.map(lambda x: x[chosen], every), levels))
+
+    found = list(over_cores(whitened, range(0, count * groups, most)))
     e = np.concatenate(found)[: count * groups].reshape(count, groups, -1, wide)
     e = np.moveaxis(e, 1, -2).reshape(count, -1, groups * wide)[..., :columns]
     return np.swapaxes(e, 1, 2) @ e

@@ -127,10 +127,10 @@ class Search:
         """What a hypothesis misses along `flights` (or others), and the rotor speeds (n, 4) that drove the body."""
         if flights is None:
             # One after another is compared with the same corrected model.
-            kept = [found for known, found in self._known if known is hypothesis]
-            if kept:
-                self._keep(hypothesis, kept[0])
-                return kept[0]
+            kept = self._kept(hypothesis)
+            if kept is not None:
+                self._keep(hypothesis, kept)
+                return kept
         model = hypothesis.model(self.parameters)
         own = self.flights(hypothesis) if flights is None else flights
         driven = driven_by(model, own, hypothesis.lead)
@@ -139,8 +139,11 @@ class Search:
             self._keep(hypothesis, found)
         return found
 
+    def _kept(self, hypothesis: Hypothesis) -> list[tuple[Blocks, np.ndarray]] | None:
+        return next((found for known, found in self._known if _alike(known, hypothesis)), None)
+
     def _keep(self, hypothesis: Hypothesis, found: list[tuple[Blocks, np.ndarray]]) -> None:
-        others = [pair for pair in self._known if pair[0] is not hypothesis]
+        others = [pair for pair in self._known if not _alike(pair[0], hypothesis)]
         self._known = [(hypothesis, found), *others[: KNOWN - 1]]
 
     def beside(self, logs: list[FlightLog], sensors: SensorCheck) -> Search:
@@ -181,6 +184,9 @@ class Search:
         return found
 
     def _driven(self, hypothesis: Hypothesis) -> list[np.ndarray]:
+        kept = self._kept(hypothesis)
+        if kept is not None:
+            return [driven for _, driven in kept]
         return driven_by(hypothesis.model(self.parameters), self.flights(hypothesis), hypothesis.lead)
 
     def _linear(self, hypothesis: Hypothesis, columns: list[Column], signals: Iterable[Signals]) -> Linear:
@@ -333,6 +339,11 @@ class Search:
         for column, value in zip(variant, found.values, strict=True):
             effect = moved(effect, column, float(value) * column.scale, False)
         return hypothesis.having(effect)
+
+
+def _alike(a: Hypothesis, b: Hypothesis) -> bool:
+    """Whether they miss the same, whatever their noise levels are."""
+    return a.effects is b.effects and (a.lead, a.shift) == (b.lead, b.shift)
 
 
 def _sample(blocks: Blocks) -> Blocks:
