@@ -42,7 +42,7 @@ def best(work) -> dict:
     }
 
 
-def over_batches(make, drones, found: list, keep) -> list:
+def over_batches(make, drones, found: list, keep) -> None:
     """Rows for one workload after the other; the first batch that fails is the last."""
     for count in drones:
         try:
@@ -53,10 +53,9 @@ def over_batches(make, drones, found: list, keep) -> list:
         keep()
         if "failed" in found[-1]:
             break
-    return found
 
 
-def machine(found: list, keep) -> list:
+def machine(found: list, keep) -> None:
     """Bytes the GPU moves per second, in a program of one line."""
     import jax
     import jax.numpy as jnp
@@ -70,10 +69,9 @@ def machine(found: list, keep) -> list:
         jax.block_until_ready(program(x))
         seconds.append(time.perf_counter() - begin)
     found.append({"what": "bytes read and written", "per_s": 2 * x.nbytes / min(seconds)})
-    return found
 
 
-def open_loop(found: list, keep) -> list:
+def open_loop(found: list, keep) -> None:
     """Rollouts with every tuning of the kernel, and without it."""
     from cfb_mjx.cli import workloads
     from cfb_mjx.model.acceleration import using
@@ -87,26 +85,24 @@ def open_loop(found: list, keep) -> list:
         with using("kernel", Tuning(block, warps)):
             over_batches(lambda n: workloads.rollout(n, "rigid"), (DRONES[3],), found, keep)
         found[-1]["body"] = f"rigid, {block} drones by {warps} warps"
-    return found
 
 
-def policy(found: list, keep) -> list:
+def policy(found: list, keep) -> None:
     """The shipped network in the loop."""
     from cfb_mjx.cli import workloads
 
-    return over_batches(workloads.rollout_policy, (8192, 65536, 524288), found, keep)
+    over_batches(workloads.rollout_policy, (8192, 65536, 524288), found, keep)
 
 
-def gradient(found: list, keep) -> list:
+def gradient(found: list, keep) -> None:
     """By all parameters, by ten, and the loss alone."""
     from cfb_mjx.cli import workloads
 
     for make in (workloads.rollout_gradient, workloads.rollout_ten, workloads.rollout_hundred):
         over_batches(make, (8192, 65536, 524288), found, keep)
-    return found
 
 
-def mjx(found: list, keep) -> list:
+def mjx(found: list, keep) -> None:
     """The MJX body, with and without floor, and plain `mjx.step`."""
     from cfb_mjx.cli import workloads
 
@@ -117,14 +113,13 @@ def mjx(found: list, keep) -> list:
         lambda n: workloads.rollout(n, "mjx-floor"),
     ):
         over_batches(make, (8192, 65536), found, keep)
-    return found
 
 
-def ppo(found: list, keep) -> list:
+def ppo(found: list, keep) -> None:
     """Updates of PPO."""
     from cfb_mjx.cli import workloads
 
-    return over_batches(workloads.ppo_update, (512, 8192), found, keep)
+    over_batches(workloads.ppo_update, (512, 8192), found, keep)
 
 
 class Reached(Exception):
@@ -140,7 +135,7 @@ TRAININGS = {
 }
 
 
-def hover(found: list, keep) -> list:
+def hover(found: list, keep) -> None:
     """Learning curves on the nominal drone: when the policy holds it within 30 mm."""
     from cfb_mjx.train.config import load_config
     from cfb_mjx.train.run import Training, train
@@ -158,10 +153,9 @@ def hover(found: list, keep) -> list:
 
         with tempfile.TemporaryDirectory() as folder, contextlib.suppress(Reached):
             train(training, Path(folder) / "out", report=report)
-    return found
 
 
-def tests(found: list, keep) -> list:
+def tests(found: list, keep) -> None:
     """What the GPU computes, beside doubles on the CPU."""
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "tests/model/test_on_gpu.py"],
@@ -173,7 +167,6 @@ def tests(found: list, keep) -> list:
     lines = done.stdout.strip().splitlines()
     print(done.stdout[-6000:], done.stderr[-500:], flush=True)
     found.append({"what": "tests/model/test_on_gpu.py", "result": lines[-1] if lines else done.stderr[-200:]})
-    return found
 
 
 SECTIONS = {f.__name__: f for f in (machine, open_loop, policy, gradient, mjx, ppo, hover, tests)}
@@ -240,8 +233,7 @@ def _hover(rows: list) -> list[str]:
     for row in rows:
         there = [point for point in row["curve"] if point["hover_mm"] < HOVER_MM]
         best = min(row["curve"], key=lambda point: point["hover_mm"])
-        for point in dict.fromkeys(map(tuple, (x.items() for x in (*there[:1], best)))):
-            at = dict(point)
+        for at in there[:1] if best in there[:1] else [*there[:1], best]:
             cells = (
                 f"{at['commands'] / 1e6:.1f} M",
                 f"{at['seconds']:.0f}",

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import equinox as eqx
@@ -36,9 +37,7 @@ def over_cores(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator
     The first goes alone, so that what it compiles is compiled once; of the rest no more are begun than there are cores.
     """
     items = iter(items)
-    for first in items:
-        yield function(first)
-        break
+    yield from map(function, islice(items, 1))
     if cores() == 1:
         yield from map(function, items)
         return

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from cfb_mjx.envs import FlipTask, Noise, TargetTask, observe, reset, step
 from cfb_mjx.envs.brax_env import EACH, BraxEnv, controller_of, wrap
 from cfb_mjx.envs.flip import FLIP_LAYOUT
+from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters import load_randomisation
 from cfb_mjx.train.brax_compat import brax_ppo
 
@@ -80,12 +82,9 @@ def test_every_episode_has_a_drone_of_its_own():
 
 
 def test_randomised_in_the_way_of_brax():
-    def heavier(drone, keys=None):
+    def heavier(drone):
         masses = jnp.array([0.03, 0.04, 0.05])
-        many = jax.tree.map(lambda x: x, drone)
-        many = _with_mass(many, masses)
-        axes = _with_mass(jax.tree.map(lambda _: None, drone), 0)
-        return many, axes
+        return _with_mass(drone, masses), _with_mass(jax.tree.map(lambda _: None, drone), 0)
 
     env = wrap(BraxEnv(TargetTask(episode_s=0.08)), 10, 1, heavier)
     states = _flown(env, 3, 12)
@@ -93,8 +92,6 @@ def test_randomised_in_the_way_of_brax():
 
 
 def _with_mass(model, mass):
-    import equinox as eqx
-
     return eqx.tree_at(lambda m: m.parameters.mass, model, mass, is_leaf=lambda x: x is None)
 
 
@@ -153,5 +150,5 @@ def test_sac_of_brax_runs_on_it():
             env, num_timesteps=128, min_replay_size=16, max_replay_size=256, batch_size=8, **SMALL
         )
     assert np.isfinite(metrics["eval/episode_reward"])
-    with pytest.raises(Exception, match="controller_of"):
+    with pytest.raises(CfbError, match="controller_of"):
         controller_of(params, FLIP_LAYOUT, normalized=False, activation="relu")

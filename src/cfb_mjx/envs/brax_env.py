@@ -11,9 +11,6 @@ Actions are 2 u - 1 in [-1, 1]. Observations are a dictionary: ``state``, what t
 
 from __future__ import annotations
 
-import contextlib
-import io
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -22,17 +19,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.control.neural import ACTIVATIONS, Network, NeuralController
-from cfb_mjx.envs.episode import Episode, Task, observe, privileged, reset, step, with_room
+from cfb_mjx.envs.episode import Episode, Task, choose, observe, privileged, reset, step, with_room
 from cfb_mjx.envs.observation import Layout
+from cfb_mjx.envs.reward import length
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.randomised import require_possible
+from cfb_mjx.quiet import quietly
 
-# Brax's physics comes along: jaxopt, which warns that it is no longer maintained, and MJX, which prints that warp is
-# missing.
-with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-    warnings.filterwarnings("ignore", category=DeprecationWarning)
+with quietly():
     from brax.envs.base import Env, State, Wrapper
     from brax.envs.wrappers import training
 
@@ -97,8 +93,7 @@ class BraxEnv(Env):
 
     def _metrics(self, episode: Episode, failed: jax.Array) -> dict[str, jax.Array]:
         """Of one command; an evaluation of Brax's adds them up over the episode."""
-        away = episode.state.position - episode.target
-        return {"distance_m": jnp.sqrt(jnp.sum(away**2)), "failed": failed}
+        return {"distance_m": length(episode.state.position - episode.target), "failed": failed}
 
     @property
     def observation_size(self) -> dict[str, int] | int:
@@ -141,12 +136,8 @@ class RedrawWrapper(Wrapper):
         waiting, redraw = info.pop("waiting"), info.pop("redraw")
         info["steps"] = jnp.where(state.done > 0, 0.0, info["steps"])
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action)
-        over = state.done > 0
-
-        def where_over(new: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(over.reshape(over.shape + (1,) * (new.ndim - over.ndim)), new, old)
-
-        episode, obs = jax.tree.map(where_over, (waiting["episode"], waiting["obs"]), (state.pipeline_state, state.obs))
+        going = state.pipeline_state, state.obs
+        episode, obs = choose(state.done > 0, (waiting["episode"], waiting["obs"]), going)
 
         def drawn(key):
             key, own = jax.vmap(jax.random.split, out_axes=1)(key)
@@ -154,8 +145,7 @@ class RedrawWrapper(Wrapper):
             return {"episode": fresh.pipeline_state, "obs": fresh.obs}, key
 
         count = redraw["count"] + 1
-        due = count % EACH == 0
-        waiting, key = jax.lax.cond(due, drawn, lambda key: (waiting, key), redraw["key"])
+        waiting, key = jax.lax.cond(count % EACH == 0, drawn, lambda key: (waiting, key), redraw["key"])
         info = {**state.info, "waiting": waiting, "redraw": {"key": key, "count": count}}
         return state.replace(pipeline_state=episode, obs=obs, info=info)
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
-import io
 from pathlib import Path
 
 import equinox as eqx
@@ -14,16 +12,16 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-with contextlib.redirect_stdout(io.StringIO()):
-    # MJX announces on standard output that its optional warp backend is missing.
-    from mujoco import mjx
-
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
 from cfb_mjx.model.effects.base import Wrench
 from cfb_mjx.model.state import Components
 from cfb_mjx.model.vector import Vec, rotate
 from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.quiet import quietly
+
+with quietly():
+    from mujoco import mjx
 
 BODY_NAME = "cfb"
 _NOT_NEEDED = (

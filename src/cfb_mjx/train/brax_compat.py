@@ -6,7 +6,6 @@ Everything here stops acting once Brax no longer needs it.
 from __future__ import annotations
 
 import contextlib
-import io
 import warnings
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -14,13 +13,12 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 
+from cfb_mjx.quiet import quietly
+
 
 def parts() -> SimpleNamespace:
     """``losses``, ``networks``, ``distribution`` and ``types`` of Brax's PPO."""
-    # Brax's physics comes along: jaxopt, which warns that it is no longer maintained, and MJX, which prints that warp
-    # is not installed.
-    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
-        warnings.filterwarnings("ignore", category=DeprecationWarning)
+    with quietly():
         from brax.training import distribution, types
         from brax.training.agents.ppo import losses, networks
     return SimpleNamespace(losses=losses, networks=networks, distribution=distribution, types=types)
@@ -33,9 +31,7 @@ def brax_ppo() -> Iterator:
     Brax 0.14.2 calls ``jax.device_put_replicated``, which jax 0.10 has removed (google/brax issue 671). While the block
     runs, jax has a function of that name again; where jax still has its own, nothing is touched.
     """
-    parts()
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=DeprecationWarning)
+    with quietly():
         from brax.training.agents.ppo import train
 
     if _has_it():
