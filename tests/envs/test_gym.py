@@ -4,13 +4,17 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
+import gymnasium
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers import vector
 
 from cfb_mjx.envs import FlipTask, Starts, TargetTask
 from cfb_mjx.envs.gym import DIVERGED, FAST, TargetEnv, TargetVectorEnv
@@ -158,8 +162,72 @@ def test_environments_without_a_seed_are_not_alike():
     assert not np.any(many[0] == many[1])
     single = [TargetEnv(SHORT).reset()[0] for _ in range(2)]
     assert not np.any(single[0] == single[1])
-    with pytest.raises(CfbError, match="one whole number"):
-        TargetVectorEnv(2, SHORT).reset(seed=[1, 2])
+
+
+@pytest.mark.parametrize("seed", [[1, 2], [1, 2, -3], -1, 2**32, 1.5, "one", True])
+def test_other_seeds_are_refused_in_a_sentence(three, seed):
+    with pytest.raises(CfbError, match=r"TargetVectorEnv: seed must be one whole number .*, or a list .*, found .*\.$"):
+        three.reset(seed=seed)
+
+
+# Half of the drones soon fail, the others' time is up after five commands.
+MIXED = replace(SHORT, randomisation=load_randomisation("paper"), starts=Starts(near=0.5, rate_radps=60.0))
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_it_flies_as_gymnasiums_own_vector_of_single_drones(mode):
+    seeds = [3, 1, 4, 1, 5]
+    ours = TargetVectorEnv(5, MIXED, autoreset_mode=mode.value)
+    theirs = SyncVectorEnv([partial(TargetEnv, MIXED)] * 5, autoreset_mode=mode)
+    numbers, ends = np.random.default_rng(0), np.zeros(5, int)
+    seen = [env.reset(seed=seeds)[0] for env in (ours, theirs)]
+    np.testing.assert_allclose(*seen, atol=1e-5)
+    np.testing.assert_array_equal(seen[0][1], seen[0][3])
+    for _ in range(25):
+        actions = numbers.uniform(-1, 1, (5, 4))
+        actions[3] = actions[1]
+        one, other = ours.step(actions), theirs.step(actions)
+        for a, b in zip(one[:4], other[:4], strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-4)
+        over = one[2] | one[3]
+        ends += over
+        assert one[4].keys() == other[4].keys()
+        if mode == AutoresetMode.SAME_STEP and over.any():
+            for i in np.flatnonzero(over):
+                np.testing.assert_allclose(one[4]["final_obs"][i], other[4]["final_obs"][i], atol=1e-4)
+        if mode == AutoresetMode.DISABLED and over.any():
+            with pytest.raises(ResetNeeded, match="episodes are over"):
+                ours.step(actions)
+            begun = [env.reset(options={"reset_mask": over.copy()})[0] for env in (ours, theirs)]
+            np.testing.assert_allclose(*begun, atol=1e-4)
+    assert ends.min() >= 4
+    assert ends.max() > ends.min()
+
+
+def test_the_first_reset_begins_all_and_a_mask_is_checked():
+    env = TargetVectorEnv(2, SHORT, autoreset_mode="Disabled")
+    with pytest.raises(ResetNeeded, match="first reset"):
+        env.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(CfbError, match="reset_mask must be 2 booleans"):
+        env.reset(options={"reset_mask": np.array([True])})
+    with pytest.raises(CfbError, match=r"autoreset_mode must be one of NextStep, .*, found 'never'"):
+        TargetVectorEnv(2, SHORT, autoreset_mode="never")
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space (min|max)imum value is")
+def test_gymnasium_makes_them_by_name_and_its_wrappers_work():
+    one = gymnasium.make("cfb_mjx/Flip-v0", model="cfb")
+    seen, _ = one.reset(seed=2)
+    assert seen.shape == (FlipTask().layout.size,)
+    many = gymnasium.make_vec("cfb_mjx/Target-v0", num_envs=3, task=SHORT, autoreset_mode="NextStep")
+    assert isinstance(many.unwrapped, TargetVectorEnv)
+    many = vector.NormalizeReward(vector.NormalizeObservation(vector.RecordEpisodeStatistics(many)))
+    many.reset(seed=0)
+    lengths = []
+    for _ in range(12):
+        *_, info = many.step(np.full((3, 4), -0.2))
+        lengths += list(info["episode"]["l"][info["_episode"]]) if "episode" in info else []
+    assert lengths == [5] * 6
 
 
 FORKED = """

@@ -1,0 +1,112 @@
+"""Train the paper's first task with Stable-Baselines3, and measure how well the policy hovers.
+
+    pip install '.[gymnasium]' stable-baselines3
+    python examples/stable_baselines3.py [--commands 6000000] [--drones 256] [--seed 0]
+
+Stable-Baselines3 has vector environments of an interface of its own, older than Gymnasium's: `Drones` is the adapter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
+
+from cfb_mjx.envs import Starts, TargetTask
+from cfb_mjx.envs.gym import TargetVectorEnv
+
+
+class Drones(VecEnv):
+    """A `TargetVectorEnv` for Stable-Baselines3."""
+
+    def __init__(self, many: TargetVectorEnv):
+        self.many, self.actions = many, None
+        super().__init__(many.num_envs, many.single_observation_space, many.single_action_space)
+
+    def reset(self) -> np.ndarray:
+        """Begin all episodes, with the seed that `seed` has left."""
+        seed = self._seeds[0]
+        self._reset_seeds()
+        return self.many.reset(seed=seed)[0]
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Keep the actions for `step_wait`."""
+        self.actions = actions
+
+    def step_wait(self):
+        """Fly them."""
+        seen, reward, failed, timed_out, info = self.many.step(self.actions)
+        infos = [{} for _ in range(self.num_envs)]
+        for i in np.flatnonzero(failed | timed_out):
+            infos[i] = {"terminal_observation": info["final_obs"][i], "TimeLimit.truncated": bool(timed_out[i])}
+        return seen, reward, failed | timed_out, infos
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.many.close()
+
+    def get_attr(self, attr_name, indices=None) -> list:
+        """The same for all drones."""
+        return [getattr(self.many, attr_name, None)] * len(list(self._get_indices(indices)))
+
+    def set_attr(self, attr_name, value, indices=None) -> None:
+        """No drone has attributes of its own."""
+        raise NotImplementedError
+
+    def env_method(self, method_name, *args, indices=None, **kwargs) -> list:
+        """No drone has methods of its own."""
+        raise NotImplementedError
+
+    def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
+        """No."""
+        return [False] * len(list(self._get_indices(indices)))
+
+
+def hover_error_m(model: PPO, seconds: float = 6.0) -> np.ndarray:
+    """Mean distance to the target after the first second, of 64 drones that begin there."""
+    task = TargetTask(starts=Starts(near=1.0), episode_s=seconds)
+    many = TargetVectorEnv(64, task)
+    seen, _ = many.reset(seed=1)
+    away = []
+    for k in range(task.episode_steps - 1):
+        seen, _, _, _, info = many.step(model.predict(seen, deterministic=True)[0])
+        if k * task.layout.control_dt_s >= 1:
+            away.append(np.linalg.norm(info["position"], axis=1))
+    return np.mean(away, axis=0)
+
+
+def main() -> None:
+    """Train and measure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--commands", type=int, default=6_000_000, help="flown in all")
+    parser.add_argument("--drones", type=int, default=256, help="flown side by side")
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    drones = VecNormalize(VecMonitor(Drones(TargetVectorEnv(arguments.drones))), norm_obs=False, gamma=0.995)
+    model = PPO(
+        "MlpPolicy",
+        drones,
+        learning_rate=lambda left: 1e-3 * max(left, 0.02),
+        n_steps=128,
+        batch_size=arguments.drones * 16,
+        n_epochs=4,
+        gamma=0.995,
+        gae_lambda=0.99,
+        max_grad_norm=1.0,
+        policy_kwargs={"net_arch": {"pi": [32] * 4, "vf": [64, 64]}, "log_std_init": -1.6},
+        seed=arguments.seed,
+        device="cpu",
+        verbose=1,
+    )
+    begin = time.time()
+    model.learn(arguments.commands, log_interval=10)
+    print(f"{model.num_timesteps / 1e6:.1f} M commands in {time.time() - begin:.0f} s")
+    error = hover_error_m(model)
+    print(f"hover error on the nominal drone: mean {1e3 * error.mean():.0f} mm, worst of 64 {1e3 * error.max():.0f} mm")
+
+
+if __name__ == "__main__":
+    main()
