@@ -1,5 +1,6 @@
 """Both algorithms, small: gradients against differences, learning, and going on after an interruption."""
 
+import csv
 from dataclasses import replace
 
 import equinox as eqx
@@ -21,7 +22,7 @@ from cfb_mjx.train.config import AnalyticSettings, load_config
 from cfb_mjx.train.flying import Hover
 from cfb_mjx.train.plants import load_plants
 from cfb_mjx.train.ppo import Ppo
-from cfb_mjx.train.run import CHECKPOINT, CURVE, POLICY, Training, segments, train
+from cfb_mjx.train.run import BEST, CHECKPOINT, CURVE, POLICY, UPDATES, Training, segments, train
 from tests.helpers import SMALL_TRAINING, watch_keys
 
 pytestmark = pytest.mark.xdist_group("training")
@@ -194,29 +195,77 @@ def test_the_learner_is_shown_no_reward_below_the_least_and_failed_drones_begin_
     np.testing.assert_array_equal(after.count[:3], config.ppo.unroll - 1)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(tmp_path, algorithm):
+# In the middle of a segment, and after its last update.
+@pytest.mark.parametrize(("algorithm", "at"), [("analytic", 3), ("ppo", 3), ("ppo", 4)])
+def test_an_interrupted_training_goes_on_from_its_last_update_to_the_same_end(tmp_path, algorithm, at):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     rows = train(small(algorithm), whole, evaluate=False)
 
     def interrupt(done, total, rate, left):
-        if done == total - 1:
+        assert total == 4
+        if done == at:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         train(small(algorithm), cut, evaluate=False, progress=interrupt)
     assert len((cut / CURVE).read_text().splitlines()) == 2
-    resumed = train(small(algorithm), cut, resume=True, evaluate=False)
+    assert run.read_about(cut / CHECKPOINT)["updates"] == at
+    flown = []
+    resumed = train(small(algorithm), cut, True, evaluate=False, log=lambda commands, metrics: flown.append(commands))
+    assert len(flown) == 4 - at
     assert (whole / POLICY).read_bytes() == (cut / POLICY).read_bytes()
+    assert (whole / UPDATES).read_text() == (cut / UPDATES).read_text()
     for a, b in zip(rows, resumed, strict=True):
         assert {k: v for k, v in a.items() if k != "seconds"} == {k: v for k, v in b.items() if k != "seconds"}
+
+
+def test_every_update_says_what_tells_how_learning_goes(tmp_path):
+    logged = []
+    train(small("ppo"), tmp_path, evaluate=False, log=lambda commands, metrics: logged.append(metrics))
+    assert {"reward", "failing", "std", "value_loss", "value_explained", "entropy", "kl", "clipped"} < set(logged[0])
+    assert all(np.isfinite(list(metrics.values())).all() for metrics in logged)
+    assert all(metrics["value_explained"] <= 1 and metrics["kl"] >= -1e-6 for metrics in logged)
+    assert all(0 <= metrics["clipped"] <= 1 for metrics in logged)
+    with open(tmp_path / UPDATES) as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["update"]) for row in rows] == [1, 2, 3, 4]
+    np.testing.assert_allclose([float(row["kl"]) for row in rows], [m["kl"] for m in logged], rtol=1e-4)
+
+
+def test_the_best_policy_is_the_one_that_randomised_drones_fly_best_with():
+    def best(*random_mm):
+        return run._is_best([{"hover_mm": 5.0 - i, "random_mm": mm} for i, mm in enumerate(random_mm)])
+
+    assert best(3.0)
+    assert best(3.0, 2.0)
+    assert not best(2.0, 3.0)
+    assert not best(2.0, 3.0, 2.5)
+    # Where most drones are lost.
+    assert not best(3.0, np.inf)
+    assert run._is_best([{"hover_mm": 3.0}, {"hover_mm": 2.0}])
+
+
+def test_the_policy_a_training_starts_from_is_left_alone_until_its_worth_is_known(tmp_path):
+    config = load_config("target", (*SMALL_TRAINING, "ppo.warm_up=2", "ppo.warm_std=0.03"))
+    task, nominal = config.build_task(), Quadrotor.from_file("cfb-guards")
+    first = NeuralController.random(jax.random.PRNGKey(1), task.layout, (8, 8))
+    for trained in (True, False):
+        ppo = Ppo(config.ppo, task, nominal, trained=trained)
+        states = [ppo.begin(jax.random.PRNGKey(0), first)]
+        np.testing.assert_allclose(jax.nn.softplus(states[0].actor.raw_std), 0.03 if trained else 0.2, rtol=1e-5)
+        for _ in range(3):
+            states.append(ppo.update(states[-1])[0])
+        same = [all(map(np.array_equal, *map(jax.tree.leaves, (s.actor, states[0].actor)))) for s in states[1:]]
+        assert same == ([True, True, False] if trained else [False] * 3)
+        valued = [all(map(np.array_equal, *map(jax.tree.leaves, (s.critic, states[0].critic)))) for s in states[1:]]
+        assert valued == [False] * 3
 
 
 def test_a_training_stopped_between_its_files_is_as_it_was_before_them(tmp_path, monkeypatch):
     before, table = {}, run._csv
 
     def stop_at_the_second(rows):
-        if len(rows) == 2:
+        if len(rows) == 4:
             before.update((path.name, path.read_bytes()) for path in tmp_path.iterdir() if path.name[0] != ".")
             raise KeyboardInterrupt
         return table(rows)
@@ -224,7 +273,7 @@ def test_a_training_stopped_between_its_files_is_as_it_was_before_them(tmp_path,
     monkeypatch.setattr(run, "_csv", stop_at_the_second)
     with pytest.raises(KeyboardInterrupt):
         train(small("analytic"), tmp_path, evaluate=False)
-    assert {POLICY, CURVE, CHECKPOINT} <= set(before)
+    assert {POLICY, BEST, CURVE, UPDATES, CHECKPOINT} <= set(before)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
     assert run.read_about(tmp_path / CHECKPOINT)["updates"] == 2
 

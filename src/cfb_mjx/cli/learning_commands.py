@@ -25,10 +25,12 @@ def train(
     coordinator: Annotated[str | None, tyro.conf.arg(metavar="HOST:PORT")] = None,
     processes: int | None = None,
     process: int | None = None,
+    tensorboard: bool = False,
 ) -> None:
     """Train a controller. Interrupt it whenever you like: --resume goes on to the same result.
 
-    Writes policy.npz (what `cfb fly` flies), curve.csv and curve.png (learning curve), config.yaml and checkpoint.npz.
+    Writes policy.npz (what `cfb fly` flies), best.npz (what was judged best on the way), curve.csv and curve.png
+    (learning curve), updates.csv (what every update measured), config.yaml and checkpoint.npz.
 
     Args:
         task: what to learn: fly to a target and hold it, or turn about the x axis at a rate that is asked for.
@@ -48,6 +50,7 @@ def train(
             within srun or mpirun.
         processes: how many they are; not with auto.
         process: which of them this is, from 0; not with auto.
+        tensorboard: write the numbers of every update and checkpoint for TensorBoard too, into the folder's events.
     """
     from cfb_mjx.cli.hosts import Hosts
     from cfb_mjx.cli.training import run_train
@@ -55,7 +58,7 @@ def train(
     hosts = Hosts.asked(coordinator, processes, process)
     choices = {"model": model, "algorithm": algorithm, "seed": seed}
     ranges = () if randomise is None else (f"randomisation.ranges={randomise}",)
-    run_train(task, config, output, (*ranges, *flat(set)), choices, start, resume, force, devices, hosts)
+    run_train(task, config, output, (*ranges, *flat(set)), choices, start, resume, force, devices, hosts, tensorboard)
 
 
 def fly(

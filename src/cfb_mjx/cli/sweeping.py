@@ -5,9 +5,8 @@ from __future__ import annotations
 import io
 import re
 import shlex
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from collections.abc import Callable
+from contextlib import redirect_stderr, redirect_stdout
 from functools import wraps
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from cfb_mjx import plugins
 from cfb_mjx.cli.runtime import Progress, say
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, require_no_file
+from cfb_mjx.interrupts import ended_by_sigterm
 from cfb_mjx.sweep import Folder, Summary, Sweep, Task, drive, load_sweep, open_folder, tasks_of
 from cfb_mjx.sweep.drive import Ended
 from cfb_mjx.sweep.folder import require_own, require_same
@@ -50,7 +50,7 @@ def run_sweep(
         return
     output_folder(output)
     require_own(output)
-    with _ended_by_sigterm(), Folder(output).driven(chosen):
+    with ended_by_sigterm(), Folder(output).driven(chosen):
         folder = open_folder(output, sweep.path.read_text(encoding="utf-8"))
         require_same(folder, tasks)
         _say_what_is_left_over(folder, tasks)
@@ -100,7 +100,7 @@ def _carry_out(
 
     needs = Needs(sweep.cpus, sweep.gpus, retries, sweep.parameters.kind.calls)
     try:
-        with opened(address, needs, folder.path) as pool, _ended_by_sigterm():
+        with opened(address, needs, folder.path) as pool, ended_by_sigterm():
             bar(done, len(tasks), f"0 failed, {len(left)} left")
             return drive(left, folder, summary, pool, main, workers, ended)
     except KeyboardInterrupt:
@@ -160,17 +160,3 @@ def _over(bar: Progress, text: str) -> None:
     """A line of its own, not at the end of the bar."""
     bar.clear()
     say(text)
-
-
-@contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    """SIGTERM, as batch systems send it, counts as Ctrl-C; entered again where Ray has put its own handler."""
-
-    def interrupt(number, frame) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 from cfb_mjx.cli.hosts import Hosts, joined
 from cfb_mjx.cli.runtime import Progress, configure_jax, differentiate_mjx, environment, say
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_no_file, together, write_json
+from cfb_mjx.interrupts import ended_by_sigterm
 
-NEWEST = "training.json"
+NEWEST, EVENTS = "training.json", "events"
 _JUDGED = (
     ("hover_mm", "hover", " mm"),
+    ("random_mm", "on randomised drones", " mm"),
     ("command_std", "command std", ""),
     ("rate_error_radps", "rate error", " rad/s"),
     ("axis_error", "axis error", ""),
@@ -29,6 +34,7 @@ def run_train(
     force: bool,
     devices: int,
     hosts: Hosts | None = None,
+    tensorboard: bool = False,
 ) -> None:
     """Train, and write policy, learning curve, configuration and checkpoint into ``output``.
 
@@ -61,17 +67,31 @@ def run_train(
             if first():
                 bar(done, total, f"{rate / 1e3:.0f} k commands/s, {_clock(left)} left")
 
-        def reported(row: dict) -> None:
+        def reported(log, row: dict) -> None:
+            log(row["commands"], {name: row[name] for name in row if name not in ("update", "commands", "seconds")})
             judged = "".join(f", {label} {row[key]:.3g}{unit}" for key, label, unit in _JUDGED if key in row)
             say(f"{_clock(row['seconds'])}: {row['commands'] / 1e6:.3g} M commands, loss {row['loss']:.3g}{judged}")
 
-        rows = train(training, output, resume, advanced, reported, devices=devices)
+        with ended_by_sigterm(), _events(output / EVENTS if tensorboard and first() else None) as log:
+            rows = train(training, output, resume, advanced, partial(reported, log), devices=devices, log=log)
         if not first():
             return
         with together():
             learning_figure(rows, output / "curve.png", f"{settings.algorithm}, {training.described.name}")
             write_json(output / NEWEST, {"environment": facts, "last": rows[-1]})
         print(f"policy: {output / POLICY}\nlearning curve: {output / 'curve.csv'}, {output / 'curve.png'}")
+
+
+@contextmanager
+def _events(folder: Path | None) -> Iterator[Callable[[int, dict], None]]:
+    """What writes numbers over commands flown for TensorBoard; without a folder nothing is written."""
+    if folder is None:
+        yield lambda commands, numbers: None
+        return
+    from tensorboardX import SummaryWriter
+
+    with SummaryWriter(str(folder)) as writer:
+        yield lambda commands, numbers: [writer.add_scalar(name, numbers[name], commands) for name in numbers]
 
 
 def _clock(seconds: float) -> str:

@@ -91,6 +91,10 @@ class PpoSettings:
     gradient_clip: float = 1.0
     first_std: float = 0.2
     """Of the Gaussian before the tanh, at the start."""
+    warm_up: int = 10
+    """Updates at first in which the value network alone learns, where a training starts from a policy (--start)."""
+    warm_std: float = 0.06
+    """In place of ``first_std`` there."""
     value_hidden: tuple[int, ...] = (64, 64)
 
     @property
@@ -243,6 +247,7 @@ _AT_LEAST = {
     "ppo.minibatches": 1,
     "ppo.epochs": 1,
     "ppo.steps": 1,
+    "ppo.warm_up": 0,
 }
 _POSITIVE = (
     "episode_s",
@@ -265,6 +270,7 @@ _POSITIVE = (
     "ppo.gradient_clip",
     "ppo.advantage_limit",
     "ppo.first_std",
+    "ppo.warm_std",
 )
 
 

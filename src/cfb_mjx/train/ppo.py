@@ -48,10 +48,21 @@ class PpoState(eqx.Module):
 
 
 class Ppo:
-    """The algorithm; see `cfb_mjx.train.algorithm.Algorithm`."""
+    """The algorithm; see `cfb_mjx.train.algorithm.Algorithm`.
 
-    def __init__(self, settings: PpoSettings, task: Task, nominal: Quadrotor, over: Devices | None = None):
+    ``trained`` says that the policy it begins with can fly: its value network has to learn first what that is worth.
+    """
+
+    def __init__(
+        self,
+        settings: PpoSettings,
+        task: Task,
+        nominal: Quadrotor,
+        over: Devices | None = None,
+        trained: bool = False,
+    ):
         self.settings, self.task, self.nominal = settings, task, nominal
+        self.warm_up, self.first_std = (settings.warm_up, settings.warm_std) if trained else (0, settings.first_std)
         self.devices = Devices.take() if over is None else over
         self.devices.require(settings.drones // settings.minibatches, "drones of a minibatch")
         self.updates = settings.updates
@@ -80,7 +91,7 @@ class Ppo:
         first = jax.tree.map(lambda x: x[0], episodes)
         inputs = self._show(first)["hidden"].shape[-1]
         critic = Network.random(of_critic, (inputs, *self.settings.value_hidden, 1), "swish")
-        raw = jnp.log(jnp.expm1(jnp.full(4, self.settings.first_std)))
+        raw = jnp.log(jnp.expm1(jnp.full(4, self.first_std)))
         actor = Actor(controller.network, raw)
         return strong(PpoState(actor, critic, self.optimizer.init((actor, critic)), episodes, key, jnp.asarray(0)))
 
@@ -97,8 +108,9 @@ class Ppo:
         show = self.devices.divided(jax.vmap(self._show), (0,), 0)
         # Every device needs what all drones saw: a batch is drawn from all of them.
         data, last = self.devices.whole((data, show(episodes)["hidden"]))
+        learning = jnp.where(state.count < self.warm_up, 0.0, 1.0)
         learnt, losses = jax.lax.scan(
-            partial(self._epoch, data, last),
+            partial(self._epoch, learning, data, last),
             (state.actor, state.critic, state.optimizer),
             jax.random.split(of_learning, self.settings.epochs),
         )
@@ -154,7 +166,7 @@ class Ppo:
 
         return jax.lax.scan(some, episodes, (of_reset, noise))
 
-    def _epoch(self, data: dict[str, Array], last: Array, learnt: tuple, key: PRNGKeyArray) -> tuple[tuple, dict]:
+    def _epoch(self, learning, data: dict[str, Array], last: Array, learnt: tuple, key: PRNGKeyArray):
         of_order, of_entropy = jax.random.split(key)
         count = self.settings.minibatches
         # Whole flights of some of the drones make a batch, of which every device takes its share.
@@ -164,14 +176,16 @@ class Ppo:
 
         def one(learnt, batch):
             actor, critic, optimizer = learnt
-            gradient, metrics = jax.grad(self._loss, has_aux=True)((actor, critic), *batch)
+            gradient, metrics = jax.grad(self._loss, has_aux=True)((actor, critic), learning, *batch)
             changes, optimizer = self.optimizer.update(gradient, optimizer)
             actor, critic = eqx.apply_updates((actor, critic), changes)
             return (actor, critic, optimizer), metrics
 
         return jax.lax.scan(one, learnt, batches)
 
-    def _loss(self, both: tuple[Actor, Network], data: dict, last: Array, key: PRNGKeyArray) -> tuple[Array, dict]:
+    def _loss(
+        self, both: tuple[Actor, Network], learning: Array | float, data: dict, last: Array, key: PRNGKeyArray
+    ) -> tuple[Array, dict]:
         logits = _logits(both[0], data["seen"])
         values = self._value(both[1], data["hidden"])
         # Anew for every batch: the value network learns from the very same flights.
@@ -187,13 +201,22 @@ class Ppo:
         most = self.settings.advantage_limit * jnp.mean(jnp.abs(advantage))
         advantage = jnp.clip(advantage, -most, most)
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
-        ratio = jnp.exp(self.distribution.log_prob(logits, data["raw"]) - data["log_prob"])
+        log_ratio = self.distribution.log_prob(logits, data["raw"]) - data["log_prob"]
+        ratio = jnp.exp(log_ratio)
         near = self.settings.clipping
         gain = jnp.mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - near, 1 + near) * advantage))
         value_loss = jnp.mean((returns - values) ** 2) / 4
         entropy = jnp.mean(self.distribution.entropy(logits, key))
-        loss = value_loss - gain - self.settings.entropy_cost * entropy
-        return loss, {"value_loss": value_loss, "loss": loss}
+        loss = value_loss - learning * (gain + self.settings.entropy_cost * entropy)
+        return loss, {
+            "loss": loss,
+            "value_loss": value_loss,
+            "value_explained": 1 - jnp.var(returns - values) / jnp.var(returns),
+            "entropy": entropy,
+            # The estimate of least variance (Schulman, Approximating KL divergence, 2020).
+            "kl": jnp.mean(ratio - 1 - log_ratio),
+            "clipped": jnp.mean(jnp.abs(ratio - 1) > near),
+        }
 
     def _value(self, critic: Network, shown: Array) -> Array:
         return self.ideal + critic(shown)[..., 0]

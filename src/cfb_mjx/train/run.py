@@ -7,7 +7,7 @@ import io
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -37,8 +37,11 @@ from cfb_mjx.train.flips import turning
 from cfb_mjx.train.flying import hover, nominal_task
 
 CHECKPOINT, POLICY, CURVE, CONFIG = "checkpoint.npz", "policy.npz", "curve.csv", "config.yaml"
-_JUDGED_ON = 64
-"""Hover flights at each point of the curve, with the noise of the task."""
+BEST, UPDATES = "best.npz", "updates.csv"
+_JUDGED_ON, _JUDGED_ON_RANDOM = 64, 256
+"""Hover flights at each point of the curve, with the noise of the task: on the nominal drone, on drones of its own."""
+_BEST_BY = ("random_mm", "hover_mm", "rate_error_radps")
+"""What the best policy has least of: the first of these that the curve has."""
 
 Row = dict[str, float]
 
@@ -46,7 +49,7 @@ Row = dict[str, float]
 class Stream(IntEnum):
     """What a training draws with its seed; each has a key of its own."""
 
-    NETWORK, LEARNING, JUDGING = range(3)
+    NETWORK, LEARNING, JUDGING, JUDGING_RANDOM = range(4)
 
     def key(self, seed: int) -> PRNGKeyArray:
         """Of a training with this seed."""
@@ -140,8 +143,12 @@ def train(
     report: Callable[[Row], None] = lambda row: None,
     evaluate: bool = True,
     devices: int = 1,
+    log: Callable[[int, Row], None] = lambda commands, metrics: None,
 ) -> list[Row]:
-    """Train, writing ``policy.npz``, ``curve.csv``, ``config.yaml`` and ``checkpoint.npz`` into ``output``.
+    """Train, writing ``policy.npz``, ``best.npz``, ``curve.csv``, ``updates.csv``, ``config.yaml`` and
+    ``checkpoint.npz`` into ``output``.
+
+    What is interrupted (KeyboardInterrupt) keeps the state of the last update, and goes on from there.
 
     Args:
         training: what to do.
@@ -152,6 +159,7 @@ def train(
         evaluate: fly the hover test at every checkpoint.
         devices: of this process over which the drones are spread; where several processes run as one
             (`cfb_mjx.hosts`), of each of them. Then the first alone reads and writes files, and reports.
+        log: called after every update with the commands flown so far and its metrics.
 
     Returns:
         The learning curve, one row per checkpoint.
@@ -166,45 +174,77 @@ def train(
     over, nominal = Devices.take(devices), training.nominal()
     task = training.config.build_task()
     task.hold(nominal)
-    algorithm = build(training.config, task, nominal, over)
+    algorithm = build(training.config, task, nominal, over, training.start is not None)
     state = algorithm.begin(Stream.LEARNING.key(training.config.seed), training.first_controller(nominal))
-    done, seconds, rows = 0, 0.0, []
+    done, seconds, rows, metrics = 0, 0.0, [], {}
     if about is not None:
         state = _loaded(checkpoint, state)
-        done, seconds, rows = about["updates"], about["seconds"], about["rows"]
+        done, seconds, rows, metrics = about["updates"], about["seconds"], about["rows"], about.get("metrics", {})
     state = spread(as_first(state), over)
+    updates = _logged(output / UPDATES, done) if first() else []
     if first():
         write_text(output / CONFIG, yaml.safe_dump(training.config.to_mapping(), sort_keys=False))
+
+    def kept() -> dict[str, Any]:
+        return training.identity() | {"updates": done, "seconds": seconds, "rows": rows, "metrics": metrics}
+
     for end in segments(algorithm.updates, training.config.checkpoints):
-        if end <= done:
+        if rows and end <= rows[-1]["update"]:
             continue
-        metrics, spent = {}, 0.0
-        for update in range(done, end):
-            started = time.perf_counter()
-            state, metrics = algorithm.update(state)
-            jax.block_until_ready(metrics)
-            spent += time.perf_counter() - started
-            pace = spent / (update + 1 - done)
-            left = pace * (algorithm.updates - update - 1)
-            progress(update + 1, algorithm.updates, algorithm.steps_per_update / pace, left)
-        done, seconds = end, seconds + spent
-        row = {"update": done, "commands": done * algorithm.steps_per_update, "seconds": round(seconds, 2)}
-        row |= {name: float(value) for name, value in metrics.items()}
+        begun, spent = done, 0.0
+        try:
+            for update in range(done, end):
+                started = time.perf_counter()
+                after, found = algorithm.update(state)
+                found = {name: float(value) for name, value in jax.block_until_ready(found).items()}
+                spent += time.perf_counter() - started
+                state, metrics, done = after, found, update + 1
+                flown = done * algorithm.steps_per_update
+                if first():
+                    updates.append({"update": done, "commands": flown} | metrics)
+                    log(flown, metrics)
+                pace = spent / (done - begun)
+                progress(done, algorithm.updates, algorithm.steps_per_update / pace, pace * (algorithm.updates - done))
+        except KeyboardInterrupt:
+            # Of several processes others may be in the middle of an update: there the last checkpoint counts.
+            if jax.process_count() == 1 and done > begun:
+                seconds += spent
+                with together():
+                    save_checkpoint(checkpoint, over.here(state), kept())
+                    write_text(output / UPDATES, _csv(updates))
+            raise
+        seconds += spent
+        row = {"update": done, "commands": done * algorithm.steps_per_update, "seconds": round(seconds, 2), **metrics}
         whole = over.here(state)
         controller = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, algorithm.controller(whole))
         if not all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(eqx.filter(controller, eqx.is_inexact_array))):
             raise CfbError(_diverged(output, done, rows))
         if first():
             row |= _judged(controller, training, task, nominal) if evaluate else {}
-            about = {"updates": done, "seconds": seconds, "rows": [*rows, row]}
+        rows = [*rows, row]
+        if first():
             with together():
                 # The first is never missing: from it an interrupted training goes on.
-                save_checkpoint(checkpoint, whole, training.identity() | about)
+                save_checkpoint(checkpoint, whole, kept())
                 save_policy(training.policy(controller), output / POLICY)
-                write_text(output / CURVE, _csv([*rows, row]))
+                if _is_best(rows):
+                    save_policy(training.policy(controller), output / BEST)
+                write_text(output / UPDATES, _csv(updates))
+                write_text(output / CURVE, _csv(rows))
             report(row)
-        rows.append(row)
     return rows
+
+
+def _is_best(rows: list[Row]) -> bool:
+    """Whether no earlier policy was judged as good as the last one."""
+    by = next((name for name in _BEST_BY if name in rows[-1]), None)
+    return by is None or all(not rows[-1][by] >= row[by] for row in rows[:-1])
+
+
+def _logged(path: Path, done: int) -> list[dict]:
+    """What the file holds of the first ``done`` updates."""
+    rows = list(csv.DictReader(path.read_text().splitlines())) if done and path.is_file() else []
+    return [row for row in rows if int(row["update"]) <= done]
 
 
 def _diverged(output: Path, done: int, rows: list[dict]) -> str:
@@ -215,12 +255,15 @@ def _diverged(output: Path, done: int, rows: list[dict]) -> str:
     )
 
 
-def build(config: TrainingConfig, task, nominal: Quadrotor, over: Devices | None = None) -> Algorithm:
-    """The algorithm of a configuration, over these devices (one by default)."""
+def build(
+    config: TrainingConfig, task, nominal: Quadrotor, over: Devices | None = None, trained: bool = False
+) -> Algorithm:
+    """The algorithm of a configuration, over these devices (one by default); ``trained``: it begins with a policy that
+    can fly."""
     if config.algorithm == "ppo":
         from cfb_mjx.train.ppo import Ppo
 
-        return Ppo(config.ppo, task, nominal, over)
+        return Ppo(config.ppo, task, nominal, over, trained)
     from cfb_mjx.train.analytic import Analytic
 
     return Analytic(config.analytic, task, nominal, over)
@@ -288,11 +331,18 @@ def _judged(controller: NeuralController, training: Training, task, nominal: Qua
         measured = turning(controller, nominal_task(task), nominal, keys)
         return {name: float(jnp.mean(value)) for name, value in measured._asdict().items()}
     measured, _ = hover(controller, nominal_task(task), nominal, keys)
-    return {
+    row = {
         "hover_mm": 1e3 * float(jnp.mean(measured.mean_distance_m)),
         "command_std": float(jnp.mean(measured.command_std)),
         "hover_failed": float(jnp.mean(measured.failed)),
     }
+    if task.randomisation is None:
+        return row
+    # All of the ranges, however mild some of the drones are that it learns on.
+    keys = jax.random.split(Stream.JUDGING_RANDOM.key(training.config.seed), _JUDGED_ON_RANDOM)
+    measured, _ = hover(controller, replace(task, graded=0.0), nominal, keys)
+    distance = jnp.where(measured.failed, jnp.inf, measured.mean_distance_m)
+    return row | {"random_mm": 1e3 * float(jnp.median(distance)), "random_failed": float(jnp.mean(measured.failed))}
 
 
 def _csv(rows: list[Row]) -> str:
