@@ -261,6 +261,26 @@ def test_the_policy_a_training_starts_from_is_left_alone_until_its_worth_is_know
         assert valued == [False] * 3
 
 
+def test_the_policy_goes_no_further_in_an_update_than_it_may():
+    sizes = ("ppo.drones=64", "ppo.epochs=4", "ppo.learning_rate=0.03", "ppo.steps=100000", "ppo.warm_up=3")
+    task = load_config("target", SMALL_TRAINING).build_task()
+    first = NeuralController.random(jax.random.PRNGKey(1), task.layout, (8, 8))
+    # As one that holds a drone to the centimetre: what it does changes a lot with its weights.
+    first = jax.tree.map(lambda w: 3 * w, first)
+    furthest = {}
+    for most in (0.0, 0.01):
+        config = load_config("target", (*SMALL_TRAINING, *sizes, f"ppo.largest_kl={most}"))
+        ppo = Ppo(config.ppo, task, Quadrotor.from_file("cfb-guards"), trained=True)
+        state, kl = ppo.begin(jax.random.PRNGKey(0), first), []
+        for _ in range(10):
+            state, metrics = ppo.update(state)
+            kl.append(float(metrics["kl"]))
+        furthest[most] = max(kl)
+    assert furthest[0.0] > 0.5
+    # Mean over an update, none of whose steps begins beyond twice as much.
+    assert 0.001 < furthest[0.01] < 0.02
+
+
 def test_a_training_stopped_between_its_files_is_as_it_was_before_them(tmp_path, monkeypatch):
     before, table = {}, run._csv
 

@@ -91,6 +91,10 @@ class PpoSettings:
     gradient_clip: float = 1.0
     first_std: float = 0.2
     """Of the Gaussian before the tanh, at the start."""
+    largest_kl: float = 0.02
+    """Between the policies before and after an update: the policy's learning rate is lowered to stay below it. 0: it is
+    not. A policy that holds a drone to the centimetre changes a hundred times as much with its weights as a first one.
+    """
     warm_up: int = 10
     """Updates at first in which the value network alone learns, where a training starts from a policy (--start)."""
     warm_std: float = 0.06
@@ -248,6 +252,7 @@ _AT_LEAST = {
     "ppo.epochs": 1,
     "ppo.steps": 1,
     "ppo.warm_up": 0,
+    "ppo.largest_kl": 0,
 }
 _POSITIVE = (
     "episode_s",

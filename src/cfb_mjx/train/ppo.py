@@ -26,6 +26,9 @@ from cfb_mjx.train.algorithm import in_progress, strong
 from cfb_mjx.train.brax_compat import parts
 from cfb_mjx.train.config import PpoSettings
 
+LEAST_RATE = 1e-3
+"""Of the policy's learning rate that is left where the policy changes too much with its weights."""
+
 
 class Actor(eqx.Module):
     """The policy: Gaussian about the network's output, then tanh."""
@@ -41,6 +44,8 @@ class PpoState(eqx.Module):
     actor: Actor
     critic: Network
     optimizer: Any
+    rate: Float[Array, ""]
+    """Factor on the policy's learning rate that keeps the KL divergence of an update small."""
     episodes: Episode
     """One per drone."""
     key: PRNGKeyArray
@@ -63,6 +68,7 @@ class Ppo:
     ):
         self.settings, self.task, self.nominal = settings, task, nominal
         self.warm_up, self.first_std = (settings.warm_up, settings.warm_std) if trained else (0, settings.first_std)
+        self.first_rate = LEAST_RATE if trained else 1.0
         self.devices = Devices.take() if over is None else over
         self.devices.require(settings.drones // settings.minibatches, "drones of a minibatch")
         self.updates = settings.updates
@@ -93,7 +99,8 @@ class Ppo:
         critic = Network.random(of_critic, (inputs, *self.settings.value_hidden, 1), "swish")
         raw = jnp.log(jnp.expm1(jnp.full(4, self.first_std)))
         actor = Actor(controller.network, raw)
-        return strong(PpoState(actor, critic, self.optimizer.init((actor, critic)), episodes, key, jnp.asarray(0)))
+        optimizer, rate = self.optimizer.init((actor, critic)), jnp.asarray(self.first_rate, raw.dtype)
+        return strong(PpoState(actor, critic, optimizer, rate, episodes, key, jnp.asarray(0)))
 
     def controller(self, state: PpoState) -> NeuralController:
         """The mean of the policy."""
@@ -111,13 +118,14 @@ class Ppo:
         learning = jnp.where(state.count < self.warm_up, 0.0, 1.0)
         learnt, losses = jax.lax.scan(
             partial(self._epoch, learning, data, last),
-            (state.actor, state.critic, state.optimizer),
+            (state.actor, state.critic, state.optimizer, state.rate),
             jax.random.split(of_learning, self.settings.epochs),
         )
         metrics = {
             "reward": jnp.mean(outcome.reward),
             "failing": jnp.mean(outcome.failed),
             "std": jnp.mean(jax.nn.softplus(learnt[0].raw_std)),
+            "rate": learnt[3],
             **jax.tree.map(jnp.mean, losses),
         }
         return PpoState(*learnt, episodes, key, state.count + 1), metrics
@@ -175,11 +183,18 @@ class Ppo:
         batches = batches, self.devices.along(last[order], 1), jax.random.split(of_entropy, count)
 
         def one(learnt, batch):
-            actor, critic, optimizer = learnt
+            actor, critic, optimizer, rate = learnt
             gradient, metrics = jax.grad(self._loss, has_aux=True)((actor, critic), learning, *batch)
             changes, optimizer = self.optimizer.update(gradient, optimizer)
+            if most := self.settings.largest_kl:
+                # How far the steps before this one have led.
+                kl = metrics["kl"]
+                step = jnp.where(kl > 2 * most, 0.0, rate)
+                changes = jax.tree.map(lambda x: step * x, changes[0]), changes[1]
+                factor = jnp.where(kl > most, 1 / 1.5, jnp.where(kl < most / 4, 1.5, 1.0))
+                rate = jnp.where(learning > 0, jnp.clip(rate * factor, LEAST_RATE, 1.0), rate)
             actor, critic = eqx.apply_updates((actor, critic), changes)
-            return (actor, critic, optimizer), metrics
+            return (actor, critic, optimizer, rate), metrics
 
         return jax.lax.scan(one, learnt, batches)
 
