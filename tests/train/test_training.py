@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.control.policy_file import load_policy
+from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, rollout_final
@@ -279,6 +279,25 @@ def test_the_policy_goes_no_further_in_an_update_than_it_may():
     assert furthest[0.0] > 0.5
     # Mean over an update, none of whose steps begins beyond twice as much.
     assert 0.001 < furthest[0.01] < 0.02
+
+
+@pytest.mark.long
+def test_ppo_keeps_what_the_shipped_policy_can_do():
+    with jax.enable_x64(False):
+        training = Training.prepare(load_config("target"), {}, shipped_policies()["target"])
+        nominal, task = training.nominal(), training.config.build_task()
+        ppo = run.build(training.config, task, nominal, None, True)
+        state = ppo.begin(jax.random.PRNGKey(0), training.first_controller(nominal))
+        before = run._judged(ppo.controller(state), training, task, nominal)
+        for update in range(20):
+            state, _ = ppo.update(state)
+            after = run._judged(ppo.controller(state), training, task, nominal)
+            most = 1.2 if update < 10 else 1.5
+            assert after["hover_mm"] < most * before["hover_mm"]
+            assert after["random_mm"] < 1.2 * before["random_mm"]
+            assert after["hover_failed"] == after["random_failed"] == 0
+    # That it is let go at all.
+    assert after["hover_mm"] != before["hover_mm"]
 
 
 def test_a_training_stopped_between_its_files_is_as_it_was_before_them(tmp_path, monkeypatch):

@@ -121,14 +121,18 @@ class Ppo:
             (state.actor, state.critic, state.optimizer, state.rate),
             jax.random.split(of_learning, self.settings.epochs),
         )
+        (*learnt, rate), losses = learnt, jax.tree.map(jnp.mean, losses)
+        # It falls within an update, and rises from one to the next: the first batches of each have no divergence yet.
+        calm = (learning > 0) & (losses["kl"] < self.settings.largest_kl / 4)
+        rate = jnp.minimum(jnp.where(calm, 1.5 * rate, rate), 1.0)
         metrics = {
             "reward": jnp.mean(outcome.reward),
             "failing": jnp.mean(outcome.failed),
             "std": jnp.mean(jax.nn.softplus(learnt[0].raw_std)),
-            "rate": learnt[3],
-            **jax.tree.map(jnp.mean, losses),
+            "rate": rate,
+            **losses,
         }
-        return PpoState(*learnt, episodes, key, state.count + 1), metrics
+        return PpoState(*learnt, rate, episodes, key, state.count + 1), metrics
 
     def _collect(self, actor: Actor, episodes: Episode, key: PRNGKeyArray):
         """Fly ``unroll`` commands with every drone; data has axes (unroll, drones)."""
@@ -191,8 +195,7 @@ class Ppo:
                 kl = metrics["kl"]
                 step = jnp.where(kl > 2 * most, 0.0, rate)
                 changes = jax.tree.map(lambda x: step * x, changes[0]), changes[1]
-                factor = jnp.where(kl > most, 1 / 1.5, jnp.where(kl < most / 4, 1.5, 1.0))
-                rate = jnp.where(learning > 0, jnp.clip(rate * factor, LEAST_RATE, 1.0), rate)
+                rate = jnp.maximum(jnp.where(kl > most, rate / 1.5, rate), LEAST_RATE)
             actor, critic = eqx.apply_updates((actor, critic), changes)
             return (actor, critic, optimizer, rate), metrics
 

@@ -1,7 +1,7 @@
 """Train the paper's first task with Stable-Baselines3, and measure how well the policy hovers.
 
     pip install '.[gymnasium]' stable-baselines3
-    python examples/stable_baselines3.py [--commands 6000000] [--drones 256] [--seed 0]
+    python examples/train_with_sb3.py [--commands 6000000] [--drones 256] [--seed 0]
 
 Stable-Baselines3 has vector environments of an interface of its own, older than Gymnasium's: `Drones` is the adapter.
 """
