@@ -40,7 +40,9 @@ def test_a_training_leaves_what_it_says(trained):
     folder, done = trained
     assert {p.name for p in folder.iterdir()} == {
         "policy.npz",
+        "best.npz",
         "curve.csv",
+        "updates.csv",
         "curve.png",
         "config.yaml",
         "checkpoint.npz",
