@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from math import isfinite
 from pathlib import Path
 
 from cfb_mjx.cli.hosts import Hosts, joined
@@ -69,7 +70,11 @@ def run_train(
 
         def reported(log, row: dict) -> None:
             log(row["commands"], {name: row[name] for name in row if name not in ("update", "commands", "seconds")})
-            judged = "".join(f", {label} {row[key]:.3g}{unit}" for key, label, unit in _JUDGED if key in row)
+            judged = "".join(
+                f", {label} {row[key]:.3g}{unit}" if isfinite(row[key]) else f", {label} most lost"
+                for key, label, unit in _JUDGED
+                if key in row
+            )
             say(f"{_clock(row['seconds'])}: {row['commands'] / 1e6:.3g} M commands, loss {row['loss']:.3g}{judged}")
 
         with ended_by_sigterm(), _events(output / EVENTS if tensorboard and first() else None) as log:
@@ -91,7 +96,14 @@ def _events(folder: Path | None) -> Iterator[Callable[[int, dict], None]]:
     from tensorboardX import SummaryWriter
 
     with SummaryWriter(str(folder)) as writer:
-        yield lambda commands, numbers: [writer.add_scalar(name, numbers[name], commands) for name in numbers]
+
+        def log(commands: int, numbers: dict) -> None:
+            for name, number in numbers.items():
+                # Where most drones are lost their median error is infinite: nothing to draw.
+                if isfinite(number):
+                    writer.add_scalar(name, number, commands)
+
+        yield log
 
 
 def _clock(seconds: float) -> str:
