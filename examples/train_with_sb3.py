@@ -66,7 +66,7 @@ class Drones(VecEnv):
 
 
 def hover_error_m(model: PPO, seconds: float = 6.0) -> np.ndarray:
-    """Mean distance to the target after the first second, of 64 drones that begin there."""
+    """Mean distance to the target after the first second, of 64 drones that begin within 0.7 m of it."""
     task = TargetTask(starts=Starts(near=1.0), episode_s=seconds)
     many = TargetVectorEnv(64, task)
     seen, _ = many.reset(seed=1)

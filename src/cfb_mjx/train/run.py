@@ -223,12 +223,13 @@ def train(
             row |= _judged(controller, training, task, nominal) if evaluate else {}
         rows = [*rows, row]
         if first():
+            policy = training.policy(controller)
             with together():
                 # The first is never missing: from it an interrupted training goes on.
                 save_checkpoint(checkpoint, whole, kept())
-                save_policy(training.policy(controller), output / POLICY)
+                save_policy(policy, output / POLICY)
                 if _is_best(rows):
-                    save_policy(training.policy(controller), output / BEST)
+                    save_policy(policy, output / BEST)
                 write_text(output / UPDATES, _csv(updates))
                 write_text(output / CURVE, _csv(rows))
             report(row)
