@@ -194,7 +194,8 @@ class Ppo:
                 # How far the steps before this one have led.
                 kl = metrics["kl"]
                 step = jnp.where(kl > 2 * most, 0.0, rate)
-                changes = jax.tree.map(lambda x: step * x, changes[0]), changes[1]
+                # A policy from a file may be of another precision than its spread and this factor.
+                changes = jax.tree.map(lambda x: step.astype(x.dtype) * x, changes[0]), changes[1]
                 rate = jnp.maximum(jnp.where(kl > most, rate / 1.5, rate), LEAST_RATE)
             actor, critic = eqx.apply_updates((actor, critic), changes)
             return (actor, critic, optimizer, rate), metrics
