@@ -9,13 +9,14 @@ import pytest
 
 from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.parameters import load_model_file, save_model_file
+from cfb_mjx.parameters import Entry, load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.refinement.numbers import PLANT
 from cfb_mjx.sysid.sensor_faults import HEALTHY
 from cfb_mjx.sysid.tracing import closing
 from cfb_mjx.sysid.tracing.fits import beside_hold
 from cfb_mjx.sysid.tracing.hypothesis import Fit
+from cfb_mjx.sysid.tracing.motors import MOTORS, motors_of
 from cfb_mjx.sysid.tracing.rules import Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
@@ -67,10 +68,40 @@ def test_parts_come_in_the_order_of_what_they_buy_and_stand_on_other_flights(cam
     assert paired(after, after)[0] == 0.0
 
 
-def test_motors_come_from_their_own_rotor_speeds(campaign, whole):
-    assert {"motor_gain", "motor_speed_offset", "motor_time_constant"} <= set(whole.motors)
-    assert all(np.all(entry.std > 0) for entry in whole.motors.values())
-    assert not {"motor_gain_mismatch", "motor_time_constant"} & {part.name for part in whole.parts}
+def test_motors_that_are_as_declared_stay_so(whole):
+    assert not whole.motors
+    assert not set(MOTORS) & {part.name for part in whole.parts}
+
+
+@pytest.fixture(scope="module")
+def other_motors():
+    """A drone of motors with several faults, on which rotor speeds were measured."""
+    case = Case("motors", 9022, (("motor_gain_mismatch", 0.8), ("motor_asymmetry", 0.7), *((n, 1.5) for n in LACKS)))
+    return fly_campaigns([case], duration_scale=0.35)[0]
+
+
+def test_effects_of_the_motors_are_named_from_rotor_speeds_alone(other_motors):
+    found = motors_of(other_motors.fit, GUARDS, _search(other_motors))
+    assert not found.entries
+    told = {type(each.effect).name: each for each in found.effects}
+    assert set(told) >= {"motor_gain_mismatch", "motor_asymmetry"}
+    truth = other_motors.truth["effects"]["motor_gain_mismatch"]
+    np.testing.assert_allclose(told["motor_gain_mismatch"].effect.relative, np.array(truth["ratio"]) - 1, atol=0.004)
+    assert all(each.t > 8 for each in told.values() if type(each.effect).name.startswith("motor_"))
+
+
+def test_motors_of_another_kind_get_constants_of_their_own(campaign):
+    """No effect of the catalogue makes an offset of the steady speed."""
+    entries = dict(GUARDS.entries)
+    gain = entries["motor_gain"]
+    entries["motor_gain"] = replace(gain, value=0.8 * np.asarray(gain.value))
+    entries["motor_speed_offset"] = Entry(np.full(4, 400.0), "of other motors")
+    base = replace(GUARDS, entries=entries)
+    found = motors_of(campaign.fit, base, replace(_search(campaign), parameters=base.parameters()))
+    assert {"motor_gain", "motor_speed_offset", "motor_time_constant"} <= set(found.entries)
+    assert all(np.all(entry.std > 0) for entry in found.entries.values())
+    np.testing.assert_allclose(found.entries["motor_gain"].value, gain.value, rtol=0.02)
+    assert not {"motor_gain_mismatch", "motor_time_constant"} & {type(each.effect).name for each in found.effects}
 
 
 def test_effects_that_the_model_declares_stay_as_they_are():
@@ -80,6 +111,7 @@ def test_effects_that_the_model_declares_stay_as_they_are():
     assert set(PLANT) - set(known) == {"blade_flapping", "thrust_scale"}
     told = names_to_fit(GUARDS, motors_told=True)
     assert set(PLANT) - set(told) == {"command_delay", "motor_asymmetry", "battery_sag"}
+    assert set(PLANT) & set(MOTORS) == {"command_delay", "motor_asymmetry", "battery_sag"}
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +143,7 @@ def test_effects_are_reported_in_the_order_of_what_they_buy(campaign, closed):
     buys = [effect["buys"] for effect in found["effects"]]
     assert buys == sorted(buys, reverse=True)
     assert not found["unexplained"]
-    assert set(found["motors"]) == {"motor_gain", "motor_speed_offset", "motor_time_constant"}
+    assert "motors" not in found
     told = {part.name for part in closed.together.parts if part.told}
     for effect in found["effects"]:
         assert ("innovations" in effect) == (effect["name"] not in told)

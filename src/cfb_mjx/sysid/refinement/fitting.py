@@ -120,6 +120,10 @@ class Refinement:
         """What another model leaves of the same predictions, each flight with the trim that was found."""
         return self._left(model, self._trims)[0]
 
+    def loss(self, model: Quadrotor) -> float:
+        """Mean loss of the same predictions by another model, likewise."""
+        return self._left(model, self._trims)[1]
+
     @property
     def _trims(self) -> np.ndarray:
         return np.array(list(self.trims.values()))

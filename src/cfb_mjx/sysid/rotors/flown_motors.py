@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,21 +22,25 @@ class Told:
     """An effect of the motors.
 
     Attributes:
-        effect: with its number.
-        number: that number's name.
-        std: its standard deviation.
-        at_bound: whether it stands at the end of what is plausible.
+        effect: with its numbers.
+        std: their standard deviations, by field.
+        t: how surely it is there: standard normal where it is not.
+        at_bound: names of numbers that stand at the end of what is plausible.
+        without: the other effects of the motors, moved to make up for it; None where they stay as they are.
     """
 
     effect: Effect
-    number: str
-    std: float
-    at_bound: bool
+    std: dict[str, Any]
+    t: float
+    at_bound: tuple[str, ...] = ()
+    without: tuple[Effect, ...] | None = None
 
-    @property
-    def t(self) -> float:
-        """Standard deviations that the number is away from nothing."""
-        return float(getattr(self.effect, self.number)) / self.std
+    @classmethod
+    def of(cls, effect: Effect, number: str, std: float) -> Told:
+        """An effect of one number, beside constants that were fitted with it."""
+        value = float(getattr(effect, number))
+        at = (f"{effect.name}.{number}",) if value in effect.prior[number] else ()
+        return cls(effect, {number: std}, value / std, at)
 
 
 @dataclass(frozen=True)
@@ -45,10 +50,12 @@ class Motors:
     Attributes:
         entries: of a model file.
         effects: of the motors.
+        known: whether rotor speeds were measured.
     """
 
     entries: dict[str, Entry] = field(default_factory=dict)
     effects: tuple[Told, ...] = ()
+    known: bool = False
 
 
 def flown_motors(logs: Sequence[FlightLog], nominal: Parameters, rows: int, piece: float) -> Motors:
@@ -79,12 +86,13 @@ def flown_motors(logs: Sequence[FlightLog], nominal: Parameters, rows: int, piec
         most = CommandDelay.prior["delay"][1]
         delay, std = float(min(best.value(late), most)), best.std(late)
         if delay > SURE * std:
-            effects.append(Told(CommandDelay(delay), "delay", std, delay == most))
+            effects.append(Told.of(CommandDelay(delay), "delay", std))
     if sag is not None:
         effect = BatterySag(level=0.0, slope=sag.slope, lag=sag.lag)
-        effects.append(Told(effect, "slope", sag.std, sag.slope == BatterySag.prior["slope"][1]))
+        effects.append(Told.of(effect, "slope", sag.std))
     source = f"fitted to the rotor speeds of {len(records)} flights"
-    return Motors({name: Entry(v[0], source, v[1]) for name, v in values.items() if v is not None}, tuple(effects))
+    entries = {name: Entry(v[0], source, v[1]) for name, v in values.items() if v is not None}
+    return Motors(entries, tuple(effects), True)
 
 
 def _middle(log: FlightLog, rows: int) -> MotorRecord:

@@ -199,14 +199,21 @@ FIRST = np.log(np.array([0.1] * 3 + [0.02] * 3 + [10.0] + [0.5] * 3 + [0.1] * 3 
 
 
 @eqx.filter_jit
-def _loss(vector, noise, blocks: Blocks):
+def surprise(vector, noise, blocks: Blocks) -> tuple[Array, Array]:
+    """Negative log-likelihood of a residual at noise levels, nats, and the number of readings that count."""
     wide = jax.tree.map(lambda x: x[..., None], blocks.signals)
     e, logs, use = innovations(Blocks(wide, blocks.interval, blocks.valid), levels_from(vector, noise))
     # Very long tails (a gust, a glitch) must not set the level of everything.
     size = jnp.abs(e[..., 0])
-    surprise = jnp.where(size < 4, size**2, 8 * size - 16)
+    squares = jnp.where(size < 4, size**2, 8 * size - 16)
+    return 0.5 * jnp.sum(logs + squares * use), jnp.sum(use)
+
+
+@eqx.filter_jit
+def _loss(vector, noise, blocks: Blocks):
+    nats, count = surprise(vector, noise, blocks)
     prior = 0.05 * jnp.sum((vector - FIRST) ** 2)
-    return (0.5 * jnp.sum(logs + surprise * use) + prior) / jnp.maximum(jnp.sum(use), 1.0)
+    return (nats + prior) / jnp.maximum(count, 1.0)
 
 
 _slope = eqx.filter_jit(jax.value_and_grad(_loss))

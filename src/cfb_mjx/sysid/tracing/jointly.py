@@ -79,29 +79,53 @@ def everything(search: Search, say: Callable[[str], None] = lambda _: None) -> F
         search: over the flights.
         say: told what happens.
     """
-    fit = as_it_is(search, search.learned(search.nothing()))
+    fits = [as_it_is(search, search.learned(search.nothing()), whole=False)]
+
+    def better(richer: Hypothesis) -> bool:
+        fits.append(as_it_is(search, richer, whole=False))
+        return _total(fits[-1]) < _total(fits[-2])
+
+    hypothesis, linear = look_by_look(search, fits[0].hypothesis, better=better, say=say)
+    return replace(next(fit for fit in fits if fit.hypothesis is hypothesis), linear=linear)
+
+
+def look_by_look(
+    search: Search,
+    hypothesis: Hypothesis,
+    never: Collection[str] = (),
+    lead_free: bool = True,
+    better: Callable[[Hypothesis], bool] = lambda _: True,
+    say: Callable[[str], None] = lambda _: None,
+) -> tuple[Hypothesis, Linear]:
+    """A hypothesis with all effects that the innovations ask for, and its derivatives by the whole catalogue.
+
+    Args:
+        search: over the flights.
+        hypothesis: to begin with, with the noise levels of what it leaves.
+        never: effects to pass over.
+        lead_free: fit the lead of the commands too; else it stays as it is.
+        better: whether what a look came to is to stay.
+        say: told what happens.
+    """
     # Late motor columns look like every lag at once: only beside the motors' own lags can they be told.
-    refused, seen = {SHIFT}, {frozenset(fit.hypothesis.present)}
+    linear, refused, seen = search.whole(hypothesis), {SHIFT, *never}, {frozenset(hypothesis.present)}
     for _ in range(search.rules.looks):
-        chosen = beside_each_other(search, fit.hypothesis, fit.linear, refused)
-        refused, richer = set(), None
+        chosen = beside_each_other(search, hypothesis, linear, refused)
+        refused, richer = set(never), None
         while chosen and richer is None:
-            more, there = [each.name for each in chosen], fit.hypothesis.present
+            more, there = [each.name for each in chosen], hypothesis.present
             say(f"fitting {', '.join(more)} beside {', '.join(there) or 'nothing'}")
             with np.errstate(over="ignore", invalid="ignore"):
-                richer = _with(search, fit.hypothesis, fit.linear, chosen)
-                gain = confirm(search, fit.hypothesis, richer).gain
+                richer = _with(search, hypothesis, linear, chosen, lead_free)
+                gain = confirm(search, hypothesis, richer).gain
             if not gain > 0:
                 # Too far for slopes, if not beyond all numbers: those that matter most first.
                 richer, chosen = None, chosen[: len(chosen) // 2]
-        if richer is None or frozenset(richer.present) in seen:
+        if richer is None or frozenset(richer.present) in seen or not better(richer):
             break
-        richer = as_it_is(search, richer)
-        if not _total(richer) < _total(fit):
-            break
-        fit = richer
-        seen.add(frozenset(fit.hypothesis.present))
-    return fit
+        hypothesis, linear = richer, search.whole(richer)
+        seen.add(frozenset(hypothesis.present))
+    return hypothesis, linear
 
 
 def borne_out(search: Search, fit: Fit, say: Callable[[str], None] = lambda _: None) -> Fit:
@@ -162,7 +186,7 @@ def needless(search: Search, hypothesis: Hypothesis) -> dict[str, Evidence]:
         gone[least] = doubted[least]
 
 
-def _with(search: Search, hypothesis: Hypothesis, linear: Linear, chosen: list[Chosen]) -> Hypothesis:
+def _with(search: Search, hypothesis: Hypothesis, linear: Linear, chosen: list[Chosen], lead_free: bool) -> Hypothesis:
     """The hypothesis with more effects, all fitted, less what the fit shows to be needless."""
     own = search.own_columns(hypothesis)
     columns = [column for each in chosen for column in each.variant]
@@ -172,11 +196,11 @@ def _with(search: Search, hypothesis: Hypothesis, linear: Linear, chosen: list[C
     for each in chosen:
         start = replace(each.found, values=np.array([next(values) for _ in each.variant]))
         hypothesis = search.with_candidate(hypothesis, each.variant, start)
-    hypothesis = search.settled(hypothesis, search.rules.look_steps, shrunk=True)
+    hypothesis = search.settled(hypothesis, search.rules.look_steps, lead_free, shrunk=True)
     gone = needless(search, hypothesis)
     for name in gone:
         hypothesis = hypothesis.without(name)
-    return search.settled(hypothesis, search.rules.look_steps, shrunk=True) if gone else hypothesis
+    return search.settled(hypothesis, search.rules.look_steps, lead_free, shrunk=True) if gone else hypothesis
 
 
 def _for_what_is_there(

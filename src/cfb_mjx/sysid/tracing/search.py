@@ -49,6 +49,7 @@ from cfb_mjx.sysid.tracing.innovations import (
     levels_from,
     residual_blocks,
     sensor_noise,
+    surprise,
     term_slopes,
     term_squares,
     with_slopes,
@@ -160,6 +161,11 @@ class Search:
         """The hypothesis with the noise levels that fit what it leaves."""
         blocks = joined(blocks for blocks, _ in self.residuals(hypothesis))
         return replace(hypothesis, levels=fit_levels(_sample(blocks), self.noise, hypothesis.levels))
+
+    def surprise(self, hypothesis: Hypothesis) -> float:
+        """Negative log-likelihood of what a hypothesis leaves at its noise levels, nats, on the blocks of `learned`."""
+        blocks = joined(blocks for blocks, _ in self.residuals(hypothesis))
+        return float(surprise(jnp.asarray(hypothesis.levels), self.noise, _sample(blocks))[0])
 
     def linearise(self, hypothesis: Hypothesis, wanted: list[Column]) -> Linear:
         """Residual and derivatives by the lead of the commands and by ``wanted`` at a hypothesis."""

@@ -4,7 +4,7 @@ A search that takes in one effect after another asks of each whether half a seco
 it. Where ten effects are missing the answer is no ten times. Here every effect is judged where it acts, and only the
 whole set by predictions:
 
-1. commands to rotor speeds: the motors on their own, from measured rotor speeds;
+1. commands to rotor speeds: the motors on their own, from measured rotor speeds (`cfb_mjx.sysid.tracing.motors`);
 2. what a drone in one piece usually lacks (`PLANT`), all at once, by predictions;
 3. what only some drones have (a load, wind): absent effects in the order of what the innovations say for them, each
    tried beside the rest, kept where predictions gain;
@@ -33,20 +33,17 @@ from cfb_mjx.sysid.metrics import BLOCK
 from cfb_mjx.sysid.refinement import Number, Refinement, plausible_numbers, refine
 from cfb_mjx.sysid.refinement.numbers import HELD, PLANT
 from cfb_mjx.sysid.refinement.predictions import kinds_alike
-from cfb_mjx.sysid.rotors.flown_motors import Motors, flown_motors
+from cfb_mjx.sysid.rotors.flown_motors import Motors, Told
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
 from cfb_mjx.sysid.tracing.fits import beside_hold
 from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Column, Hypothesis, moved, neutral_effects, strengths
+from cfb_mjx.sysid.tracing.motors import MOTORS, motors_of, with_motors
 from cfb_mjx.sysid.tracing.rules import Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.trace import line_of
 
 OWN = ("cog_offset", "thrust_tilt", "torque_scale", "command_delay", "motor_asymmetry", "battery_sag")
 """Of `PLANT`, what differs from one drone of a type to the next."""
-OF_MOTORS = ("command_delay", "motor_asymmetry", "battery_sag")
-"""Of `OWN`, what measured rotor speeds tell."""
-MOTORS = (*OF_MOTORS, "motor_gain_mismatch", "motor_time_constant", "motor_second_order", "motor_thermal_drift")
-"""Effects that are not looked for where the motors were fitted to rotor speeds."""
 
 
 @dataclass(frozen=True)
@@ -129,11 +126,9 @@ def fit_together(
         say: told what happens.
     """
     rules = search.rules
-    if any(log.rotor_speed is not None for log in logs):
-        say("fitting the motors to the rotor speeds")
-    motors = flown_motors(logs, base.parameters(), rules.motor_rows, rules.motor_piece)
-    start = _started(base, motors)
-    names = names_to_fit(base, bool(motors.entries))
+    motors = motors_of(logs, base, search, say)
+    start = with_motors(base, motors)
+    names = names_to_fit(base, motors.known)
     known = of_type(base, rules.spreads)
     say(f"fitting {len(names)} effects together")
     fit = partial(_fit, logs, kinds_alike(start, logs), rules)
@@ -141,7 +136,7 @@ def fit_together(
     numbers = tuple(n for n in plausible_numbers(start.parameters, names) if n.effect not in typical)
     found = fit(start, numbers, rules.steps, {})
     tried: list[dict] = []
-    refused: set[str] = {SHIFT, *(MOTORS if motors.entries else ())}
+    refused: set[str] = {SHIFT, *(MOTORS if motors.known else ())}
     if "thrust_scale" in names:
         # No flight tells more mass from less thrust.
         refused.add("payload")
@@ -173,6 +168,7 @@ def fit_together(
         say("moving what the type declares within its spread")
         found = fit(found.model, (*found.numbers, *known), rules.trial_steps, found.trims)
     found = _lean(found, fit, rules, say, typical)
+    found, motors = _motors_that_matter(found, motors, rules, say)
     model = _bare(found, found.model)
     parts = _parts(found, motors, rules, say, typical)
     return Together(model, found, motors.entries, parts, tried, _predicted(model, logs), frozenset(typical))
@@ -181,7 +177,7 @@ def fit_together(
 def names_to_fit(base: ModelFile, motors_told: bool) -> list[str]:
     """Effects to fit together: what a model declares is known of the type, but for what is a drone's own."""
     declared = {mapping["name"] for mapping in base.effects}
-    told = OF_MOTORS if motors_told else ()
+    told = MOTORS if motors_told else ()
     return [name for name in PLANT if name not in told and (name in OWN or name not in declared)]
 
 
@@ -206,15 +202,6 @@ def of_type(base: ModelFile, spreads: float) -> tuple[Number, ...]:
         if number.field in items[number.effect]["spread"] and reach > HELD:
             found.append(replace(number, low=value - reach, high=value + reach))
     return tuple(found)
-
-
-def _started(base: ModelFile, motors: Motors) -> Quadrotor:
-    """The declared model with its motors fitted anew."""
-    model = Quadrotor.from_file(replace(base, entries={**base.entries, **motors.entries}))
-    if not motors.entries:
-        return model
-    kept = tuple(e for e in model.effects if type(e).name not in OF_MOTORS)
-    return Quadrotor(model.parameters, (*kept, *(told.effect for told in motors.effects)), body=model.body)
 
 
 def hypothesis_of(search: Search, model: Quadrotor, absent: Collection[str] = ()) -> Hypothesis:
@@ -370,15 +357,36 @@ def _lean(
         found = fit(found.without(gone).model, numbers, rules.trial_steps, found.trims)
 
 
+def _motors_that_matter(
+    found: Refinement, motors: Motors, rules: Rules, say: Callable[[str], None]
+) -> tuple[Refinement, Motors]:
+    """The fit without effects of the motors that predictions do not miss, the least first.
+
+    Rotor speeds tell of an effect long before it matters. What goes is left in the fit's model, at neutral.
+    """
+    while motors.effects:
+        losses = [found.loss(_neutral(found.model, told)) for told in motors.effects]
+        reached, least = min(losses), motors.effects[int(np.argmin(losses))]
+        if reached - found.cost[1] > rules.worth * found.cost[1]:
+            break
+        say(f"leaving out {type(least.effect).name}")
+        found = replace(found, model=_neutral(found.model, least), cost=(found.cost[0], reached))
+        kept = {type(e).name: e for e in least.without or ()}
+        rest = (told for told in motors.effects if told is not least)
+        rest = (replace(told, effect=kept.get(type(told.effect).name, told.effect), without=None) for told in rest)
+        motors = replace(motors, effects=tuple(rest))
+    return found, motors
+
+
 def _fitted(found: Refinement) -> list[str]:
     """Names of the effects whose numbers may move."""
     return list(dict.fromkeys(n.effect for n in found.numbers if not n.held))
 
 
 def _bare(found: Refinement, model: Quadrotor) -> Quadrotor:
-    """A model without the effects that a fit held at neutral."""
+    """A model without the effects that a fit held at neutral, and those of motors that do nothing."""
     held = {n.effect for n in found.numbers} - set(_fitted(found))
-    effects = tuple(e for e in model.effects if type(e).name not in held)
+    effects = tuple(e for e in model.effects if type(e).name not in held and not _idle(e))
     return Quadrotor(model.parameters, effects, body=model.body)
 
 
@@ -392,7 +400,7 @@ def _parts(
     parts = []
     for name in [*(name for name in _fitted(found) if name not in typical), *told]:
         own = told.get(name)
-        less = found.without([name]) if own is None else found.judged(_neutral(found.model, name))
+        less = found.without([name]) if own is None else found.judged(_neutral(found.model, own))
         effect = next(e for e in found.model.effects if type(e).name == name)
         if own is None:
             std, at_bound = (
@@ -402,7 +410,7 @@ def _parts(
             confusable = _confusable(found, name, rules.confused)
             t, p_value = _surely([(a - b).sum(axis=(1, 2)) for a, b in zip(less.losses, whole.losses, strict=True)])
         else:
-            std, at_bound, confusable = {own.number: own.std}, [own.number] if own.at_bound else [], []
+            std, at_bound, confusable = own.std, list(own.at_bound), []
             t, p_value = own.t, float(norm.sf(own.t))
         values = {key: np.asarray(getattr(effect, key)).tolist() for key in std}
         buys = 1 - error / _mean(less.errors)
@@ -411,9 +419,20 @@ def _parts(
     return sorted(parts, key=lambda part: -part.buys)
 
 
-def _neutral(model: Quadrotor, name: str) -> Quadrotor:
-    effects = tuple(type(e).neutral() if type(e).name == name else e for e in model.effects)
-    return Quadrotor(model.parameters, effects, body=model.body)
+def _neutral(model: Quadrotor, gone: str | Told) -> Quadrotor:
+    """A model with an effect at neutral, those of the motors moved to make up for one of theirs."""
+    name, others = (gone, ()) if isinstance(gone, str) else (type(gone.effect).name, gone.without or ())
+    moved_ = {type(e).name: e for e in others}
+    effects = (type(e).neutral() if type(e).name == name else moved_.get(type(e).name, e) for e in model.effects)
+    return Quadrotor(model.parameters, tuple(effects), body=model.body)
+
+
+def _idle(effect: Effect) -> bool:
+    """Whether an effect of the motors is at neutral."""
+    neutral, fields = type(effect).neutral(), type(effect).strengths
+    return type(effect).name in MOTORS and all(
+        np.array_equal(getattr(effect, field), getattr(neutral, field)) for field in fields
+    )
 
 
 def _mean(errors: list[np.ndarray]) -> float:

@@ -1,0 +1,110 @@
+"""The motors of a drone that lacks much, from its rotor speeds alone: effects by name, or their constants anew.
+
+Rotor speeds need nothing of the rest of the drone. So what its motors lack is found before anything else, by one-step
+innovations: once beside the declared constants, and once beside constants fitted anew (gain, offset and lag of each
+motor). The first stands unless the second is clearly likelier, its numbers counted: named effects say more, and
+constants are what is left where the motors are others than those declared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.parameters import ModelFile
+from cfb_mjx.sysid.rotors.flown_motors import Motors, Told, flown_motors
+from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Hypothesis, bounds
+from cfb_mjx.sysid.tracing.jointly import look_by_look, one_by_one
+from cfb_mjx.sysid.tracing.search import Search
+from cfb_mjx.sysid.tracing.trace import numbers_of
+
+FITTED = ("command_delay", "battery_sag")
+"""Effects of motors whose constants are fitted anew that are fitted with these."""
+IN_CONSTANTS = ("motor_gain_mismatch", "motor_time_constant")
+"""What such constants hold."""
+MOTORS = (
+    *FITTED,
+    *IN_CONSTANTS,
+    *("motor_asymmetry", "motor_second_order", "motor_thermal_drift", "motor_hysteresis", "esc_rate_limit"),
+)
+"""Effects that measured rotor speeds tell."""
+
+
+def motors_of(
+    logs: Sequence[FlightLog], base: ModelFile, search: Search, say: Callable[[str], None] = lambda _: None
+) -> Motors:
+    """What the rotor speeds of some flights tell of the motors; nothing where there are none.
+
+    Args:
+        logs: flights to fit, as recorded; run with x64 enabled.
+        base: the declared model.
+        search: over the same flights; its rules count.
+        say: told what happens.
+    """
+    flown = [log for log in logs if log.rotor_speed is not None]
+    if not flown:
+        return Motors()
+    rules = search.rules
+    say("fitting the motors to the rotor speeds")
+    parts = _some(flown, rules.motor_searched)
+    anew = flown_motors(logs, base.parameters(), rules.motor_rows, rules.motor_piece)
+    declared = {type(e).name for e in search.declared}
+    names = tuple(name for name in search.names if name in MOTORS or name in declared)
+    plain = replace(search, logs=parts, names=names, _flights={})
+    started = with_motors(base, anew)
+    beside = replace(plain, parameters=started.parameters, declared=started.effects)
+    there = tuple(type(told.effect).name for told in anew.effects)
+    named = _settled(plain, plain.nothing(), (), say)
+    rest = _settled(beside, replace(beside.nothing(), present=there), IN_CONSTANTS, say)
+    rows = sum(int(np.isfinite(log.rotor_speed).sum()) for log in parts)
+    price = 0.5 * np.log(rows)
+    constants = sum(np.size(entry.value) for entry in anew.entries.values())
+    costs = [
+        plain.surprise(named) + price * len(plain.own_columns(named)),
+        beside.surprise(rest) + price * (len(beside.own_columns(rest)) + constants),
+    ]
+    # As for an effect: a statistic of ``clear`` or more.
+    if costs[0] - costs[1] < 0.5 * rules.clear**2:
+        return Motors(effects=_told(plain, named), known=True)
+    return Motors(anew.entries, _told(beside, rest), known=True)
+
+
+def with_motors(base: ModelFile, motors: Motors) -> Quadrotor:
+    """The declared model with its motors as they were found."""
+    model = Quadrotor.from_file(replace(base, entries={**base.entries, **motors.entries}))
+    # Constants were fitted without what a model declares of the motors.
+    replaced = {*(type(told.effect).name for told in motors.effects), *(MOTORS if motors.entries else ())}
+    kept = tuple(e for e in model.effects if type(e).name not in replaced)
+    return Quadrotor(model.parameters, (*kept, *(told.effect for told in motors.effects)), body=model.body)
+
+
+def _some(flown: Sequence[FlightLog], rows: int) -> list[FlightLog]:
+    """Flights evenly spread, so many that they hold ``rows`` about: whole, for motors are cold where a log begins."""
+    count = int(np.clip(round(rows / np.mean([len(log) for log in flown])), 1, len(flown)))
+    chosen = [flown[i] for i in np.linspace(0, len(flown) - 1, count).round().astype(int)]
+    return [log.rows(np.arange(min(len(log), rows))) for log in chosen]
+
+
+def _settled(search: Search, hypothesis: Hypothesis, never: Sequence[str], say: Callable[[str], None]) -> Hypothesis:
+    """A hypothesis with what the rotor speeds ask for, and the noise levels of what it leaves."""
+    # Predictions hold a command until the next row: what a lead takes back a delay would have too much.
+    held = replace(hypothesis, lead=0.0)
+    found, _ = look_by_look(search, search.learned(held), {SHIFT, *never}, lead_free=False, say=say)
+    return search.learned(found)
+
+
+def _told(search: Search, hypothesis: Hypothesis) -> tuple[Told, ...]:
+    """The effects of a hypothesis as what rotor speeds tell."""
+    linear = search.linearise(hypothesis, search.own_columns(hypothesis))
+    found = []
+    for name, (evidence, without) in one_by_one(search, hypothesis).items():
+        _, std = numbers_of(search, hypothesis, linear, name)
+        effect = hypothesis.effect(name)
+        at_bound = tuple(f"{name}.{f}" for f in std if np.any(np.isin(getattr(effect, f), bounds(name, f))))
+        others = tuple(without.effect(other) for other in hypothesis.present if other != name)
+        found.append(Told(effect, std, evidence.t, at_bound, others))
+    return tuple(found)
