@@ -55,11 +55,12 @@ def motors_of(
     declared = {type(e).name for e in search.declared}
     names = tuple(name for name in search.names if name in MOTORS or name in declared)
     plain = replace(search, logs=parts, names=names, _flights={})
-    started = with_motors(base, anew)
+    started = with_motors(base, replace(anew, effects=()))
     beside = replace(plain, parameters=started.parameters, declared=started.effects)
-    there = tuple(type(told.effect).name for told in anew.effects)
-    named = _settled(plain, plain.nothing(), (), say)
-    rest = _settled(beside, replace(beside.nothing(), present=there), IN_CONSTANTS, say)
+    begun = beside.nothing()
+    for told in anew.effects:
+        begun = begun.having(told.effect)
+    named, rest = _settled(plain, plain.nothing(), (), say), _settled(beside, begun, IN_CONSTANTS, say)
     rows = sum(int(np.isfinite(log.rotor_speed).sum()) for log in parts)
     price = 0.5 * np.log(rows)
     constants = sum(np.size(entry.value) for entry in anew.entries.values())
