@@ -54,7 +54,8 @@ def motors_of(
     anew = flown_motors(logs, base.parameters(), rules.motor_rows, rules.motor_piece)
     declared = {type(e).name for e in search.declared}
     names = tuple(name for name in search.names if name in MOTORS or name in declared)
-    plain = replace(search, logs=parts, names=names, _flights={})
+    few = replace(rules, looks=rules.motor_looks)
+    plain = replace(search, logs=parts, names=names, rules=few, _flights={})
     started = with_motors(base, replace(anew, effects=()))
     beside = replace(plain, parameters=started.parameters, declared=started.effects)
     begun = beside.nothing()
@@ -92,9 +93,10 @@ def _some(flown: Sequence[FlightLog], rows: int) -> list[FlightLog]:
 
 def _settled(search: Search, hypothesis: Hypothesis, never: Sequence[str], say: Callable[[str], None]) -> Hypothesis:
     """A hypothesis with what the rotor speeds ask for, and the noise levels of what it leaves."""
+    others = [name for name in search.names if name not in MOTORS]
     # Predictions hold a command until the next row: what a lead takes back a delay would have too much.
     held = replace(hypothesis, lead=0.0)
-    found, _ = look_by_look(search, search.learned(held), {SHIFT, *never}, lead_free=False, say=say)
+    found, _ = look_by_look(search, search.learned(held), {SHIFT, *others, *never}, lead_free=False, say=say)
     return search.learned(found)
 
 

@@ -126,8 +126,10 @@ class Rules:
     """Of a trial at most."""
     motor_rows: int = 12_000
     """That the motors are fitted to, about: the middles of flights."""
-    motor_searched: int = 24_000
+    motor_searched: int = 12_000
     """Rows in which effects of the motors are looked for, about: whole flights."""
+    motor_looks: int = 2
+    """Looks for them at most."""
     motor_piece: float = 3.0
     """Seconds of a flight at least, of so many flights evenly spread as that allows."""
     windows: int = 400
