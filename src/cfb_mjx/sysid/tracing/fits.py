@@ -15,7 +15,7 @@ from scipy.stats import norm
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.tracing.hypothesis import Fit, Hypothesis
-from cfb_mjx.sysid.tracing.innovations import CHANNELS, Blocks, Levels, innovations, joined, levels_from
+from cfb_mjx.sysid.tracing.innovations import CHANNELS, DOMAINS, Blocks, Levels, innovations, joined, levels_from
 from cfb_mjx.sysid.tracing.search import Search
 
 ERRORS = tuple(
@@ -68,8 +68,6 @@ def completed(search: Search, fit: Fit) -> Fit:
     return fit if fit.linear is not None else replace(fit, linear=search.whole(fit.hypothesis))
 
 
-DOMAINS = {"rotor_speed": range(6, 10), "force": (*range(3, 6), *range(10, 13)), "torque": range(3)}
-"""Channels of the innovations by where an effect acts: commands to rotor speeds, these to forces, and to torques."""
 TOGETHER = 64
 """Blocks compared at a time: one program serves any number."""
 

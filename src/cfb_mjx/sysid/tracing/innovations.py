@@ -32,6 +32,8 @@ from cfb_mjx.sysid.identification.flight_data import white_noise
 from cfb_mjx.sysid.replay import Lane, Replay, between, replays, smoothed_rotor_speed, speeds_along
 
 CHANNELS = 10
+DOMAINS = {"rotor_speed": range(6, 10), "force": (*range(3, 6), *range(10, 13)), "torque": range(3)}
+"""Channels of the innovations by where an effect acts: commands to rotor speeds, these to forces, and to torques."""
 SIDE_BY_SIDE = 32, 16
 """Blocks and columns that are whitened at a time: one program serves any number."""
 MOTOR_LAG = 0.05

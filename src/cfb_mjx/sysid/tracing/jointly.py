@@ -93,7 +93,6 @@ def look_by_look(
     search: Search,
     hypothesis: Hypothesis,
     never: Collection[str] = (),
-    lead_free: bool = True,
     better: Callable[[Hypothesis], bool] = lambda _: True,
     say: Callable[[str], None] = lambda _: None,
 ) -> tuple[Hypothesis, Linear]:
@@ -103,7 +102,6 @@ def look_by_look(
         search: over the flights.
         hypothesis: to begin with, with the noise levels of what it leaves.
         never: effects to pass over.
-        lead_free: fit the lead of the commands too; else it stays as it is.
         better: whether what a look came to is to stay.
         say: told what happens.
     """
@@ -116,7 +114,7 @@ def look_by_look(
             more, there = [each.name for each in chosen], hypothesis.present
             say(f"fitting {', '.join(more)} beside {', '.join(there) or 'nothing'}")
             with np.errstate(over="ignore", invalid="ignore"):
-                richer = _with(search, hypothesis, linear, chosen, lead_free)
+                richer = _with(search, hypothesis, linear, chosen)
                 gain = confirm(search, hypothesis, richer).gain
             if not gain > 0:
                 # Too far for slopes, if not beyond all numbers: those that matter most first.
@@ -186,7 +184,7 @@ def needless(search: Search, hypothesis: Hypothesis) -> dict[str, Evidence]:
         gone[least] = doubted[least]
 
 
-def _with(search: Search, hypothesis: Hypothesis, linear: Linear, chosen: list[Chosen], lead_free: bool) -> Hypothesis:
+def _with(search: Search, hypothesis: Hypothesis, linear: Linear, chosen: list[Chosen]) -> Hypothesis:
     """The hypothesis with more effects, all fitted, less what the fit shows to be needless."""
     own = search.own_columns(hypothesis)
     columns = [column for each in chosen for column in each.variant]
@@ -196,11 +194,11 @@ def _with(search: Search, hypothesis: Hypothesis, linear: Linear, chosen: list[C
     for each in chosen:
         start = replace(each.found, values=np.array([next(values) for _ in each.variant]))
         hypothesis = search.with_candidate(hypothesis, each.variant, start)
-    hypothesis = search.settled(hypothesis, search.rules.look_steps, lead_free, shrunk=True)
+    hypothesis = search.settled(hypothesis, search.rules.look_steps, shrunk=True)
     gone = needless(search, hypothesis)
     for name in gone:
         hypothesis = hypothesis.without(name)
-    return search.settled(hypothesis, search.rules.look_steps, lead_free, shrunk=True) if gone else hypothesis
+    return search.settled(hypothesis, search.rules.look_steps, shrunk=True) if gone else hypothesis
 
 
 def _for_what_is_there(

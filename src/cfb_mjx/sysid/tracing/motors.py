@@ -55,22 +55,19 @@ def motors_of(
     declared = {type(e).name for e in search.declared}
     names = tuple(name for name in search.names if name in MOTORS or name in declared)
     few = replace(rules, looks=rules.motor_looks)
-    plain = replace(search, logs=parts, names=names, rules=few, _flights={})
+    plain = replace(search, logs=parts, names=names, rules=few, rotors_only=True, _flights={})
     started = with_motors(base, replace(anew, effects=()))
     beside = replace(plain, parameters=started.parameters, declared=started.effects)
     begun = beside.nothing()
     for told in anew.effects:
         begun = begun.having(told.effect)
-    named, rest = _settled(plain, plain.nothing(), (), say), _settled(beside, begun, IN_CONSTANTS, say)
     rows = sum(int(np.isfinite(log.rotor_speed).sum()) for log in parts)
-    price = 0.5 * np.log(rows)
+    named, named_cost = _found(plain, plain.nothing(), (), rows, say)
+    rest, rest_cost = _found(beside, begun, IN_CONSTANTS, rows, say)
     constants = sum(np.size(entry.value) for entry in anew.entries.values())
-    costs = [
-        plain.surprise(named) + price * len(plain.own_columns(named)),
-        beside.surprise(rest) + price * (len(beside.own_columns(rest)) + constants),
-    ]
+    price = 0.5 * np.log(rows) * constants
     # As for an effect: a statistic of ``clear`` or more.
-    if costs[0] - costs[1] < 0.5 * rules.clear**2:
+    if named_cost - rest_cost - price < 0.5 * rules.clear**2:
         return Motors(effects=_told(plain, named), known=True)
     return Motors(anew.entries, _told(beside, rest), known=True)
 
@@ -91,17 +88,20 @@ def _some(flown: Sequence[FlightLog], rows: int) -> list[FlightLog]:
     return [log.rows(np.arange(min(len(log), rows))) for log in chosen]
 
 
-def _settled(search: Search, hypothesis: Hypothesis, never: Sequence[str], say: Callable[[str], None]) -> Hypothesis:
-    """A hypothesis with what the rotor speeds ask for, and the noise levels of what it leaves."""
-    others = [name for name in search.names if name not in MOTORS]
-    # Predictions hold a command until the next row: what a lead takes back a delay would have too much.
-    held = replace(hypothesis, lead=0.0)
-    found, _ = look_by_look(search, search.learned(held), {SHIFT, *others, *never}, lead_free=False, say=say)
-    return search.learned(found)
+def _found(
+    search: Search, hypothesis: Hypothesis, never: Sequence[str], rows: int, say: Callable[[str], None]
+) -> tuple[Hypothesis, float]:
+    """A hypothesis with what the rotor speeds ask for, and its surprise, half the logarithm of ``rows`` a number."""
+    refused = {SHIFT, *never, *(name for name in search.names if name not in MOTORS)}
+    found, _ = look_by_look(search, search.learned(hypothesis), refused, say=say)
+    found = search.learned(found)
+    return found, search.surprise(found) + 0.5 * np.log(rows) * len(search.own_columns(found))
 
 
 def _told(search: Search, hypothesis: Hypothesis) -> tuple[Told, ...]:
     """The effects of a hypothesis as what rotor speeds tell."""
+    # Predictions hold a command until the next row: what a lead takes back a delay would have too much.
+    hypothesis = search.settled(replace(hypothesis, lead=0.0), search.rules.look_steps, lead_free=False, shrunk=True)
     linear = search.linearise(hypothesis, search.own_columns(hypothesis))
     found = []
     for name, (evidence, without) in one_by_one(search, hypothesis).items():

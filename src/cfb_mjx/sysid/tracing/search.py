@@ -38,6 +38,8 @@ from cfb_mjx.sysid.tracing.hypothesis import (
     term_columns,
 )
 from cfb_mjx.sysid.tracing.innovations import (
+    CHANNELS,
+    DOMAINS,
     SIDE_BY_SIDE,
     Blocks,
     Signals,
@@ -84,6 +86,8 @@ class Search:
     declared: tuple[Effect, ...] = ()
     """Effects the declared model has already."""
     rules: Rules = RULES
+    rotors_only: bool = False
+    """Look at rotor speeds alone, not at what the body does."""
     _flights: dict[float, list[Flight]] = field(default_factory=dict)
     _known: list[tuple[Hypothesis, list]] = field(default_factory=list, init=False)
     """The last `residuals`; a search that replaces another knows nothing of them."""
@@ -135,7 +139,8 @@ class Search:
         model = hypothesis.model(self.parameters)
         own = self.flights(hypothesis) if flights is None else flights
         driven = driven_by(model, own, hypothesis.lead)
-        found = list(zip(residual_blocks(model, own, driven, hypothesis.lead), driven, strict=True))
+        blocks = map(self._looked_at, residual_blocks(model, own, driven, hypothesis.lead))
+        found = list(zip(blocks, driven, strict=True))
         if flights is None:
             self._keep(hypothesis, found)
         return found
@@ -199,7 +204,7 @@ class Search:
         levels = levels_from(jnp.asarray(hypothesis.levels), self.noise)
         found, waiting, counts = [], [], []
         for pair in zip(self.flights(hypothesis), signals, strict=True):
-            waiting.append(cut(*pair))
+            waiting.append(self._looked_at(cut(*pair)))
             counts.append(len(waiting[-1].interval))
             # Short flights together, so that they fill what is whitened at a time.
             if sum(len(blocks.interval) for blocks in waiting) >= SIDE_BY_SIDE[0]:
@@ -208,6 +213,12 @@ class Search:
         if waiting:
             found.append(inner_products(joined(waiting), levels))
         return Linear(columns, np.concatenate(found), dealt(counts))
+
+    def _looked_at(self, blocks: Blocks) -> Blocks:
+        """The same, valid in the channels this search looks at."""
+        if not self.rotors_only:
+            return blocks
+        return replace(blocks, valid=blocks.valid * np.isin(np.arange(CHANNELS), DOMAINS["rotor_speed"]))
 
     def _slopes(
         self, hypothesis: Hypothesis, columns: list[Column], driven: list[np.ndarray] | None = None
@@ -354,7 +365,7 @@ def _alike(a: Hypothesis, b: Hypothesis) -> bool:
 
 def _sample(blocks: Blocks) -> Blocks:
     """`SAMPLE` of the blocks, spread evenly over those in flight: one compiled program serves every campaign."""
-    share = np.asarray(blocks.valid)[:, :, 0].mean(axis=1)
+    share = np.asarray(blocks.valid).max(axis=2).mean(axis=1)
     good = np.flatnonzero(share > 0.5 * share.max())
     chosen = good[np.linspace(0, len(good) - 1, SAMPLE).round().astype(int)]
     picked = jax.tree.map(lambda x: x[chosen], blocks)
