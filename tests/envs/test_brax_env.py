@@ -140,6 +140,7 @@ def test_ppo_of_brax_trains_it_and_the_policy_becomes_a_controller():
     _same_policy(plain(params, deterministic=True), params, False)
 
 
+@pytest.mark.long
 def test_sac_of_brax_runs_on_it():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

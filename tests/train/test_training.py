@@ -261,6 +261,7 @@ def test_the_policy_a_training_starts_from_is_left_alone_until_its_worth_is_know
         assert valued == [False] * 3
 
 
+@pytest.mark.long
 def test_the_policy_goes_no_further_in_an_update_than_it_may():
     sizes = ("ppo.drones=64", "ppo.epochs=4", "ppo.learning_rate=0.03", "ppo.steps=100000", "ppo.warm_up=3")
     task = load_config("target", SMALL_TRAINING).build_task()
