@@ -90,7 +90,6 @@ def test_effects_of_the_motors_are_named_from_rotor_speeds_alone(other_motors):
     assert all(each.t > 8 for each in told.values() if type(each.effect).name.startswith("motor_"))
 
 
-@pytest.mark.long
 def test_motors_of_another_kind_get_constants_of_their_own(campaign):
     """No effect of the catalogue makes an offset of the steady speed."""
     entries = dict(GUARDS.entries)

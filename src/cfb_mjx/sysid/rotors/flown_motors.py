@@ -72,8 +72,7 @@ def flown_motors(logs: Sequence[FlightLog], nominal: Parameters, rows: int, piec
         return Motors()
     least = piece / float(np.median([log.nominal_interval for log in flown]))
     count = min(len(flown), max(1, round(rows / least)))
-    chosen = [flown[i] for i in np.linspace(0, len(flown) - 1, count).round().astype(int)]
-    records = [_middle(log, rows // count) for log in chosen]
+    records = [_middle(log, rows // count) for log in evenly_spread(flown, count)]
     fit, sag = fit_with_sag(records, nominal, offset=True)
     values = {name: fit.values(name) for name in ENTRIES}
     effects = []
@@ -93,6 +92,11 @@ def flown_motors(logs: Sequence[FlightLog], nominal: Parameters, rows: int, piec
     source = f"fitted to the rotor speeds of {len(records)} flights"
     entries = {name: Entry(v[0], source, v[1]) for name, v in values.items() if v is not None}
     return Motors(entries, tuple(effects), True)
+
+
+def evenly_spread(logs: Sequence[FlightLog], count: int) -> list[FlightLog]:
+    """So many of some flights, from the first to the last."""
+    return [logs[i] for i in np.linspace(0, len(logs) - 1, count).round().astype(int)]
 
 
 def _middle(log: FlightLog, rows: int) -> MotorRecord:

@@ -16,7 +16,7 @@ import numpy as np
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import ModelFile
-from cfb_mjx.sysid.rotors.flown_motors import Motors, Told, flown_motors
+from cfb_mjx.sysid.rotors.flown_motors import Motors, Told, evenly_spread, flown_motors
 from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Hypothesis, bounds
 from cfb_mjx.sysid.tracing.jointly import look_by_look, one_by_one
 from cfb_mjx.sysid.tracing.search import Search
@@ -82,10 +82,9 @@ def with_motors(base: ModelFile, motors: Motors) -> Quadrotor:
 
 
 def _some(flown: Sequence[FlightLog], rows: int) -> list[FlightLog]:
-    """Flights evenly spread, so many that they hold ``rows`` about: whole, for motors are cold where a log begins."""
+    """As many flights as hold about ``rows``, each from its first row on: motors are cold where a log begins."""
     count = int(np.clip(round(rows / np.mean([len(log) for log in flown])), 1, len(flown)))
-    chosen = [flown[i] for i in np.linspace(0, len(flown) - 1, count).round().astype(int)]
-    return [log.rows(np.arange(min(len(log), rows))) for log in chosen]
+    return [log.rows(np.arange(min(len(log), rows))) for log in evenly_spread(flown, count)]
 
 
 def _found(
