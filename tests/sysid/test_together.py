@@ -83,11 +83,11 @@ def other_motors():
 def test_effects_of_the_motors_are_named_from_rotor_speeds_alone(other_motors):
     found = motors_of(other_motors.fit, GUARDS, _search(other_motors))
     assert not found.entries
-    told = {type(each.effect).name: each for each in found.effects}
+    told = {each.name: each for each in found.effects}
     assert set(told) >= {"motor_gain_mismatch", "motor_asymmetry"}
     truth = other_motors.truth["effects"]["motor_gain_mismatch"]
     np.testing.assert_allclose(told["motor_gain_mismatch"].effect.relative, np.array(truth["ratio"]) - 1, atol=0.004)
-    assert all(each.t > 8 for each in told.values() if type(each.effect).name.startswith("motor_"))
+    assert all(each.t > 8 for each in told.values() if each.name.startswith("motor_"))
 
 
 def test_motors_of_another_kind_get_constants_of_their_own(campaign):
@@ -101,7 +101,7 @@ def test_motors_of_another_kind_get_constants_of_their_own(campaign):
     assert {"motor_gain", "motor_speed_offset", "motor_time_constant"} <= set(found.entries)
     assert all(np.all(entry.std > 0) for entry in found.entries.values())
     np.testing.assert_allclose(found.entries["motor_gain"].value, gain.value, rtol=0.02)
-    assert not {"motor_gain_mismatch", "motor_time_constant"} & {type(each.effect).name for each in found.effects}
+    assert not {"motor_gain_mismatch", "motor_time_constant"} & {each.name for each in found.effects}
 
 
 def test_effects_that_the_model_declares_stay_as_they_are():
@@ -143,7 +143,7 @@ def test_effects_are_reported_in_the_order_of_what_they_buy(campaign, closed):
     buys = [effect["buys"] for effect in found["effects"]]
     assert buys == sorted(buys, reverse=True)
     assert not found["unexplained"]
-    assert "motors" not in found
+    assert not {"motors", "dropped"} & set(found)
     told = {part.name for part in closed.together.parts if part.told}
     for effect in found["effects"]:
         assert ("innovations" in effect) == (effect["name"] not in told)
@@ -152,6 +152,18 @@ def test_effects_are_reported_in_the_order_of_what_they_buy(campaign, closed):
     assert lift["value"] == pytest.approx(campaign.truth["effects"]["thrust_scale"]["thrust_scale"] - 1, abs=0.03)
     for effect in found["unconfirmed"]:
         assert effect["name"] not in [item["name"] for item in closed.model_file("x", {}).effects]
+
+
+def test_what_was_declared_of_the_motors_and_left_the_model_is_said(closed):
+    """Constants fitted anew take its place: a reader of the report must not miss it unawares."""
+    declared = {"name": "motor_asymmetry", "parameters": {"spin_up": 0.2}}
+    anew = {"motor_gain": Entry(np.full(4, 1.1), "of other motors")}
+    changed = replace(closed, base=replace(GUARDS, effects=(declared,)), motors=anew)
+    assert "motor_asymmetry" not in {item["name"] for item in changed.model_file("x", {}).effects}
+    found = changed.to_json()
+    assert found["dropped"] == ["motor_asymmetry"]
+    assert found["motors"]["motor_gain"]["value"] == [1.1] * 4
+    assert "constants were fitted anew): motor_asymmetry." in closing_sections._held(changed)
 
 
 def test_the_first_paragraph_says_what_the_drone_has_what_it_buys_and_what_to_do(closed):

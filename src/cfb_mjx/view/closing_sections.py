@@ -124,7 +124,10 @@ def _held(diagnosis: Diagnosis) -> str:
     edge = [n.name for n in fit.numbers if n.effect in moved and fit.at_bound(n)]
     text = f" Held as the model declares them: {', '.join(held)}." if held else ""
     text += f" Moved within the spread of the type: {', '.join(moved)}." if moved else ""
-    return text + (f" At the edge of it, so that this drone is unlike the type: {', '.join(edge)}." if edge else "")
+    text += f" At the edge of it, so that this drone is unlike the type: {', '.join(edge)}." if edge else ""
+    gone = diagnosis.dropped
+    motors = " (the motors' constants were fitted anew)" if diagnosis.motors else ""
+    return text + (f" Declared by the model, but nothing asks for it{motors}: {', '.join(gone)}." if gone else "")
 
 
 def _sentence(item: Reported, which: str = "one") -> str:

@@ -35,6 +35,11 @@ class Told:
     at_bound: tuple[str, ...] = ()
     without: tuple[Effect, ...] | None = None
 
+    @property
+    def name(self) -> str:
+        """Of the effect."""
+        return self.effect.name
+
     @classmethod
     def of(cls, effect: Effect, number: str, std: float) -> Told:
         """An effect of one number, beside constants that were fitted with it."""

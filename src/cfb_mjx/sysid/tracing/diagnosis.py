@@ -199,6 +199,15 @@ class Diagnosis:
         return Quadrotor.from_file(self.base), Quadrotor.from_file(self.model_file(self.base.name, {}))
 
     @property
+    def dropped(self) -> list[str]:
+        """Effects that the base model declares and a fit of all at once took out, other than `unconfirmed`."""
+        if self.together is None:
+            return []
+        judged = (item.name for item in (*self.reported, *self.unconfirmed))
+        stay = {*self.hypothesis.present, *judged, *SENSOR_FAULTS}
+        return [item["name"] for item in self.base.effects if item["name"] not in stay]
+
+    @property
     def candidates(self) -> list[Candidate]:
         """Effects that came near and are not reported, the most nearly found first."""
         reported = {item.name for item in self.reported}
@@ -293,7 +302,9 @@ class Diagnosis:
             "unconfirmed": [item.to_json() for item in self.unconfirmed],
             "sensors": {name: {"value": v, "std": s} for name, (v, s) in self.trace.sensors.measured.items()},
             "search": self.trace.tried,
-        } | ({"motors": {name: _written(entry) for name, entry in self.motors.items()}} if self.motors else {})
+            **({"motors": {name: _written(entry) for name, entry in self.motors.items()}} if self.motors else {}),
+            **({"dropped": self.dropped} if self.dropped else {}),
+        }
 
     def model_file(self, name: str, provenance: dict) -> ModelFile:
         """The corrected model."""

@@ -76,7 +76,7 @@ def with_motors(base: ModelFile, motors: Motors) -> Quadrotor:
     """The declared model with its motors as they were found."""
     model = Quadrotor.from_file(replace(base, entries={**base.entries, **motors.entries}))
     # Constants were fitted without what a model declares of the motors.
-    replaced = {*(type(told.effect).name for told in motors.effects), *(MOTORS if motors.entries else ())}
+    replaced = {*(told.name for told in motors.effects), *(MOTORS if motors.entries else ())}
     kept = tuple(e for e in model.effects if type(e).name not in replaced)
     return Quadrotor(model.parameters, (*kept, *(told.effect for told in motors.effects)), body=model.body)
 

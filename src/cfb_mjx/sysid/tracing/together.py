@@ -33,7 +33,7 @@ from cfb_mjx.sysid.metrics import BLOCK
 from cfb_mjx.sysid.refinement import Number, Refinement, plausible_numbers, refine
 from cfb_mjx.sysid.refinement.numbers import HELD, PLANT
 from cfb_mjx.sysid.refinement.predictions import kinds_alike
-from cfb_mjx.sysid.rotors.flown_motors import Motors, Told
+from cfb_mjx.sysid.rotors.flown_motors import Motors
 from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
 from cfb_mjx.sysid.tracing.fits import beside_hold
 from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Column, Hypothesis, moved, neutral_effects, strengths
@@ -365,15 +365,15 @@ def _motors_that_matter(
     Rotor speeds tell of an effect long before it matters. What goes is left in the fit's model, at neutral.
     """
     while motors.effects:
-        losses = [found.loss(_neutral(found.model, told)) for told in motors.effects]
+        losses = [found.loss(_neutral(found.model, told.name, told.without)) for told in motors.effects]
         reached, least = min(losses), motors.effects[int(np.argmin(losses))]
         if reached - found.cost[1] > rules.worth * found.cost[1]:
             break
-        say(f"leaving out {type(least.effect).name}")
-        found = replace(found, model=_neutral(found.model, least), cost=(found.cost[0], reached))
+        say(f"leaving out {least.name}")
+        found = replace(found, model=_neutral(found.model, least.name, least.without), cost=(found.cost[0], reached))
         kept = {type(e).name: e for e in least.without or ()}
         rest = (told for told in motors.effects if told is not least)
-        rest = (replace(told, effect=kept.get(type(told.effect).name, told.effect), without=None) for told in rest)
+        rest = (replace(told, effect=kept.get(told.name, told.effect), without=None) for told in rest)
         motors = replace(motors, effects=tuple(rest))
     return found, motors
 
@@ -396,11 +396,11 @@ def _parts(
     say("leaving out one effect after another")
     whole = found.left
     error = _mean(whole.errors)
-    told = {type(each.effect).name: each for each in motors.effects}
+    told = {each.name: each for each in motors.effects}
     parts = []
     for name in [*(name for name in _fitted(found) if name not in typical), *told]:
         own = told.get(name)
-        less = found.without([name]) if own is None else found.judged(_neutral(found.model, own))
+        less = found.without([name]) if own is None else found.judged(_neutral(found.model, name, own.without))
         effect = next(e for e in found.model.effects if type(e).name == name)
         if own is None:
             std, at_bound = (
@@ -419,11 +419,10 @@ def _parts(
     return sorted(parts, key=lambda part: -part.buys)
 
 
-def _neutral(model: Quadrotor, gone: str | Told) -> Quadrotor:
-    """A model with an effect at neutral, those of the motors moved to make up for one of theirs."""
-    name, others = (gone, ()) if isinstance(gone, str) else (type(gone.effect).name, gone.without or ())
-    moved_ = {type(e).name: e for e in others}
-    effects = (type(e).neutral() if type(e).name == name else moved_.get(type(e).name, e) for e in model.effects)
+def _neutral(model: Quadrotor, name: str, others: Sequence[Effect] | None = None) -> Quadrotor:
+    """A model with an effect at neutral, and others as they are without it."""
+    instead = {each.name: each for each in (*(others or ()), CATALOGUE[name].neutral())}
+    effects = (instead.get(each.name, each) for each in model.effects)
     return Quadrotor(model.parameters, tuple(effects), body=model.body)
 
 
