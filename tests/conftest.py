@@ -63,6 +63,25 @@ def settings_as_before():
             jax.config.update(name, value)
 
 
+@pytest.fixture(autouse=True)
+def in_haste(request, monkeypatch):
+    """Compile in haste for tests that compile far more than they run (mark ``haste``); jax has no setting for it."""
+    if request.node.get_closest_marker("haste") is None:
+        return
+    from jax._src import compiler
+
+    from tests.helpers import HASTE
+
+    options = compiler.get_compile_options
+    monkeypatch.setattr(
+        compiler,
+        "get_compile_options",
+        lambda *args, **given: options(
+            *args, **given | {"env_options_overrides": HASTE | (given.get("env_options_overrides") or {})}
+        ),
+    )
+
+
 MAPS = Path("/proc/self/maps")
 MANY_MAPS = 20_000
 """Linux gives a process 65530 memory maps, and every compiled program keeps some: a worker that keeps the programs of

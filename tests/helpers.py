@@ -204,6 +204,9 @@ def state_of(y: np.ndarray):
     return State(*(jnp.asarray(part(y, name)) for name in NAMES))
 
 
+HASTE = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
+"""Options of XLA: large programs compile in half to two thirds of the time, and run up to four times slower."""
+
 SMALL_TRAINING = (
     "checkpoints=2",
     "network.hidden=[8, 8]",

@@ -23,6 +23,8 @@ with warnings.catch_warnings():
     from brax.envs.wrappers import training
     from brax.training.agents.ppo import networks
 
+pytestmark = pytest.mark.haste
+
 TASK = TargetTask(randomisation=load_randomisation("paper"), episode_s=0.08)
 
 
@@ -140,7 +142,6 @@ def test_ppo_of_brax_trains_it_and_the_policy_becomes_a_controller():
     _same_policy(plain(params, deterministic=True), params, False)
 
 
-@pytest.mark.long
 def test_sac_of_brax_runs_on_it():
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

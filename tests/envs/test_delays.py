@@ -20,6 +20,8 @@ from cfb_mjx.parameters import Randomisation
 from cfb_mjx.parameters.randomisation import Range
 from cfb_mjx.train.flying import fly
 
+pytestmark = pytest.mark.haste
+
 DRONE = Quadrotor.from_file("cfb-guards")
 TASK = TargetTask(noise=QUIET)
 

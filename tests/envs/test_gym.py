@@ -22,6 +22,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_randomisation
 
+pytestmark = pytest.mark.haste
+
 SHORT = replace(TargetTask(), episode_s=0.04)
 
 

@@ -21,6 +21,8 @@ from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.rotors import hover_rotor_speed
 from cfb_mjx.parameters import load_randomisation
 
+pytestmark = pytest.mark.haste
+
 COUNT = 20_000
 # A body of nearly equal moments: none that is drawn breaks the triangle inequality, which is mended afterwards.
 DRONE = eqx.tree_at(

@@ -17,6 +17,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, State, rollout
 from cfb_mjx.parameters import load_randomisation
 
+pytestmark = pytest.mark.haste
+
 DRONE = Quadrotor.from_file("cfb-guards")
 QUIET_TASK = TargetTask(noise=QUIET)
 RANDOM_TASK = TargetTask(randomisation=load_randomisation("paper"))

@@ -25,7 +25,7 @@ from cfb_mjx.train.ppo import Ppo
 from cfb_mjx.train.run import BEST, CHECKPOINT, CURVE, POLICY, UPDATES, Training, segments, train
 from tests.helpers import SMALL_TRAINING, watch_keys
 
-pytestmark = pytest.mark.xdist_group("training")
+pytestmark = [pytest.mark.xdist_group("training"), pytest.mark.haste]
 
 ALGORITHMS = ("analytic", "ppo")
 
@@ -261,7 +261,6 @@ def test_the_policy_a_training_starts_from_is_left_alone_until_its_worth_is_know
         assert valued == [False] * 3
 
 
-@pytest.mark.long
 def test_the_policy_goes_no_further_in_an_update_than_it_may():
     sizes = ("ppo.drones=64", "ppo.epochs=4", "ppo.learning_rate=0.03", "ppo.steps=100000", "ppo.warm_up=3")
     task = load_config("target", SMALL_TRAINING).build_task()
