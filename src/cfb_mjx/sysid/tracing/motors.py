@@ -56,20 +56,19 @@ def motors_of(
     names = tuple(name for name in search.names if name in MOTORS or name in declared)
     few = replace(rules, looks=rules.motor_looks)
     plain = replace(search, logs=parts, names=names, rules=few, rotors_only=True, _flights={})
-    started = with_motors(base, replace(anew, effects=()))
+    started = with_motors(base, anew)
     beside = replace(plain, parameters=started.parameters, declared=started.effects)
-    begun = beside.nothing()
-    for told in anew.effects:
-        begun = begun.having(told.effect)
+    # Those were fitted with the constants, to all flights: fewer tell a battery's slope from its level badly.
+    held = (*IN_CONSTANTS, *(told.name for told in anew.effects))
     rows = sum(int(np.isfinite(log.rotor_speed).sum()) for log in parts)
     named, named_cost = _found(plain, plain.nothing(), (), rows, say)
-    rest, rest_cost = _found(beside, begun, IN_CONSTANTS, rows, say)
-    constants = sum(np.size(entry.value) for entry in anew.entries.values())
+    rest, rest_cost = _found(beside, beside.nothing(), held, rows, say)
+    constants = sum(np.size(entry.value) for entry in anew.entries.values()) + len(anew.effects)
     price = 0.5 * np.log(rows) * constants
     # As for an effect: a statistic of ``clear`` or more.
     if named_cost - rest_cost - price < 0.5 * rules.clear**2:
         return Motors(effects=_told(plain, named), known=True)
-    return Motors(anew.entries, _told(beside, rest), known=True)
+    return Motors(anew.entries, (*anew.effects, *_told(beside, rest)), known=True)
 
 
 def with_motors(base: ModelFile, motors: Motors) -> Quadrotor:
