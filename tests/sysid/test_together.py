@@ -9,11 +9,13 @@ import pytest
 
 from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.model import Quadrotor
+from cfb_mjx.model.effects import BatterySag
 from cfb_mjx.parameters import Entry, load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.refinement.numbers import PLANT
+from cfb_mjx.sysid.rotors.flown_motors import Told, flown_motors
 from cfb_mjx.sysid.sensor_faults import HEALTHY
-from cfb_mjx.sysid.tracing import closing
+from cfb_mjx.sysid.tracing import closing, motors
 from cfb_mjx.sysid.tracing.fits import beside_hold
 from cfb_mjx.sysid.tracing.hypothesis import Fit
 from cfb_mjx.sysid.tracing.motors import MOTORS, motors_of
@@ -90,8 +92,15 @@ def test_effects_of_the_motors_are_named_from_rotor_speeds_alone(other_motors):
     assert all(each.t > 8 for each in told.values() if each.name.startswith("motor_"))
 
 
-def test_motors_of_another_kind_get_constants_of_their_own(campaign):
-    """No effect of the catalogue makes an offset of the steady speed."""
+def test_motors_of_another_kind_get_constants_of_their_own(campaign, monkeypatch):
+    """No effect of the catalogue makes an offset of the steady speed. What is fitted with the constants, to more
+    flights than are searched, stays as it was fitted: here a battery that these flights do not show."""
+    battery = Told.of(BatterySag(level=0.0, slope=0.05, lag=0.01), "slope", 0.01)
+
+    def with_a_battery(*given):
+        return replace(anew := flown_motors(*given), effects=(*anew.effects, battery))
+
+    monkeypatch.setattr(motors, "flown_motors", with_a_battery)
     entries = dict(GUARDS.entries)
     gain = entries["motor_gain"]
     entries["motor_gain"] = replace(gain, value=0.8 * np.asarray(gain.value))
@@ -102,6 +111,7 @@ def test_motors_of_another_kind_get_constants_of_their_own(campaign):
     assert all(np.all(entry.std > 0) for entry in found.entries.values())
     np.testing.assert_allclose(found.entries["motor_gain"].value, gain.value, rtol=0.02)
     assert not {"motor_gain_mismatch", "motor_time_constant"} & {each.name for each in found.effects}
+    assert any(each is battery for each in found.effects)
 
 
 def test_effects_that_the_model_declares_stay_as_they_are():

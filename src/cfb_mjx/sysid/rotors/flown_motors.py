@@ -26,14 +26,14 @@ class Told:
         std: their standard deviations, by field.
         t: how surely it is there: standard normal where it is not.
         at_bound: names of numbers that stand at the end of what is plausible.
-        without: the other effects of the motors, moved to make up for it; None where they stay as they are.
+        without: other effects of the motors, moved to make up for it; those that are not there stay as they are.
     """
 
     effect: Effect
     std: dict[str, Any]
     t: float
     at_bound: tuple[str, ...] = ()
-    without: tuple[Effect, ...] | None = None
+    without: tuple[Effect, ...] = ()
 
     @property
     def name(self) -> str:

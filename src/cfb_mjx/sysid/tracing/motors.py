@@ -58,7 +58,7 @@ def motors_of(
     plain = replace(search, logs=parts, names=names, rules=few, rotors_only=True, _flights={})
     started = with_motors(base, anew)
     beside = replace(plain, parameters=started.parameters, declared=started.effects)
-    # Those were fitted with the constants, to all flights: fewer tell a battery's slope from its level badly.
+    # Fitted with the constants, to pieces of more flights: few flights hardly tell a battery's slope from its level.
     held = (*IN_CONSTANTS, *(told.name for told in anew.effects))
     rows = sum(int(np.isfinite(log.rotor_speed).sum()) for log in parts)
     named, named_cost = _found(plain, plain.nothing(), (), rows, say)

@@ -371,9 +371,9 @@ def _motors_that_matter(
             break
         say(f"leaving out {least.name}")
         found = replace(found, model=_neutral(found.model, least.name, least.without), cost=(found.cost[0], reached))
-        kept = {type(e).name: e for e in least.without or ()}
+        kept = {each.name: each for each in least.without}
         rest = (told for told in motors.effects if told is not least)
-        rest = (replace(told, effect=kept.get(told.name, told.effect), without=None) for told in rest)
+        rest = (replace(told, effect=kept.get(told.name, told.effect), without=()) for told in rest)
         motors = replace(motors, effects=tuple(rest))
     return found, motors
 
@@ -419,9 +419,9 @@ def _parts(
     return sorted(parts, key=lambda part: -part.buys)
 
 
-def _neutral(model: Quadrotor, name: str, others: Sequence[Effect] | None = None) -> Quadrotor:
+def _neutral(model: Quadrotor, name: str, others: Sequence[Effect] = ()) -> Quadrotor:
     """A model with an effect at neutral, and others as they are without it."""
-    instead = {each.name: each for each in (*(others or ()), CATALOGUE[name].neutral())}
+    instead = {each.name: each for each in (*others, CATALOGUE[name].neutral())}
     effects = (instead.get(each.name, each) for each in model.effects)
     return Quadrotor(model.parameters, tuple(effects), body=model.body)
 
