@@ -61,6 +61,9 @@ def test_what_no_flight_tells_is_not_fitted():
         *(f"wind.velocity[{i}]" for i in range(3)),
         *(f"battery_sag.{f}" for f in ("level", "slope", "lag")),
     ]
+    beside_gains = {n.name for n in plausible_numbers(GUARDS(), ("battery_sag", "motor_gain_mismatch"))}
+    assert beside_gains >= {"battery_sag.slope", "motor_gain_mismatch.relative[3]"}
+    assert "battery_sag.level" not in beside_gains
     for asked, conductance in ((("wind",), 0.02), (("wind", "rotor_drag"), 0.0)):
         model = _prepared(Quadrotor(GUARDS()), plausible_numbers(GUARDS(), asked))
         assert float(model.effects[0].conductance) == pytest.approx(conductance)

@@ -10,6 +10,7 @@ import pytest
 from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import BatterySag
+from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE
 from cfb_mjx.parameters import Entry, load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.refinement.numbers import PLANT
@@ -78,17 +79,26 @@ def test_motors_that_are_as_declared_stay_so(whole):
 @pytest.fixture(scope="module")
 def other_motors():
     """A drone of motors with several faults, on which rotor speeds were measured."""
-    case = Case("motors", 9023, (("motor_gain_mismatch", 0.8), ("motor_asymmetry", 0.8), ("rotor_drag", 1.0)))
-    return fly_campaigns([case], duration_scale=0.35)[0]
+    names = {"motor_gain_mismatch": 0.8, "motor_asymmetry": 0.8, "battery_sag": 1.0, "rotor_drag": 1.0}
+    return fly_campaigns([Case("motors", 9023, tuple(names.items()))], duration_scale=0.35)[0]
 
 
 def test_effects_of_the_motors_are_named_from_rotor_speeds_alone(other_motors):
+    """A battery's level would say what all four gains say: beside these it stays as it is declared."""
     found = motors_of(other_motors.fit, GUARDS, _search(other_motors))
     assert not found.entries
     told = {each.name: each for each in found.effects}
-    assert set(told) >= {"motor_gain_mismatch", "motor_asymmetry"}
-    truth = other_motors.truth["effects"]["motor_gain_mismatch"]
-    np.testing.assert_allclose(told["motor_gain_mismatch"].effect.relative, np.array(truth["ratio"]) - 1, atol=0.004)
+    assert set(told) >= {"motor_gain_mismatch", "motor_asymmetry", "battery_sag"}
+    truth = other_motors.truth["effects"]
+    battery = truth["battery_sag"]
+    of_all = (NOMINAL_VOLTAGE / battery["sag_voltage"]) ** battery["sag"]
+    gains = told["motor_gain_mismatch"]
+    np.testing.assert_allclose(
+        gains.effect.relative, np.array(truth["motor_gain_mismatch"]["ratio"]) * of_all - 1, atol=0.006
+    )
+    assert np.max(gains.std["relative"]) < 0.01
+    assert float(told["battery_sag"].effect.level) == 0.0
+    assert "level" not in told["battery_sag"].std
     assert all(each.t > 8 for each in told.values() if each.name.startswith("motor_"))
 
 

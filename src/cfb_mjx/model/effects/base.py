@@ -94,6 +94,8 @@ class Effect(eqx.Module):
     searched: ClassVar[bool] = True
     assumed: ClassVar[tuple[str, ...]] = ()
     """Fields that no flight tells: whoever fits leaves them as they are given."""
+    said_by: ClassVar[dict[str, str]] = {}
+    """Fields that say what another effect says, with its name: beside that one whoever fits leaves them as given."""
     rank: ClassVar[int] = 0
     """Which of two effects acts first where the second sees what the first leaves; by their names where it is equal.
 

@@ -79,6 +79,8 @@ class BatterySag(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("level", "slope")
     # Beside a log the voltage is what was read.
     assumed: ClassVar[tuple[str, ...]] = ("charge", "capacity", "resistance", "power")
+    # All gains of the motors times the same number.
+    said_by: ClassVar[dict[str, str]] = {"level": "motor_gain_mismatch"}
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"lag": 0.02}, {"lag": 0.5})
 
     level: Float[Array, "*batch"] = eqx.field(converter=number)

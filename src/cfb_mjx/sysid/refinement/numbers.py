@@ -61,6 +61,10 @@ class Number:
         value = self.of_neutral()
         return replace(self, low=value - HELD, high=value + HELD)
 
+    def said_by(self, effect: str) -> bool:
+        """Whether another effect says the same."""
+        return KNOWN[self.effect].said_by.get(self.field) == effect
+
     @property
     def held(self) -> bool:
         """Whether it may not move."""
@@ -87,7 +91,8 @@ class Number:
 def plausible_numbers(parameters: Parameters, effects: Sequence[str]) -> tuple[Number, ...]:
     """Every number of some effects within its prior range; inertia within `INERTIA`, inflow within momentum theory.
 
-    Fields that no flight tells (`Effect.assumed`) stay as the model has them.
+    Fields that no flight tells (`Effect.assumed`), and those that another of the effects says (`Effect.said_by`), stay
+    as the model has them.
 
     Raises:
         CfbError: an effect the catalogue does not have, or one that is no physics.
@@ -119,7 +124,7 @@ def _numbers(effects: Sequence[str], bounds: dict) -> tuple[Number, ...]:
             raise CfbError(f"{name}: no such effect; the catalogue has {', '.join(sorted(KNOWN))}.")
         neutral = KNOWN[name].neutral()
         for field, prior in KNOWN[name].prior.items():
-            if field in KNOWN[name].assumed:
+            if field in KNOWN[name].assumed or KNOWN[name].said_by.get(field) in effects:
                 continue
             low, high = bounds.get((name, field), prior)
             value = np.asarray(getattr(neutral, field))

@@ -5,6 +5,7 @@ Strengths and shapes of every effect of the catalogue are one column each.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
@@ -61,10 +62,11 @@ def columns_of(name: str, fields: tuple[str, ...], probe: dict[str, float]) -> l
     return found
 
 
-def strengths(name: str) -> list[list[Column]]:
-    """Columns of an effect's strengths, one list for each probe of its shape."""
+def strengths(name: str, others: Collection[str] = ()) -> list[list[Column]]:
+    """Columns of an effect's strengths, one list for each probe of its shape; without what ``others`` say as well."""
     kind = KNOWN[name]
-    return [columns_of(name, kind.strengths, probe) for probe in kind.probes]
+    own = tuple(f for f in kind.strengths if kind.said_by.get(f) not in others)
+    return [columns_of(name, own, probe) for probe in kind.probes]
 
 
 def shapes(effect: Effect) -> list[Column]:
@@ -209,10 +211,18 @@ class Hypothesis:
         return SensorFaults(motor_shift=self.shift)
 
     def having(self, effect: Effect) -> Hypothesis:
-        """The same with an effect that was absent."""
+        """The same with an effect that was absent; what of the others it says as well is as declared again."""
         name = type(effect).name
-        effects = tuple(effect if type(e).name == name else e for e in self.effects)
-        return replace(self, effects=effects, present=(*self.present, name))
+        present = (*self.present, name)
+        effects = []
+        for old, declared in zip(self.effects, self.origin, strict=True):
+            here = effect if type(old).name == name else old
+            if type(old).name in present:
+                for field_, by in here.said_by.items():
+                    if by in present:
+                        here = eqx.tree_at(lambda e, f=field_: getattr(e, f), here, getattr(declared, field_))
+            effects.append(here)
+        return replace(self, effects=tuple(effects), present=present)
 
     def without(self, name: str) -> Hypothesis:
         """The same with one effect back at neutral."""

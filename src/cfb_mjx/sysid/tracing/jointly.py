@@ -44,7 +44,7 @@ def beside_each_other(
     """Absent effects that stand beside what is there and beside each other, the largest gain first."""
     own = search.own_columns(hypothesis)
     base, prior = linear.index(own), search.prior(hypothesis, own)
-    absent = [v for v in search.candidates() if v[0].effect not in {*hypothesis.present, *refused}]
+    absent = [v for v in search.candidates(hypothesis) if v[0].effect not in refused]
     chosen: list[Chosen] = []
 
     def beside(variant: list[Column], others: list[Chosen]) -> Evidence:

@@ -235,9 +235,12 @@ class Search:
         """Whether evidence for an effect is beyond chance after a look at all of them."""
         return self.rules.significant(found, len(self.names))
 
-    def candidates(self) -> list[list[Column]]:
-        """Columns of every effect and probe."""
-        return [[shift_column()]] + [variant for name in self.names for variant in strengths(name)]
+    def candidates(self, hypothesis: Hypothesis) -> list[list[Column]]:
+        """Columns of every effect that is not there, at each probe."""
+        there = hypothesis.present
+        absent = [name for name in self.names if name not in there]
+        shift = [] if SHIFT in there else [[shift_column()]]
+        return shift + [variant for name in absent for variant in strengths(name, there)]
 
     def own_columns(self, hypothesis: Hypothesis, guessed: bool = False) -> list[Column]:
         """Columns of what is there: strengths and shapes, but no shapes where the strength may be a mere guess."""
@@ -246,14 +249,14 @@ class Search:
             if name == SHIFT:
                 found.append(shift_column())
                 continue
-            found += strengths(name)[0]
+            found += strengths(name, hypothesis.present)[0]
             if not (guessed and coarse(name)):
                 found += shapes(hypothesis.effect(name))
         return [replace(c, probe=()) for c in found] + list(hypothesis.terms)
 
     def whole(self, hypothesis: Hypothesis) -> Linear:
         """Derivatives by what is there and by the rest of the catalogue."""
-        absent = [c for v in self.candidates() if v[0].effect not in hypothesis.present for c in v]
+        absent = [c for variant in self.candidates(hypothesis) for c in variant]
         return self.linearise(hypothesis, self.own_columns(hypothesis) + absent)
 
     def refine(self, hypothesis: Hypothesis, rounds: int = 5) -> tuple[Hypothesis, Linear]:
@@ -337,10 +340,8 @@ class Search:
     def probes(self, hypothesis: Hypothesis, linear: Linear) -> dict[str, tuple[Evidence, list[Column]]]:
         """Every absent effect whose sign makes sense, at the probe that gains most."""
         best: dict[str, tuple[Evidence, list[Column]]] = {}
-        for variant in self.candidates():
+        for variant in self.candidates(hypothesis):
             name = variant[0].effect
-            if name in hypothesis.present:
-                continue
             found = self.adding(hypothesis, linear, variant)
             if found is not None and (name not in best or found.gain > best[name][0].gain):
                 best[name] = (found, variant)

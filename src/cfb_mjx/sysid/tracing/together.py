@@ -151,7 +151,8 @@ def fit_together(
             model, numbers = _with(found, variant, evidence)
             reached = found.foreseen(numbers, model)
             if reached < (1 - rules.gain / 2) * found.cost[1]:
-                richer = fit(model, (*found.numbers, *numbers), rules.trial_steps, found.trims)
+                beside = [n.held_at_neutral if n.said_by(name) else n for n in found.numbers]
+                richer = fit(model, (*beside, *numbers), rules.trial_steps, found.trims)
                 reached = richer.cost[1]
                 # What drives another number out of what is plausible stands in for something else.
                 pressed = set(richer.pressed) - set(found.pressed)
@@ -251,7 +252,7 @@ def asked(search: Search, model: Quadrotor, names: Collection[str]) -> dict[str,
     """What the innovations ask of the strengths of some effects of a model, all together, by effect."""
     search = replace(search, parameters=model.parameters, _flights={})
     hypothesis = search.learned(hypothesis_of(search, model))
-    columns = [column for name in names for variant in strengths(name)[:1] for column in variant]
+    columns = [column for name in names for variant in strengths(name, names)[:1] for column in variant]
     columns = [replace(column, probe=()) for column in columns]
 
     def values(of):
