@@ -17,6 +17,7 @@ from cfb_mjx.sysid.refinement.numbers import PLANT
 from cfb_mjx.sysid.rotors.flown_motors import Told, flown_motors
 from cfb_mjx.sysid.sensor_faults import HEALTHY
 from cfb_mjx.sysid.tracing import closing, motors
+from cfb_mjx.sysid.tracing.evidence import alike
 from cfb_mjx.sysid.tracing.fits import beside_hold
 from cfb_mjx.sysid.tracing.hypothesis import Fit
 from cfb_mjx.sysid.tracing.motors import MOTORS, motors_of
@@ -100,6 +101,17 @@ def test_effects_of_the_motors_are_named_from_rotor_speeds_alone(other_motors):
     assert float(told["battery_sag"].effect.level) == 0.0
     assert "level" not in told["battery_sag"].std
     assert all(each.t > 8 for each in told.values() if each.name.startswith("motor_"))
+    assert not any(each.alike for each in told.values())
+
+
+def test_numbers_that_go_together_name_each_others_effects():
+    names = ["lag", "delay", "delay", "drag"]
+    together = np.array(
+        [[1.0, 0.1, -0.95, 0.0], [0.1, 1.0, 0.0, np.nan], [-0.95, 0.0, 1.0, 0.2], [0.0, np.nan, 0.2, 1.0]]
+    )
+    assert alike(names, together, "lag", 0.9) == ["delay"]
+    assert alike(names, together, "delay", 0.9) == ["lag"]
+    assert alike(names, together, "drag", 0.9) == []
 
 
 def test_motors_of_another_kind_get_constants_of_their_own(campaign, monkeypatch):

@@ -27,6 +27,7 @@ class Told:
         t: how surely it is there: standard normal where it is not.
         at_bound: names of numbers that stand at the end of what is plausible.
         without: other effects of the motors, moved to make up for it; those that are not there stay as they are.
+        alike: names of effects whose numbers make up for its own.
     """
 
     effect: Effect
@@ -34,6 +35,7 @@ class Told:
     t: float
     at_bound: tuple[str, ...] = ()
     without: tuple[Effect, ...] = ()
+    alike: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:

@@ -71,6 +71,20 @@ def solve(total: np.ndarray, columns: list[int], scale: np.ndarray, prior: Prior
     return np.linalg.solve(a, total[columns, 0] * s + prior.precision * prior.center)
 
 
+def alike(effects: Sequence[str], correlation: np.ndarray, name: str, limit: float) -> list[str]:
+    """Effects of which a number goes with one of this effect's.
+
+    Args:
+        effects: of each number.
+        correlation: (n, n) of the numbers; NaN for those that go with none.
+        name: of the effect.
+        limit: correlation from which on two go together.
+    """
+    every = np.array(effects)
+    most = np.nan_to_num(np.abs(correlation))[every == name].max(axis=0)
+    return [other for other in dict.fromkeys(effects) if other != name and most[every == other].max() > limit]
+
+
 def covariance(
     blocks: np.ndarray, columns: list[int], scale: np.ndarray, values: np.ndarray, prior: Prior | None = None
 ) -> np.ndarray:

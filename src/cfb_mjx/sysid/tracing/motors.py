@@ -17,10 +17,11 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.rotors.flown_motors import Motors, Told, evenly_spread, flown_motors
+from cfb_mjx.sysid.tracing.evidence import alike
 from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Hypothesis, bounds
 from cfb_mjx.sysid.tracing.jointly import look_by_look, one_by_one
 from cfb_mjx.sysid.tracing.search import Search
-from cfb_mjx.sysid.tracing.trace import numbers_of
+from cfb_mjx.sysid.tracing.trace import numbers_of, spread_of
 
 FITTED = ("command_delay", "battery_sag")
 """Effects of motors whose constants are fitted anew that are fitted with these."""
@@ -101,11 +102,15 @@ def _told(search: Search, hypothesis: Hypothesis) -> tuple[Told, ...]:
     # Predictions hold a command until the next row: what a lead takes back a delay would have too much.
     hypothesis = search.settled(replace(hypothesis, lead=0.0), search.rules.look_steps, lead_free=False, shrunk=True)
     linear = search.linearise(hypothesis, search.own_columns(hypothesis))
+    columns, spread = spread_of(search, hypothesis, linear)
+    deviation = np.sqrt(np.diag(spread))
+    correlation = spread / np.outer(deviation, deviation)
     found = []
     for name, (evidence, without) in one_by_one(search, hypothesis).items():
         _, std = numbers_of(search, hypothesis, linear, name)
         effect = hypothesis.effect(name)
         at_bound = tuple(f"{name}.{f}" for f in std if np.any(np.isin(getattr(effect, f), bounds(name, f))))
         others = tuple(without.effect(other) for other in hypothesis.present if other != name)
-        found.append(Told(effect, std, evidence.t, at_bound, others))
+        same = alike([c.effect for c in columns], correlation, name, search.rules.confused)
+        found.append(Told(effect, std, evidence.t, at_bound, others, tuple(same)))
     return tuple(found)

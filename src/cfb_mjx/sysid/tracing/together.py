@@ -34,7 +34,7 @@ from cfb_mjx.sysid.refinement import Number, Refinement, plausible_numbers, refi
 from cfb_mjx.sysid.refinement.numbers import HELD, PLANT
 from cfb_mjx.sysid.refinement.predictions import kinds_alike
 from cfb_mjx.sysid.rotors.flown_motors import Motors
-from cfb_mjx.sysid.tracing.evidence import Evidence, covariance, solve
+from cfb_mjx.sysid.tracing.evidence import Evidence, alike, covariance, solve
 from cfb_mjx.sysid.tracing.fits import beside_hold
 from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Column, Hypothesis, moved, neutral_effects, strengths
 from cfb_mjx.sysid.tracing.motors import MOTORS, motors_of, with_motors
@@ -408,10 +408,10 @@ def _parts(
                 found.uncertainty(name),
                 [n.name for n in found.numbers if n.effect == name and found.at_bound(n)],
             )
-            confusable = _confusable(found, name, rules.confused)
+            confusable = alike([n.effect for n in found.numbers], found.correlation, name, rules.confused)
             t, p_value = _surely([(a - b).sum(axis=(1, 2)) for a, b in zip(less.losses, whole.losses, strict=True)])
         else:
-            std, at_bound, confusable = own.std, list(own.at_bound), []
+            std, at_bound, confusable = own.std, list(own.at_bound), list(own.alike)
             t, p_value = own.t, float(norm.sf(own.t))
         values = {key: np.asarray(getattr(effect, key)).tolist() for key in std}
         buys = 1 - error / _mean(less.errors)
@@ -438,12 +438,3 @@ def _idle(effect: Effect) -> bool:
 def _mean(errors: list[np.ndarray]) -> float:
     """Over all windows, horizons and quantities."""
     return float(np.concatenate([each.ravel() for each in errors]).mean())
-
-
-def _confusable(found: Refinement, name: str, limit: float) -> list[str]:
-    """Effects of which a number goes with one of this effect's."""
-    # Numbers at a bound go with none.
-    correlation = np.nan_to_num(np.abs(found.correlation))
-    effects = np.array([n.effect for n in found.numbers])
-    most = correlation[effects == name].max(axis=0)
-    return [other for other in dict.fromkeys(effects[effects != name]) if most[effects == other].max() > limit]

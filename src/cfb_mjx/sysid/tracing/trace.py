@@ -295,13 +295,19 @@ def simplified(
 
 def deviations(search: Search, hypothesis: Hypothesis, linear: Linear) -> dict[Column, float]:
     """Standard deviation of every number of the effects that are there, fitted together with the lead."""
+    columns, spread = spread_of(search, hypothesis, linear)
+    return dict(zip(columns, np.sqrt(np.diag(spread)).tolist(), strict=True))
+
+
+def spread_of(search: Search, hypothesis: Hypothesis, linear: Linear) -> tuple[list[Column], np.ndarray]:
+    """The numbers of the effects that are there and their covariance (n, n), fitted together with the lead."""
     columns = search.own_columns(hypothesis)
     index = [1, *linear.index(columns)]
     values = solve(linear.blocks.sum(0), index, linear.scale)
     prior = Prior.weak(len(index)).pulled(0, 0.0, (linear.scale[1] / LEAD_SPREAD) ** 2)
     spread = covariance(linear.blocks, index, linear.scale, values, prior)
-    deviation = np.sqrt(np.diag(spread)) * linear.scale[index]
-    return dict(zip(columns, deviation[1:].tolist(), strict=True))
+    scale = linear.scale[index][1:]
+    return columns, spread[1:, 1:] * np.outer(scale, scale)
 
 
 def numbers_of(search: Search, hypothesis: Hypothesis, linear: Linear, name: str) -> tuple[dict, dict]:
