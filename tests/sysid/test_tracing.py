@@ -23,10 +23,11 @@ from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.closing import close_loop
 from cfb_mjx.sysid.tracing.evidence import dealt, evidence
+from cfb_mjx.sysid.tracing.fits import as_it_is
 from cfb_mjx.sysid.tracing.formula import with_library
 from cfb_mjx.sysid.tracing.given import fit_given
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, moved, neutral_effects, shapes, strengths, term_columns
-from cfb_mjx.sysid.tracing.jointly import beside_each_other, everything, needless, one_by_one
+from cfb_mjx.sysid.tracing.jointly import beside_each_other, everything, needless, one_by_one, told_apart
 from cfb_mjx.sysid.tracing.residuals import find_lines, residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors, lags
@@ -55,6 +56,7 @@ CASES = [
     Case("nicked", 9008, (("prop_damage", 1.0),)),
     Case("sticky", 9009, (("motor_hysteresis", 1.0),)),
     Case("many", 9010, MANY),
+    Case("loaded", 9012, (("payload", 0.8), ("cog_offset", 1.0))),
 ]
 
 
@@ -478,6 +480,27 @@ def test_what_stands_beside_others_is_told_from_what_stands_in_for_them(campaign
     # An effect that is not there is seen to be needless, the one that is not.
     both = search.settled(found.having(CATALOGUE["thrust_tilt"](tilt=[0.01, 0.0], twist=0.0)))
     assert set(needless(search, both)) == {"thrust_tilt"}
+
+
+def test_a_load_beside_the_axis_is_told_from_one_on_it_and_a_centre_of_gravity_of_its_own(campaigns, base):
+    """The place of the load takes up the other, but for an inertia that is not there."""
+    campaign = campaigns["loaded"]
+    search = Search.start(campaign.fit, base.parameters(), 0.008, check_sensors(campaign.fit, 0.008, 0.0))
+    aside = search.learned(search.nothing())
+    aside = search.settled(aside.having(aside.effect("payload")), shrunk=True)
+    assert np.hypot(*aside.effect("payload").offset) > 0.01
+    found = told_apart(search, as_it_is(search, aside, whole=False)).hypothesis
+    assert found.present == ("payload", "cog_offset")
+    np.testing.assert_array_equal(found.effect("payload").offset, 0.0)
+    truth = campaign.truth["effects"]
+    mass, load = float(base.parameters().mass), float(found.effect("payload").mass)
+    assert load == pytest.approx(truth["payload"]["mass"], rel=0.05)
+    # There the whole drone's centre of gravity lies beside the axis, here the bare drone's.
+    place = found.effect("cog_offset").offset * mass / (mass + load)
+    np.testing.assert_allclose(place, truth["cog_offset"]["cog"][:2], atol=5e-5)
+    # What that drone has needs no telling apart.
+    fit = as_it_is(search, found, whole=False)
+    assert told_apart(search, fit) is fit
 
 
 def test_what_is_taken_out_goes_back_to_the_declared_model(campaigns, base):

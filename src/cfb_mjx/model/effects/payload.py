@@ -41,6 +41,8 @@ class Payload(Effect):
         "offset": Limits(-1.0, 1.0, -0.08, 0.08),
     }
     strengths: ClassVar[tuple[str, ...]] = ("mass",)
+    # To first order: what hangs beside the axis has an inertia of its own besides.
+    said_by: ClassVar[dict[str, str]] = {"offset": "cog_offset"}
     # Hung on the drone as its own inertia and centre of gravity leave it.
     rank: ClassVar[int] = 1
     probes: ClassVar[tuple[dict[str, float], ...]] = (

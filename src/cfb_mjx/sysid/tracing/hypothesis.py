@@ -69,14 +69,15 @@ def strengths(name: str, others: Collection[str] = ()) -> list[list[Column]]:
     return [columns_of(name, own, probe) for probe in kind.probes]
 
 
-def shapes(effect: Effect) -> list[Column]:
+def shapes(effect: Effect, others: Collection[str] = ()) -> list[Column]:
     """Columns of what describes the shape of an effect that is there: fitted once its strength is known.
 
-    What no flight tells (`Effect.assumed`) is left as it is.
+    What no flight tells (`Effect.assumed`) is left as it is, and so is what ``others`` say as well.
     """
     kind = type(effect)
-    moving = {key for probe in kind.probes for key in probe}
-    return columns_of(kind.name, tuple(f for f in kind.prior if f in moving and f not in kind.assumed), {})
+    moving = {key for probe in kind.probes for key in probe} - set(kind.assumed)
+    own = tuple(f for f in kind.prior if f in moving and kind.said_by.get(f) not in others)
+    return columns_of(kind.name, own, {})
 
 
 def bounds(name: str, item: str) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from cfb_mjx.model.effects import CATALOGUE
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, evidence, solve
-from cfb_mjx.sysid.tracing.fits import as_it_is, confirm
+from cfb_mjx.sysid.tracing.fits import ERRORS, as_it_is, confirm
 from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Column, Fit, Hypothesis, Linear, sensible
 from cfb_mjx.sysid.tracing.search import Search
 
@@ -124,6 +124,24 @@ def look_by_look(
         hypothesis, linear = richer, search.whole(richer)
         seen.add(frozenset(hypothesis.present))
     return hypothesis, linear
+
+
+def told_apart(search: Search, fit: Fit, say: Callable[[str], None] = lambda _: None) -> Fit:
+    """The fit with another effect in place of a field that says nearly the same, where that is better.
+
+    Beside a free field the other effect explains nothing, so no look takes it in (`Effect.said_by`). The innovations
+    must not refute it, and predictions be better by `Rules.same_errors`.
+    """
+    for name in fit.hypothesis.present:
+        said_by = {} if name == SHIFT else CATALOGUE[name].said_by
+        for other in (set(said_by.values()) & set(search.names)) - set(fit.hypothesis.present):
+            say(f"telling {name} from {other}")
+            rival = fit.hypothesis.having(fit.hypothesis.effect(other))
+            rival = search.settled(rival, search.rules.look_steps, shrunk=True)
+            if confirm(search, fit.hypothesis, rival).t > -search.rules.doubtful:
+                apart = as_it_is(search, rival, whole=False)
+                fit = apart if _total(apart) < _total(fit) - len(ERRORS) * search.rules.same_errors else fit
+    return fit
 
 
 def borne_out(search: Search, fit: Fit, say: Callable[[str], None] = lambda _: None) -> Fit:

@@ -251,7 +251,7 @@ class Search:
                 continue
             found += strengths(name, hypothesis.present)[0]
             if not (guessed and coarse(name)):
-                found += shapes(hypothesis.effect(name))
+                found += shapes(hypothesis.effect(name), hypothesis.present)
         return [replace(c, probe=()) for c in found] + list(hypothesis.terms)
 
     def whole(self, hypothesis: Hypothesis) -> Linear:

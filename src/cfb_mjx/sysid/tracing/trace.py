@@ -15,7 +15,7 @@ from cfb_mjx.sysid.tracing.checkpoint import Checkpoint, Progress
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, solve
 from cfb_mjx.sysid.tracing.fits import ERRORS, as_it_is, completed, confirm, fitted, prediction_errors
 from cfb_mjx.sysid.tracing.hypothesis import LEAD_SPREAD, SHIFT, Column, Fit, Hypothesis, Linear
-from cfb_mjx.sysid.tracing.jointly import beside_each_other, borne_out, everything, one_by_one
+from cfb_mjx.sysid.tracing.jointly import beside_each_other, borne_out, everything, one_by_one, told_apart
 from cfb_mjx.sysid.tracing.rules import RULES, Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
@@ -162,6 +162,8 @@ def trace(
     if len(fit.hypothesis.present) > 1 and not starts:
         single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
         fit, left_out = (completed(search, single), {}) if single is not None else (fit, left_out)
+    apart = told_apart(search, fit, progress)
+    fit, left_out = (completed(search, apart), {}) if apart is not fit else (fit, left_out)
     found = []
     for name in fit.hypothesis.present:
         whole = judged if name in left_out else fit.hypothesis
@@ -180,6 +182,7 @@ def lacks_many(search: Search, fit: Fit, progress: Callable[[str], None]) -> Fit
     if sum(each.found.t > search.rules.clear for each in standing) < search.rules.many:
         return None
     whole = everything(search, progress)
+    whole = told_apart(search, whole, progress)
     if not (np.log(whole.errors / fit.errors).sum() < 0 and whole.beside_hold < search.rules.far_off):
         return None
     return completed(search, borne_out(search, whole, progress))
