@@ -482,6 +482,32 @@ def test_what_stands_beside_others_is_told_from_what_stands_in_for_them(campaign
     assert set(needless(search, both)) == {"thrust_tilt"}
 
 
+def test_no_field_says_all_that_another_effect_says_unless_it_is_declared(campaigns, base):
+    """Two such numbers, both free, cancel. An effect of which nothing else is left needs no word: it explains nothing
+    beside the other, and no search keeps it."""
+    logs, parameters = campaigns["drag"].fit, base.parameters()
+    search = Search.start(logs, parameters, 0.008, check_sensors(logs, 0.008, 0.0))
+    # With a load, so that its place shows.
+    loaded = search.learned(search.nothing().having(CATALOGUE["payload"](mass=0.005, height=-0.02, offset=0.0)))
+    variants = [variant for name in search.names for variant in strengths(name)]
+    variants += [shapes(loaded.effect("payload"))]
+    linear = search.linearise(loaded, [column for variant in variants for column in variant])
+    products, where = linear.blocks.sum(axis=0), {id(v): linear.index(v) for v in variants}
+    same = set()
+    for one in variants:
+        for other in variants:
+            if one[0].effect != other[0].effect:
+                index = where[id(other)]
+                within = np.linalg.pinv(products[np.ix_(index, index)], hermitian=True)
+                for column, i in zip(one, where[id(one)], strict=True):
+                    if products[index, i] @ within @ products[index, i] > 0.9998 * products[i, i]:
+                        same.add((column.effect, column.field, other[0].effect))
+    numbers = {name: {column.field for v in variants if v[0].effect == name for column in v} for name in search.names}
+    said = {(name, field, by) for name in search.names for field, by in CATALOGUE[name].said_by.items()}
+    whole = {(name, by) for name, _, by in same if numbers[name] <= {f for n, f, b in same if (n, b) == (name, by)}}
+    assert {each for each in same if (each[0], each[2]) not in whole} == said
+
+
 def test_a_load_beside_the_axis_is_told_from_one_on_it_and_a_centre_of_gravity_of_its_own(campaigns, base):
     """The place of the load takes up the other, but for an inertia that is not there."""
     campaign = campaigns["loaded"]
