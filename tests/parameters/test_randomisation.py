@@ -118,6 +118,16 @@ def test_identification_ranges(nominal):
     assert jnp.all(drawn.attitude_offset == 0)
 
 
+def test_the_other_reading_of_motor_dynamics_leaves_the_gain_alone(nominal):
+    """With it, what a command of hover lifts varies by what the paper gives thrust."""
+    both, lag = (dict(load_randomisation(name).ranges) for name in ("paper", "paper-lag"))
+    assert set(both) - set(lag) == {"motor_gain"}
+    assert all(lag[name] == both[name] for name in lag)
+    drawn = sample_parameters(jax.random.key(1), nominal, load_randomisation("paper-lag"))
+    assert jnp.all(drawn.motor_gain == nominal.motor_gain)
+    assert not jnp.any(drawn.motor_time_constant == nominal.motor_time_constant)
+
+
 def _ranges(text):
     return f"format: cfb_mjx randomisation 1\nranges:\n  {text}\n"
 
