@@ -24,6 +24,11 @@ VARIANTS = {
     "ppo-lambda": ("target", (*UNLIMITED, "ppo.gae_lambda=0.95"), "not limited, gae_lambda 0.95"),
     "ppo-random": ("target", RANDOM, "the paper's randomisation"),
     "ppo-random-unlimited": ("target", (*RANDOM, "ppo.advantage_limit=1e9"), "the same, not limited"),
+    "ppo-random-detrended": (
+        "target",
+        (*RANDOM, "ppo.detrended=true", "ppo.gae_lambda=0.97"),
+        "the paper's randomisation, `detrended`, gae_lambda 0.97",
+    ),
     "ppo-rare": (
         "target",
         (*UNLIMITED, "ppo.drones=2048"),

@@ -17,11 +17,11 @@ from cfb_mjx.model import Quadrotor, rollout_final
 from cfb_mjx.parameters import load_model_file, load_randomisation, save_model_file
 from cfb_mjx.train import run
 from cfb_mjx.train.analytic import Analytic
-from cfb_mjx.train.brax_compat import brax_ppo
+from cfb_mjx.train.brax_compat import brax_ppo, parts
 from cfb_mjx.train.config import AnalyticSettings, load_config
 from cfb_mjx.train.flying import Hover
 from cfb_mjx.train.plants import load_plants
-from cfb_mjx.train.ppo import Ppo
+from cfb_mjx.train.ppo import Ppo, detrended
 from cfb_mjx.train.run import BEST, CHECKPOINT, CURVE, POLICY, UPDATES, Training, segments, train
 from tests.helpers import SMALL_TRAINING, watch_keys
 
@@ -193,6 +193,34 @@ def test_the_learner_is_shown_no_reward_below_the_least_and_failed_drones_begin_
     # Another drone each, and the rest of the commands flown with it.
     assert not np.any(np.asarray(after.model.parameters.mass)[:3] == np.asarray(episodes.model.parameters.mass)[:3])
     np.testing.assert_array_equal(after.count[:3], config.ppo.unroll - 1)
+
+
+def test_a_value_that_is_wrong_all_the_while_tells_nothing_of_a_command():
+    """Brax's advantages with values wrong by a constant for each drone, detrended, are those of the right values."""
+    of_reward, of_value = jax.random.split(jax.random.key(0))
+    rewards, values = jax.random.normal(of_reward, (32, 5)), jax.random.normal(of_value, (33, 5))
+    over = jnp.zeros((32, 5)).at[10, 4].set(1.0)
+
+    def advantages(wrong):
+        _, found = parts().losses.compute_gae(
+            truncation=jnp.zeros_like(over),
+            termination=over,
+            rewards=rewards,
+            values=values[:-1] + wrong,
+            bootstrap_value=values[-1] + wrong,
+            lambda_=0.97,
+            discount=0.99,
+        )
+        return found
+
+    right, shifted = advantages(0.0), advantages(jnp.arange(5.0))
+    assert float(jnp.abs(shifted - right)[:, 1:].max(axis=0).min()) > 0.1
+    found = detrended(shifted, over, 0.97 * 0.99)
+    np.testing.assert_allclose(found[:, :4], detrended(right, over, 0.97 * 0.99)[:, :4], atol=1e-4)
+    np.testing.assert_allclose(found[:, :4].mean(axis=0), 0.0, atol=1e-5)
+    # What the end of an episode cost is told as it is.
+    np.testing.assert_array_equal(found[:, 4], shifted[:, 4])
+    assert float(jnp.var(found[:, :4])) > 0.3 * float(jnp.var(right[:, :4]))
 
 
 # In the middle of a segment, and after its last update.

@@ -84,6 +84,9 @@ class PpoSettings:
     advantage_limit: float = 3.0
     """Advantages larger than so many times their mean magnitude count as that: the few drones that fail, by a lot,
     would otherwise drown what all the others have to learn about their last decimetre."""
+    detrended: bool = False
+    """Whether what a value wrong by one and the same amount adds to a drone's advantages is taken out of them, and
+    their mean, where no episode ends."""
     entropy_cost: float = 1e-3
     reward_scaling: float = 0.02
     least_reward: float = -30.0

@@ -217,6 +217,9 @@ class Ppo:
             lambda_=self.settings.gae_lambda,
             discount=self.settings.discount,
         )
+        if self.settings.detrended:
+            both = self.settings.discount * self.settings.gae_lambda
+            advantage = detrended(advantage, jnp.maximum(data["failed"], data["cut"]), both)
         most = self.settings.advantage_limit * jnp.mean(jnp.abs(advantage))
         advantage = jnp.clip(advantage, -most, most)
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
@@ -239,6 +242,20 @@ class Ppo:
 
     def _value(self, critic: Network, shown: Array) -> Array:
         return self.ideal + critic(shown)[..., 0]
+
+
+def detrended(advantage: Float[Array, "n drones"], over: Float[Array, "n drones"], decay: float) -> Array:
+    """Advantages of an unroll, less their mean and what a value too high by a constant makes of them.
+
+    Args:
+        advantage: generalised advantages (Schulman et al. 2016), from the first command to the last.
+        over: 1 where an episode ends. Drones of which one does keep their advantages, for these say what it cost.
+        decay: discount times lambda: the error of the value is seen from every command to the unroll's end.
+    """
+    seen = 1 - decay ** jnp.arange(len(advantage), 0, -1.0)
+    basis, _ = jnp.linalg.qr(jnp.stack([jnp.ones_like(seen), seen], axis=1))
+    whole = 1 - jnp.max(over, axis=0)
+    return advantage - whole * (basis @ (basis.T @ advantage))
 
 
 def _logits(actor: Actor, seen: Array) -> Array:
