@@ -118,45 +118,54 @@ class BraxEnv(Env):
 
 class RedrawWrapper(Wrapper):
     """Where an episode has ended another begins, on another drone: in place of `AutoResetWrapper`, which goes back to
-    the first episode's start and drone for ever."""
+    the first episode's start and drone for ever. States are Brax's or MuJoCo Playground's."""
 
-    def reset(self, rng: jax.Array) -> State:
+    def reset(self, rng: jax.Array) -> Any:
         """Begin all episodes, and draw what comes after them."""
         own, waiting, rest = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(rng)
         state = self.env.reset(own)
         next_one = self.env.reset(waiting)
-        state.info["waiting"] = {"episode": next_one.pipeline_state, "obs": next_one.obs}
+        state.info["waiting"] = {"flying": _flying(next_one), "obs": next_one.obs}
         state.info["redraw"] = {"key": rest, "count": jnp.zeros((), jnp.int32)}
         return state
 
-    def step(self, state: State, action: jax.Array) -> State:
+    def step(self, state: Any, action: jax.Array) -> Any:
         """As the wrapped environment's; what is seen after the last command of an episode is the next one's start."""
         # What is wrapped is vmapped, and knows nothing of what is kept here.
         info = dict(state.info)
         waiting, redraw = info.pop("waiting"), info.pop("redraw")
         info["steps"] = jnp.where(state.done > 0, 0.0, info["steps"])
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done), info=info), action)
-        going = state.pipeline_state, state.obs
-        episode, obs = choose(state.done > 0, (waiting["episode"], waiting["obs"]), going)
+        going = _flying(state), state.obs
+        flying, obs = choose(state.done > 0, (waiting["flying"], waiting["obs"]), going)
 
         def drawn(key):
             key, own = jax.vmap(jax.random.split, out_axes=1)(key)
             fresh = self.env.reset(own)
-            return {"episode": fresh.pipeline_state, "obs": fresh.obs}, key
+            return {"flying": _flying(fresh), "obs": fresh.obs}, key
 
         count = redraw["count"] + 1
         waiting, key = jax.lax.cond(count % EACH == 0, drawn, lambda key: (waiting, key), redraw["key"])
         info = {**state.info, "waiting": waiting, "redraw": {"key": key, "count": count}}
-        return state.replace(pipeline_state=episode, obs=obs, info=info)
+        return state.replace(**{_holds(state): flying}, obs=obs, info=info)
+
+
+def _holds(state: Any) -> str:
+    """Where what flies is kept: in ``data`` in states of MuJoCo Playground."""
+    return "data" if hasattr(state, "data") else "pipeline_state"
+
+
+def _flying(state: Any) -> Any:
+    return getattr(state, _holds(state))
 
 
 def wrap(
-    env: Env, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable | None = None
+    env: Any, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable | None = None
 ) -> Wrapper:
     """For ``wrap_env_fn`` of Brax's trainers: as `brax.envs.training.wrap`, but every episode on a drone of its own.
 
     Args:
-        env: a `BraxEnv`.
+        env: a `BraxEnv`, or one of `cfb_mjx.envs.playground`.
         episode_length: commands in an episode.
         action_repeat: times that each action is flown.
         randomization_fn: of drones about which the episodes' are drawn, in Brax's way; none by default.

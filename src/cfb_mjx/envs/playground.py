@@ -1,0 +1,195 @@
+"""Tasks as environments of MuJoCo Playground, for its trainers and those written for them.
+
+    import cfb_mjx.envs.playground  # registers them
+    from mujoco_playground import registry
+
+    env = registry.load("CfbTarget", config_overrides={"model": "cfb", "magnitude": 1.0})
+
+`BraxEnv` with Playground's interface: what flies lies in ``state.data``, sizes are shapes, a configuration says which
+drone. `cfb_mjx.envs.brax_env.wrap` begins every episode on a drone of its own; Playground's wrapper goes back to the
+first one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import mujoco
+from brax.envs import base as brax
+from jaxtyping import Array, Float
+from mujoco import mjx
+
+from cfb_mjx.envs.brax_env import BraxEnv
+from cfb_mjx.envs.episode import Episode, Task
+from cfb_mjx.envs.flip import FlipTask
+from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import shipped
+from cfb_mjx.model.mjx_body import BODY_NAME
+from cfb_mjx.parameters import load_randomisation
+from cfb_mjx.quiet import quietly
+
+try:
+    with quietly():
+        from ml_collections import config_dict
+        from mujoco_playground import MjxEnv, State, dm_control_suite
+except ImportError as error:
+    raise CfbError(f"MuJoCo Playground is not installed ({error}): pip install playground.") from None
+
+
+CAMERA = "track"
+"""Of `CfbEnv.render`, unless another is asked for: it stays beside the drone."""
+PLACE, AXES = (0.0, -0.35, 0.15), (1.0, 0.0, 0.0, 0.0, 0.4, 0.92)
+
+
+class Data(eqx.Module):
+    """What flies, and what drawing needs of MuJoCo's data."""
+
+    episode: Episode
+
+    @property
+    def qpos(self) -> Float[Array, "*batch 7"]:
+        """Position of the centre of gravity, m, and quaternion (w, x, y, z)."""
+        return jnp.concatenate([self.episode.state.position, self.episode.state.quaternion], axis=-1)
+
+    @property
+    def qvel(self) -> Float[Array, "*batch 6"]:
+        """Velocity, m/s, world axes, and body rate, rad/s, body axes."""
+        return jnp.concatenate([self.episode.state.velocity, self.episode.state.body_rate], axis=-1)
+
+    @property
+    def mocap_pos(self) -> Float[Array, "*batch 0 3"]:
+        """Of no body."""
+        return jnp.zeros((*self.qpos.shape[:-1], 0, 3))
+
+    @property
+    def mocap_quat(self) -> Float[Array, "*batch 0 4"]:
+        """Of no body."""
+        return jnp.zeros((*self.qpos.shape[:-1], 0, 4))
+
+    @property
+    def xfrc_applied(self) -> Float[Array, "*batch 2 6"]:
+        """Nothing: the rotors' forces are not MuJoCo's."""
+        return jnp.zeros((*self.qpos.shape[:-1], 2, 6))
+
+
+def default_config() -> config_dict.ConfigDict:
+    """The nominal drone with guards; ``randomisation`` names ranges, drawn ``magnitude`` of them, "" none."""
+    task = TargetTask()
+    return config_dict.create(
+        ctrl_dt=task.layout.control_dt_s,
+        sim_dt=0.004,
+        episode_length=task.episode_steps,
+        action_repeat=1,
+        model="cfb-guards",
+        randomisation="paper",
+        magnitude=1.0,
+        asymmetric=True,
+    )
+
+
+class CfbEnv(MjxEnv):
+    """One drone on a task.
+
+    Args:
+        config: as `default_config`.
+        config_overrides: of some of its numbers.
+        task: in place of the paper's first one as the configuration has it.
+
+    Raises:
+        CfbError: as `BraxEnv`, or a control step that is not the task's.
+    """
+
+    task_type: type[Task] = TargetTask
+
+    def __init__(
+        self,
+        config: config_dict.ConfigDict | None = None,
+        config_overrides: dict[str, Any] | None = None,
+        task: Task | None = None,
+    ):
+        super().__init__(default_config() if config is None else config, config_overrides)
+        own = self._config
+        if task is None:
+            ranges = load_randomisation(own.randomisation) if own.randomisation else None
+            task = self.task_type(randomisation=ranges, magnitude=own.magnitude)
+        self._env = BraxEnv(task, own.model, asymmetric=own.asymmetric)
+        real = self._env.dt, float(self._env.sys.dt)
+        if (own.ctrl_dt, own.sim_dt) != real:
+            raise CfbError(
+                f"ctrl_dt = {own.ctrl_dt:g}, sim_dt = {own.sim_dt:g} in the configuration, but the task's commands are "
+                f"{real[0]:g} s apart and the model's steps {real[1]:g} s: say these, or give a task of your own."
+            )
+        seen = mujoco.MjSpec.from_file(self.xml_path)
+        # Tasks fly about the origin, below it too.
+        for floor in [geom for geom in seen.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
+            seen.delete(floor)
+        seen.body(BODY_NAME).add_camera(name=CAMERA, mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK, pos=PLACE, xyaxes=AXES)
+        seen.stat.extent = 2.0  # the nearest that is drawn is a share of it
+        self._mj_model = seen.compile()
+
+    @property
+    def task(self) -> Task:
+        """What is flown."""
+        return self._env.task
+
+    def reset(self, rng: jax.Array) -> State:
+        """As `BraxEnv.reset`."""
+        return _shown(self._env.reset(rng))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """As `BraxEnv.step`."""
+        flying = brax.State(state.data.episode, state.obs, state.reward, state.done, state.metrics, state.info)
+        return _shown(self._env.step(flying, action))
+
+    @property
+    def action_size(self) -> int:
+        """One number for each motor."""
+        return self._env.action_size
+
+    @property
+    def xml_path(self) -> str:
+        """Of the drone as it is drawn."""
+        return str(shipped("assets", "cfb.xml"))
+
+    @property
+    def mj_model(self) -> mujoco.MjModel:
+        """The drone as it is drawn; how it flies its own model says."""
+        return self._mj_model
+
+    @property
+    def mjx_model(self) -> mjx.Model:
+        """The same for MJX."""
+        return mjx.put_model(self._mj_model)
+
+    def render(self, trajectory: Any, height: int = 240, width: int = 320, camera: str | None = CAMERA, **options: Any):
+        """As Playground's: pictures of states; by default from beside the drone."""
+        return super().render(trajectory, height, width, camera, **options)
+
+    @property
+    def _mjx_model(self) -> mjx.Model:
+        return self.mjx_model
+
+    @_mjx_model.setter
+    def _mjx_model(self, _: mjx.Model) -> None:
+        # What Playground's wrapper for randomisation sets; no drone would fly otherwise for it.
+        raise CfbError(
+            "randomization_fn: drones are randomised by `randomisation` and `magnitude` of the configuration."
+        )
+
+
+class CfbFlipEnv(CfbEnv):
+    """One drone on the paper's second task."""
+
+    task_type = FlipTask
+
+
+def _shown(state: brax.State) -> State:
+    return State(Data(state.pipeline_state), state.obs, state.reward, state.done, state.metrics, state.info)
+
+
+for name, kind in {"CfbTarget": CfbEnv, "CfbFlip": CfbFlipEnv}.items():
+    dm_control_suite.register_environment(name, kind, default_config)
