@@ -17,14 +17,14 @@ from cfb_mjx.sysid.refinement.numbers import PLANT
 from cfb_mjx.sysid.rotors.flown_motors import Told, flown_motors
 from cfb_mjx.sysid.sensor_faults import HEALTHY
 from cfb_mjx.sysid.tracing import closing, motors
-from cfb_mjx.sysid.tracing.evidence import alike
+from cfb_mjx.sysid.tracing.evidence import Evidence, alike
 from cfb_mjx.sysid.tracing.fits import beside_hold
-from cfb_mjx.sysid.tracing.hypothesis import Fit
+from cfb_mjx.sysid.tracing.hypothesis import Fit, strengths
 from cfb_mjx.sysid.tracing.motors import MOTORS, motors_of
 from cfb_mjx.sysid.tracing.rules import Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
-from cfb_mjx.sysid.tracing.together import fit_together, names_to_fit, of_type, paired
+from cfb_mjx.sysid.tracing.together import _with, fit_together, names_to_fit, of_type, paired
 from cfb_mjx.sysid.tracing.trace import Trace
 from cfb_mjx.view import closing_sections
 from cfb_mjx.view.closing_words import verdict
@@ -102,6 +102,16 @@ def test_effects_of_the_motors_are_named_from_rotor_speeds_alone(other_motors):
     assert "level" not in told["battery_sag"].std
     assert all(each.t > 8 for each in told.values() if each.name.startswith("motor_"))
     assert not any(each.alike for each in told.values())
+
+
+def test_a_load_that_is_tried_beside_a_centre_of_gravity_hangs_on_the_axis(whole):
+    """Its place beside the axis would say the same; without the other it is free."""
+    seen = Evidence(20.0, 9.0, 1e-9, np.array([0.5]))
+    others = tuple(n for n in whole.fit.numbers if n.effect != "cog_offset")
+    for numbers, free in ((whole.fit.numbers, set()), (others, {0, 1})):
+        _, added = _with(replace(whole.fit, numbers=numbers), strengths("payload")[0], seen)
+        assert {n.index for n in added if n.field == "offset"} == free
+        assert {n.field for n in added} >= {"mass", "height"}
 
 
 def test_numbers_that_go_together_name_each_others_effects():

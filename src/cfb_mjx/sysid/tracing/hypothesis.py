@@ -215,15 +215,9 @@ class Hypothesis:
         """The same with an effect that was absent; what of the others it says as well is as declared again."""
         name = type(effect).name
         present = (*self.present, name)
-        effects = []
-        for old, declared in zip(self.effects, self.origin, strict=True):
-            here = effect if type(old).name == name else old
-            if type(old).name in present:
-                for field_, by in here.said_by.items():
-                    if by in present:
-                        here = eqx.tree_at(lambda e, f=field_: getattr(e, f), here, getattr(declared, field_))
-            effects.append(here)
-        return replace(self, effects=tuple(effects), present=present)
+        effects = (effect if type(e).name == name else e for e in self.effects)
+        pairs = zip(effects, self.origin, strict=True)
+        return replace(self, effects=tuple(_unsaid(e, declared, present) for e, declared in pairs), present=present)
 
     def without(self, name: str) -> Hypothesis:
         """The same with one effect back at neutral."""
@@ -231,6 +225,14 @@ class Hypothesis:
         effects = tuple(declared if type(e).name == name else e for e, declared in pairs)
         shift = 0.0 if name == SHIFT else self.shift
         return replace(self, effects=effects, present=tuple(p for p in self.present if p != name), shift=shift)
+
+
+def _unsaid(effect: Effect, declared: Effect, others: Collection[str]) -> Effect:
+    """The effect with what others say as well as it is declared."""
+    for item, by in effect.said_by.items():
+        if by in others:
+            effect = eqx.tree_at(lambda e, f=item: getattr(e, f), effect, getattr(declared, item))
+    return effect
 
 
 @dataclass

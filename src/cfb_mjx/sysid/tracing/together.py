@@ -329,7 +329,9 @@ def _with(found: Refinement, variant: list[Column], evidence: Evidence) -> tuple
     for column, value in zip(variant, evidence.values, strict=True):
         effect = moved(effect, column, 0.1 * float(value) * column.scale, False)
     model = Quadrotor(found.model.parameters, (*found.model.effects, effect), body=found.model.body)
-    return model, plausible_numbers(model.parameters, [kind.name])
+    there = _fitted(found)
+    own = plausible_numbers(model.parameters, [kind.name])
+    return model, tuple(number for number in own if not any(map(number.said_by, there)))
 
 
 def _lean(
