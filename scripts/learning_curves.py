@@ -118,11 +118,11 @@ def figure(found: dict[str, list[dict]], path) -> None:
 
     from cfb_mjx.view.style import context, new_figure, save
 
-    colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C8C8C")
+    colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C8C8C", "#000000")
     with context():
         plot = new_figure(7.6, 3.4)
         axes = plot.subplots(1, 2, sharey=True)
-        for (name, runs), colour in zip(found.items(), colours, strict=False):
+        for (name, runs), colour in zip(found.items(), colours[: len(found)], strict=True):
             error = np.array([[row["hover_mm"] for row in run["curve"]] for run in runs])
             for axis, key, scale in zip(axes, ("seconds", "commands"), (1, 1e-6), strict=True):
                 at = scale * np.median([[row[key] for row in run["curve"]] for run in runs], axis=0)
