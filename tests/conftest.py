@@ -70,14 +70,14 @@ def in_haste(request, monkeypatch):
         return
     from jax._src import compiler
 
-    from tests.helpers import HASTE
+    from tests.helpers import haste
 
-    options = compiler.get_compile_options
+    options, wanted = compiler.get_compile_options, haste()
     monkeypatch.setattr(
         compiler,
         "get_compile_options",
         lambda *args, **given: options(
-            *args, **given | {"env_options_overrides": HASTE | (given.get("env_options_overrides") or {})}
+            *args, **given | {"env_options_overrides": wanted | (given.get("env_options_overrides") or {})}
         ),
     )
 

@@ -7,6 +7,7 @@ solves the coupled Newton-Euler equations of the rotors' centre (6 x 6 mass matr
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -206,6 +207,23 @@ def state_of(y: np.ndarray):
 
 HASTE = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
 """Options of XLA: large programs compile in half to two thirds of the time, and run up to four times slower."""
+
+
+@functools.cache
+def haste() -> dict[str, object]:
+    """Those of `HASTE` that the installed XLA knows: of jaxlib 0.12 on, emitters of fusions can no longer be chosen."""
+    return {name: value for name, value in HASTE.items() if _known(name, value)}
+
+
+def _known(name: str, value: object) -> bool:
+    try:
+        jax.jit(lambda x: x + 1.0).lower(0.0).compile(compiler_options={name: value})
+    except jax.errors.JaxRuntimeError as error:
+        if "No such compile option" not in str(error):
+            raise
+        return False
+    return True
+
 
 SMALL_TRAINING = (
     "checkpoints=2",
