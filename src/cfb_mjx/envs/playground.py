@@ -18,7 +18,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import mujoco
-from brax.envs import base as brax
 from jaxtyping import Array, Float
 from mujoco import mjx
 
@@ -34,6 +33,7 @@ from cfb_mjx.quiet import quietly
 
 try:
     with quietly():
+        from brax.envs import base as brax
         from ml_collections import config_dict
         from mujoco_playground import MjxEnv, State, dm_control_suite
 except ImportError as error:

@@ -15,6 +15,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
@@ -252,9 +253,9 @@ def detrended(advantage: Float[Array, "n drones"], over: Float[Array, "n drones"
         over: 1 where an episode ends. Drones of which one does keep their advantages, for these say what it cost.
         decay: discount times lambda: the error of the value is seen from every command to the unroll's end.
     """
-    seen = 1 - decay ** jnp.arange(len(advantage), 0, -1.0)
-    basis, _ = jnp.linalg.qr(jnp.stack([jnp.ones_like(seen), seen], axis=1))
-    whole = 1 - jnp.max(over, axis=0)
+    seen = 1 - decay ** np.arange(len(advantage), 0, -1.0)
+    basis, _ = np.linalg.qr(np.stack([np.ones_like(seen), seen], axis=1))
+    basis, whole = jnp.asarray(basis, advantage.dtype), 1 - jnp.max(over, axis=0)
     return advantage - whole * (basis @ (basis.T @ advantage))
 
 

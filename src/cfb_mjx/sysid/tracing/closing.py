@@ -24,7 +24,7 @@ from cfb_mjx.sysid.tracing.rules import RULES, Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.together import Part, asked, fit_together, hypothesis_of, paired
-from cfb_mjx.sysid.tracing.trace import Found, Trace, numbers_of, trace, with_rare
+from cfb_mjx.sysid.tracing.trace import Found, Trace, deviations, numbers_of, trace, with_rare
 
 
 def close_loop(
@@ -169,9 +169,10 @@ def _judged(
     if unconfirmed and reported:
         # What stays was fitted beside what goes.
         hypothesis, linear = search.refine(hypothesis)
+        stds = deviations(search, hypothesis, linear)
         for entry in reported:
             if entry.found is not None:
-                entry.parameters, entry.uncertainty = numbers_of(search, hypothesis, linear, entry.name)
+                entry.parameters, entry.uncertainty = numbers_of(hypothesis, stds, entry.name)
     return hypothesis, reported, unconfirmed
 
 

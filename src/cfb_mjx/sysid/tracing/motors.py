@@ -105,9 +105,10 @@ def _told(search: Search, hypothesis: Hypothesis) -> tuple[Told, ...]:
     columns, spread = spread_of(search, hypothesis, linear)
     deviation = np.sqrt(np.diag(spread))
     correlation = spread / np.outer(deviation, deviation)
+    stds = dict(zip(columns, deviation.tolist(), strict=True))
     found = []
     for name, (evidence, without) in one_by_one(search, hypothesis).items():
-        _, std = numbers_of(search, hypothesis, linear, name)
+        _, std = numbers_of(hypothesis, stds, name)
         effect = hypothesis.effect(name)
         at_bound = tuple(f"{name}.{f}" for f in std if np.any(np.isin(getattr(effect, f), bounds(name, f))))
         others = tuple(without.effect(other) for other in hypothesis.present if other != name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -162,8 +162,9 @@ def trace(
     if len(fit.hypothesis.present) > 1 and not starts:
         single = simplified(search, nothing, fit, tried[0]["ranking"], progress)
         fit, left_out = (completed(search, single), {}) if single is not None else (fit, left_out)
-    apart = told_apart(search, fit, progress)
-    fit, left_out = (completed(search, apart), {}) if apart is not fit else (fit, left_out)
+    if not starts:
+        apart = told_apart(search, fit, progress)
+        fit, left_out = (completed(search, apart), {}) if apart is not fit else (fit, left_out)
     found = []
     for name in fit.hypothesis.present:
         whole = judged if name in left_out else fit.hypothesis
@@ -181,8 +182,7 @@ def lacks_many(search: Search, fit: Fit, progress: Callable[[str], None]) -> Fit
     standing = beside_each_other(search, fit.hypothesis, fit.linear)
     if sum(each.found.t > search.rules.clear for each in standing) < search.rules.many:
         return None
-    whole = everything(search, progress)
-    whole = told_apart(search, whole, progress)
+    whole = told_apart(search, everything(search, progress), progress)
     if not (np.log(whole.errors / fit.errors).sum() < 0 and whole.beside_hold < search.rules.far_off):
         return None
     return completed(search, borne_out(search, whole, progress))
@@ -313,11 +313,11 @@ def spread_of(search: Search, hypothesis: Hypothesis, linear: Linear) -> tuple[l
     return columns, spread[1:, 1:] * np.outer(scale, scale)
 
 
-def numbers_of(search: Search, hypothesis: Hypothesis, linear: Linear, name: str) -> tuple[dict, dict]:
-    """Values and standard deviations of one effect, by field."""
+def numbers_of(hypothesis: Hypothesis, stds: Mapping[Column, float], name: str) -> tuple[dict, dict]:
+    """Values and standard deviations of one effect, by field; ``stds`` are of all numbers (`deviations`)."""
     parameters: dict[str, float | list[float]] = {}
     uncertainty: dict[str, float | list[float]] = {}
-    for column, std in deviations(search, hypothesis, linear).items():
+    for column, std in stds.items():
         if column.effect != name:
             continue
         value = np.asarray(hypothesis.shift if name == SHIFT else getattr(hypothesis.effect(name), column.field))
@@ -331,7 +331,7 @@ def numbers_of(search: Search, hypothesis: Hypothesis, linear: Linear, name: str
 
 def summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
     """What is reported of an effect, from a fit and what is left of it without the effect."""
-    parameters, uncertainty = numbers_of(search, fit.hypothesis, fit.linear, name)
+    parameters, uncertainty = numbers_of(fit.hypothesis, deviations(search, fit.hypothesis, fit.linear), name)
     gain, p_value = (less.own.gain, less.own.p_value) if less.own else (0.0, 1.0)
     close = 1 - search.rules.close
     rivals = {v[0].effect: e.gain for e, v in less.ranking if v[0].effect != name and e.gain > close * gain}
