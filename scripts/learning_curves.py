@@ -120,7 +120,7 @@ def figure(found: dict[str, list[dict]], path) -> None:
 
     colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C8C8C", "#000000")
     with context():
-        plot = new_figure(7.6, 3.4)
+        plot = new_figure(9.2, 3.4)
         axes = plot.subplots(1, 2, sharey=True)
         for (name, runs), colour in zip(found.items(), colours[: len(found)], strict=True):
             error = np.array([[row["hover_mm"] for row in run["curve"]] for run in runs])
@@ -134,8 +134,8 @@ def figure(found: dict[str, list[dict]], path) -> None:
         axes[0].set_yscale("log")
         axes[0].set_ylim(2, 5000)
         axes[0].yaxis.set_major_formatter(FormatStrFormatter("%g"))
-        axes[1].legend(frameon=False, fontsize=8)
-        plot.subplots_adjust(left=0.1, right=0.98, bottom=0.15, top=0.96, wspace=0.08)
+        axes[1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        plot.subplots_adjust(left=0.08, right=0.79, bottom=0.15, top=0.96, wspace=0.08)
         save(plot, path)
 
 
