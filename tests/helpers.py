@@ -117,7 +117,9 @@ def ode(constants: Constants, command: np.ndarray):
     """Right-hand side y' = f(t, y) with the command held."""
     m, c = constants.mass, constants.center_of_gravity
     cx = cross_matrix(c)
-    about_center = np.diag(constants.inertia) - m * cx @ cx
+    # Principal moments, or the whole tensor.
+    inertia = constants.inertia if np.ndim(constants.inertia) == 2 else np.diag(constants.inertia)
+    about_center = inertia - m * cx @ cx
     mass_matrix = np.block([[m * np.eye(3), -m * cx], [m * cx, about_center]])
     inverse = np.linalg.inv(mass_matrix)
     steady = constants.motor_gain * np.clip(command, 0.0, 1.0) + constants.motor_speed_offset

@@ -134,6 +134,7 @@ def _stepped(model, state, commands):
 @pytest.fixture(scope="module")
 def manoeuvre():
     y, commands = helpers.aggressive_manoeuvre(0.1)
+    y[5] = -1.0  # some effects show in descent alone
     return helpers.state_of(y), jnp.asarray(commands)
 
 

@@ -15,11 +15,11 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.model.effects import CATALOGUE, Inertia, RateDamping, RotorDrag
+from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS, Inertia, RateDamping, RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.flight import prepare_flight
-from cfb_mjx.sysid.sensor_faults import SensorFaults
+from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.closing import close_loop
 from cfb_mjx.sysid.tracing.evidence import dealt, evidence
@@ -75,9 +75,9 @@ def test_healthy_sensors_agree_with_each_other(campaigns):
     check = check_sensors(campaigns["clean"].fit, 0.008, 0.0)
     assert check.faults.healthy
     assert not check.findings
-    for name, healthy in (("sensor_delay", 0.0), ("sensor_gyro_lowpass", 0.0), ("sensor_velocity_scale", 1.0)):
-        value, std = check.measured[name]
-        assert abs(value - healthy) < 5 * std
+    assert set(check.measured) == set(SENSOR_FAULTS) - {"sensor_time_shift"}
+    for name, (value, std) in check.measured.items():
+        assert abs(value - SENSOR_FAULTS[name].healthy) < 5 * std
         assert std < 0.002
 
 
@@ -143,6 +143,31 @@ def test_a_velocity_stretched_along_some_axes_only_is_told_from_one_stretched_al
     for log, bad in zip(campaigns["clean"].fit, flights, strict=True):
         np.testing.assert_allclose(check.gyro_bias[log.name], healthy.gyro_bias[log.name], atol=1e-4)
         np.testing.assert_allclose(told.repaired(bad).velocity, log.velocity, atol=0.005 * np.abs(log.velocity).max())
+
+
+@pytest.mark.parametrize("scale", [0.88, 1.12])
+def test_a_gyro_out_of_scale_is_measured_and_taken_out(campaigns, scale):
+    """As one of another range than its driver believes; also where it lags besides."""
+    flights = [log.replace(body_rate=scale * log.body_rate) for log in campaigns["filtered"].fit]
+    check, other = (check_sensors(logs, 0.008, 0.0) for logs in (flights, campaigns["filtered"].fit))
+    assert {f.name for f in check.findings} == {"sensor_gyro_lowpass", "sensor_gyro_scale"}
+    assert check.faults.gyro_scale == pytest.approx(scale, abs=0.005)
+    assert check.faults.gyro_lag == pytest.approx(other.faults.gyro_lag, abs=1e-3)
+    told = SensorFaults.from_mappings(check.faults.to_mappings(), "drone.yaml")
+    assert told == check.faults
+    for log, bad in zip(campaigns["filtered"].fit, flights, strict=True):
+        right = SensorFaults(gyro_lag=told.gyro_lag).repaired(log).body_rate
+        np.testing.assert_allclose(told.repaired(bad).body_rate, right, atol=0.01 * np.abs(right).max())
+    model = Quadrotor.from_file(load_model_file("cfb-guards"))
+    key, held_out = "rate_rmse_radps@0.2s", campaigns["filtered"].held_out
+    bad = [log.replace(body_rate=scale * log.body_rate) for log in held_out]
+    before, after, whole = (
+        evaluate(model, logs, faults=faults).metrics("commands_in")[key]
+        for logs, faults in ((bad, HEALTHY), (bad, told), (held_out, other.faults))
+    )
+    assert after < 0.8 * before
+    # Errors are those of what such a gyro records.
+    assert after == pytest.approx(scale * whole, rel=0.05)
 
 
 def test_a_gyro_that_is_said_to_be_late_is_no_finding(campaigns, base):
@@ -370,7 +395,8 @@ def test_what_no_search_looks_for_takes_part_where_it_is_named_or_declared(campa
         return Search.start(campaigns["clean"].fit[:1], base.parameters(), 0.008, sensors, *given).names
 
     sensors = check_sensors(campaigns["clean"].fit, 0.008, 0.0)
-    assert set(CATALOGUE) - set(names()) == {"position_moment", "rate_damping", "gust", "jet"}
+    unsearched = {"position_moment", "rate_damping", "gust", "jet", "vortex_ring", "wall_effect"}
+    assert set(CATALOGUE) - set(names()) == unsearched
     assert "position_moment" in names((), ["position_moment"])
     assert "position_moment" in names((CATALOGUE["position_moment"].neutral(),))
 

@@ -28,6 +28,7 @@ ATTRIBUTES = {
         "with_attitude": "with_attitude",
     },
     "sensor_gyro_lowpass": {"lag": "gyro_lag"},
+    "sensor_gyro_scale": {"scale": "gyro_scale"},
     "sensor_time_shift": {"shift": "motor_shift"},
 }
 """Attributes of `SensorFaults` that hold the parameters of a fault of `SENSOR_FAULTS`."""
@@ -39,6 +40,7 @@ LIMITS = {
     "velocity_fade": Limits(1e-3, 1e6, 0.01, 1e3),
     "with_attitude": Limits(1.0, 1.0, 1.0, 1.0),
     "gyro_lag": Limits(-0.1, 1.0, -0.01, 0.05),
+    "gyro_scale": Limits(0.1, 10.0, 0.5, 2.0),
     "motor_shift": Limits(-1.0, 1.0, -0.06, 0.06),
 }
 """Where each attribute may lie."""
@@ -62,6 +64,7 @@ class SensorFaults:
             both by the same flow: the drone's motion is then taken as logged, and only the position moves less than the
             velocity says. None: the attitude is right, and the velocity alone is not.
         gyro_lag: lag of the gyro column, s.
+        gyro_scale: logged body rate over true body rate.
         motor_shift: how late command and rotor-speed columns are against all others, s (negative: early).
     """
 
@@ -72,6 +75,7 @@ class SensorFaults:
     velocity_fade: float | None = None
     with_attitude: float | None = None
     gyro_lag: float = 0.0
+    gyro_scale: float = 1.0
     motor_shift: float = 0.0
 
     @property
@@ -91,7 +95,7 @@ class SensorFaults:
         """What is left where columns are taken as they were logged: a stretch of the velocity, the attitude with it."""
         if self.stretch.none:
             return SensorFaults()
-        return replace(self, delay=0.0, gyro_lag=0.0, motor_shift=0.0, with_attitude=1.0)
+        return replace(self, delay=0.0, gyro_lag=0.0, gyro_scale=1.0, motor_shift=0.0, with_attitude=1.0)
 
     def unstretched(self, log: FlightLog) -> FlightLog:
         """The log with velocity and position in step, which needs no later row: the stretch taken out of the velocity,
@@ -133,6 +137,8 @@ class SensorFaults:
             changes["velocity"] = later(log.velocity, self.delay)
         if self.gyro_lag:
             changes["body_rate"] = later(log.body_rate, self.gyro_lag)
+        if self.gyro_scale != 1.0:
+            changes["body_rate"] = changes.get("body_rate", log.body_rate) / self.gyro_scale
         if self.motor_shift:
             # Between rows a mean of the two commands, in the share of the interval each would hold.
             changes["command"] = later(log.command, self.motor_shift)
@@ -176,7 +182,7 @@ class SensorFaults:
             position[:, pose],
             velocity[:, pose],
             predicted.quaternion[:, pose],
-            predicted.body_rate[:, gyro],
+            predicted.body_rate[:, gyro] * self.gyro_scale,
             predicted.rotor_speed[:, gyro],
         )
 

@@ -19,6 +19,7 @@ from cfb_mjx.model.effects.ground_effect import GroundEffect
 from cfb_mjx.model.effects.gust import Gust
 from cfb_mjx.model.effects.gyroscopic import Gyroscopic
 from cfb_mjx.model.effects.inertia import Inertia
+from cfb_mjx.model.effects.inertia_products import InertiaProducts
 from cfb_mjx.model.effects.inflow_thrust import InflowThrust
 from cfb_mjx.model.effects.jet import Jet
 from cfb_mjx.model.effects.motor_asymmetry import MotorAsymmetry
@@ -38,6 +39,9 @@ from cfb_mjx.model.effects.rotor_drag import RotorDrag
 from cfb_mjx.model.effects.thrust_scale import ThrustScale
 from cfb_mjx.model.effects.thrust_tilt import ThrustTilt
 from cfb_mjx.model.effects.torque_scale import TorqueScale
+from cfb_mjx.model.effects.translational_lift import TranslationalLift
+from cfb_mjx.model.effects.vortex_ring import VortexRing
+from cfb_mjx.model.effects.wall_effect import WallEffect
 from cfb_mjx.model.effects.wind import Wind
 
 __all__ = [
@@ -55,6 +59,7 @@ __all__ = [
     "Gust",
     "Gyroscopic",
     "Inertia",
+    "InertiaProducts",
     "InflowThrust",
     "Jet",
     "Memory",
@@ -78,6 +83,9 @@ __all__ = [
     "ThrustScale",
     "ThrustTilt",
     "TorqueScale",
+    "TranslationalLift",
+    "VortexRing",
+    "WallEffect",
     "Wind",
     "Wrench",
     "effect_from_mapping",

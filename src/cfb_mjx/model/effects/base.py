@@ -13,8 +13,9 @@ from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
-CONSTRAINT, EXPECTATION = 10, 11
-"""Ranks of a force that follows from all others (a string's tension), and of what is no physics but an expectation."""
+INERTIAL, CONSTRAINT, EXPECTATION = 9, 10, 11
+"""Ranks of how the body takes the torque of all forces, of a force that follows from all others (a string's tension),
+and of what is no physics but an expectation."""
 
 Memory = tuple[Vec, ...]
 """What one effect remembers from step to step: hidden states such as a delay line or a swinging load."""
@@ -99,7 +100,7 @@ class Effect(eqx.Module):
     rank: ClassVar[int] = 0
     """Which of two effects acts first where the second sees what the first leaves; by their names where it is equal.
 
-    The order of a model's list means nothing. Below `CONSTRAINT`, effects on the body only add to the wrench.
+    The order of a model's list means nothing. Below `INERTIAL`, effects on the body only add to the wrench.
     """
     feels_air: ClassVar[bool] = False
     """Whether it depends on `Condition.airspeed_body`."""

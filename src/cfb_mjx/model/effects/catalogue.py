@@ -29,6 +29,7 @@ from cfb_mjx.model.effects.ground_effect import GroundEffect
 from cfb_mjx.model.effects.gust import Gust
 from cfb_mjx.model.effects.gyroscopic import Gyroscopic
 from cfb_mjx.model.effects.inertia import Inertia
+from cfb_mjx.model.effects.inertia_products import InertiaProducts
 from cfb_mjx.model.effects.inflow_thrust import InflowThrust
 from cfb_mjx.model.effects.jet import Jet
 from cfb_mjx.model.effects.motor_asymmetry import MotorAsymmetry
@@ -48,6 +49,9 @@ from cfb_mjx.model.effects.rotor_drag import RotorDrag
 from cfb_mjx.model.effects.thrust_scale import ThrustScale
 from cfb_mjx.model.effects.thrust_tilt import ThrustTilt
 from cfb_mjx.model.effects.torque_scale import TorqueScale
+from cfb_mjx.model.effects.translational_lift import TranslationalLift
+from cfb_mjx.model.effects.vortex_ring import VortexRing
+from cfb_mjx.model.effects.wall_effect import WallEffect
 from cfb_mjx.model.effects.wind import Wind
 from cfb_mjx.parameters.parameters import Parameters
 
@@ -58,6 +62,7 @@ _PHYSICS: dict[str, type[Effect]] = {
         TorqueScale,
         PropDamage,
         Inertia,
+        InertiaProducts,
         CogOffset,
         Payload,
         MotorGainMismatch,
@@ -70,7 +75,10 @@ _PHYSICS: dict[str, type[Effect]] = {
         EscRateLimit,
         MotorHysteresis,
         InflowThrust,
+        TranslationalLift,
+        VortexRing,
         GroundEffect,
+        WallEffect,
         Gyroscopic,
         ThrustTilt,
         RotorDrag,
@@ -143,6 +151,9 @@ SENSOR_FAULTS: dict[str, SensorFault] = {
     ),
     "sensor_gyro_lowpass": SensorFault(
         "lag", "s", 0.0, "the gyro is filtered and lags", "cfb excite roll-pitch: fast rates show a filter"
+    ),
+    "sensor_gyro_scale": SensorFault(
+        "scale", "1", 1.0, "the gyro is not in scale with the turning of the pose", "cfb excite roll-pitch"
     ),
     "sensor_time_shift": SensorFault(
         "shift",

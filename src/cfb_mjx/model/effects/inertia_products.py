@@ -1,0 +1,76 @@
+"""Products of inertia: the principal axes are not the body's.
+
+    J_ij = relative_ij sqrt(J_i J_j),   J omega' = tau - omega x J omega with the whole tensor J
+
+A battery that lies askew does this, and turns roll into yaw. Of all forces but those that
+follow from all others (a string's tension) and those of the floor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import INERTIAL, Condition, Effect, Wrench
+from cfb_mjx.model.effects.fields import vector
+from cfb_mjx.model.vector import Vec
+from cfb_mjx.parameters.limits import Limits
+
+
+class InertiaProducts(Effect):
+    """J_ij = relative_ij sqrt(J_i J_j)."""
+
+    name: ClassVar[str] = "inertia_products"
+    meaning: ClassVar[str] = "the mass lies askew: the principal axes of inertia are not the body's axes"
+    experiment: ClassVar[str] = "cfb excite roll-pitch: doublets about roll and pitch, and yaw turns both ways"
+    units: ClassVar[dict[str, str]] = {"relative": "1"}
+    source: ClassVar[str] = "J. L. Meriam, L. G. Kraige, Engineering Mechanics: Dynamics, sec. 7/7 and app. B"
+    prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.2, 0.2)}
+    # Up to one half any three of them leave a tensor that is positive.
+    limits: ClassVar[dict[str, Limits]] = {"relative": Limits(-0.49, 0.49, -0.3, 0.3)}
+    strengths: ClassVar[tuple[str, ...]] = ("relative",)
+    rank: ClassVar[int] = INERTIAL
+
+    relative: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
+    """Elements xy, xz and yz of the tensor, each over the geometric mean of its two moments."""
+
+    @classmethod
+    def neutral(cls) -> InertiaProducts:
+        return cls(relative=0.0)
+
+    def body(self, wrench: Wrench, condition: Condition) -> Wrench:
+        x, y, z = condition.parameters.inertia
+        means = Vec(jnp.sqrt(x * y), jnp.sqrt(x * z), jnp.sqrt(y * z))
+        return turned_by_products(wrench, condition, Vec.unstack(self.relative) * means)
+
+
+def turned_by_products(wrench: Wrench, condition: Condition, products: Vec) -> Wrench:
+    """The wrench that turns a body of diagonal inertia as ``wrench`` turns one that has products of inertia too.
+
+    Args:
+        wrench: about the rotors' centre, all other forces included.
+        condition: of flight.
+        products: elements xy, xz and yz of the inertia tensor, kg m^2.
+
+    Returns:
+        The same force, and a torque that is another wherever the body turns or is turned.
+    """
+    omega, (x, y, z), (xy, xz, yz) = condition.body_rate, condition.parameters.inertia, products
+
+    def across(turning: Vec) -> Vec:
+        return Vec(
+            xy * turning[1] + xz * turning[2], xy * turning[0] + yz * turning[2], xz * turning[0] + yz * turning[1]
+        )
+
+    momentum = condition.parameters.inertia * omega + across(omega)
+    about_center = wrench.torque - condition.parameters.center_of_gravity.cross(wrench.force)
+    left = about_center - omega.cross(momentum)
+    rows = Vec(x, xy, xz), Vec(xy, y, yz), Vec(xz, yz, z)
+    minors = rows[1].cross(rows[2]), rows[2].cross(rows[0]), rows[0].cross(rows[1])
+    inverse_determinant = 1 / rows[0].dot(minors[0])
+    turning = Vec(*(minor.dot(left) * inverse_determinant for minor in minors))
+    return replace(wrench, torque=wrench.torque - across(turning) - omega.cross(across(omega)))

@@ -1,0 +1,83 @@
+"""Wall or ceiling: near a flat surface a rotor gives more thrust, or less.
+
+    f_i *= 1 + strength (reach^2 + d^2) / (reach^2 + a_i^2),  d = 0.1 m
+
+with a_i the distance of rotor i from the plane, which lies ``distance`` from the world's origin in ``direction``;
+behind it the distance counts as zero. The form is that of `ground_effect`. A ceiling ([0, 0, 1]) draws the drone up;
+beside a wall the rotors next to it lose some thrust, and the drone leans towards it.
+
+Not searched for by `cfb close-loop`, for the room is not in the log: name it, with the plane where it is.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from cfb_mjx.model.effects.base import Condition, Effect
+from cfb_mjx.model.effects.fields import hub_positions, number, vector
+from cfb_mjx.model.effects.ground_effect import REFERENCE
+from cfb_mjx.model.rotors import RotorLoads
+from cfb_mjx.model.vector import Vec, rotate, rotate_inverse
+from cfb_mjx.parameters.limits import Limits
+
+
+class WallEffect(Effect):
+    """f_i *= 1 + strength (reach^2 + d^2) / (reach^2 + a_i^2), d = 0.1 m."""
+
+    name: ClassVar[str] = "wall_effect"
+    meaning: ClassVar[str] = "thrust changes near a wall or the ceiling"
+    experiment: ClassVar[str] = "hover for five seconds each at 0.1, 0.15, 0.25 and 0.5 m from the surface"
+    units: ClassVar[dict[str, str]] = {"strength": "1", "reach": "m", "direction": "1", "distance": "m"}
+    source: ClassVar[str] = (
+        "P. Sanchez-Cuevas, G. Heredia, A. Ollero, Multirotor UAS for bridge inspection by contact using the ceiling "
+        "effect, ICUAS 2017; D. Robinson, H. Chung, K. Ryan, Computational investigation of micro rotorcraft near-wall "
+        "hovering aerodynamics, ICUAS 2014"
+    )
+    prior: ClassVar[dict[str, tuple[float, float]]] = {
+        "strength": (-0.2, 0.3),
+        "reach": (0.02, 0.3),
+        "direction": (-1.0, 1.0),
+        "distance": (0.5, 5.0),
+    }
+    limits: ClassVar[dict[str, Limits]] = {
+        "strength": Limits(-0.9, 3.0, -0.5, 0.9),
+        "reach": Limits(0.001, 10.0, 0.01, 1.0),
+        "direction": Limits(-1e3, 1e3, -1.0, 1.0),
+        "distance": Limits(-1e3, 1e3, -20.0, 20.0),
+    }
+    strengths: ClassVar[tuple[str, ...]] = ("strength",)
+    assumed: ClassVar[tuple[str, ...]] = ("direction", "distance")
+    # Of the thrust that the flow through the rotors leaves.
+    rank: ClassVar[int] = 1
+    searched: ClassVar[bool] = False
+    probes: ClassVar[tuple[dict[str, float], ...]] = ({"reach": 0.05}, {"reach": 0.12}, {"reach": 0.25})
+
+    strength: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Relative gain of thrust at `REFERENCE` from the surface."""
+    reach: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Distance at which half of the gain at the surface is left."""
+    direction: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
+    """From the drone to the surface, world; of any length but zero."""
+    distance: Float[Array, "*batch"] = eqx.field(converter=number)
+    """Of the surface from the world's origin, along the direction."""
+
+    @classmethod
+    def neutral(cls) -> WallEffect:
+        return cls(strength=0.0, reach=0.12, direction=[0.0, 0.0, 1.0], distance=2.5)
+
+    def rotors(self, loads: RotorLoads, condition: Condition) -> RotorLoads:
+        parameters = condition.parameters
+        normal = Vec.unstack(self.direction)
+        normal = normal * (1 / jnp.sqrt(normal.dot(normal)))
+        in_body = rotate_inverse(condition.quaternion, normal)
+        along, across = hub_positions(parameters)
+        center = condition.position - rotate(condition.quaternion, parameters.center_of_gravity)
+        away = -(along * in_body[0] + across * in_body[1]) + (self.distance - center.dot(normal))
+        core = self.reach**2
+        gain = self.strength * (core + REFERENCE**2)
+        factor = away.map(lambda a: 1 + gain / (core + jnp.where(a > 0, a, 0.0) ** 2))
+        return RotorLoads(loads.thrust * factor, loads.torque, loads.rate)
