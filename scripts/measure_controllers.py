@@ -3,7 +3,7 @@
     python scripts/measure_controllers.py [--plants 4096] [--before EARLIER.json]
 
 Minutes. The paper's own numbers are of the real drone and stand beside; beside an earlier run's results the page says
-what moved.
+what moved. `raptor` among the controllers is RAPTOR's published policy (`pip install foundation-policy`).
 """
 
 import argparse
@@ -27,6 +27,13 @@ HEADLINES = {
     "random_recovered": "random drones recovered",
     "recovered": "nominal recovered",
 }
+RAPTOR = [
+    "`raptor`: the published policy of RAPTOR (Eschmann, Albani, Loianno 2025; `pip install foundation-policy`), 100 "
+    "commands/s, with errors of position and velocity limited to 0.5 m and 1 m/s as its authors' adapter for PX4 does. "
+    "It was trained on quadrotors of every size, without delay, and finds out in flight what it flies; the shipped "
+    "policies were trained on this type and its delay.",
+    "",
+]
 PAPER_OF = {"target": PAPER_HOVER[1.0], **PAPER_FIRMWARE}
 
 
@@ -41,6 +48,7 @@ def main() -> None:
     configure_jax(x64=False)
     import jax
     import numpy as np
+    from raptor import RaptorPilot
 
     from cfb_mjx.control.pilot import find_pilot, has_lumped_delay
     from cfb_mjx.envs import reset
@@ -55,8 +63,10 @@ def main() -> None:
     results = {}
     for name in arguments.controllers:
         say(name)
-        pilot = find_pilot(name, nominal)
-        calm, wild = (replace(task, lumped_delay=has_lumped_delay(name)) for task in (judge.calm, judge.wild))
+        pilot = RaptorPilot.published() if name == "raptor" else find_pilot(name, nominal)
+        # RAPTOR reads the gyro on the drone, as the firmware's controllers do.
+        lumped = name != "raptor" and has_lumped_delay(name)
+        calm, wild = (replace(task, lumped_delay=lumped) for task in (judge.calm, judge.wild))
         one, _ = hover(pilot, calm, nominal, few)
         step, _ = six_metres(pilot, calm, nominal, few)
         all_of_them, _ = hover(pilot, wild, nominal, many)
@@ -153,9 +163,10 @@ def page(results: dict, facts: dict, plants: int, described, change: list[str]) 
         f"Written by `python scripts/measure_controllers.py {' '.join(Path(a).name for a in sys.argv[1:])}` on "
         f"{facts['date']}, {facts['processor']}, Python {facts['python']}, jax {facts['jax']}, cfb_mjx "
         f"{facts['cfb_mjx']}. In simulation: model `{described.name}`, estimates 8 ms late and noisy, the gyro too "
-        "but for the firmware's controllers, which read it on the drone; noise of the state as in the paper. The "
-        "paper's numbers are of its real drone.",
+        "but for the firmware's controllers and RAPTOR, which read it on the drone; noise of the state as in the "
+        "paper. The paper's numbers are of its real drone.",
         "",
+        *(RAPTOR if "raptor" in names else []),
         "## On the nominal drone",
         "",
         "Hover: 6 s, all but the first second counted, mean of 64 flights. Step: 6 m to one side, arrival "

@@ -63,6 +63,28 @@ def test_drawn_delays_are_flown_however_long_they_are(lumped, pose):
     assert abs(np.corrcoef(drawn, gyro)[0, 1]) < 0.3
 
 
+def test_jitter_makes_every_reading_late_by_another_time():
+    """Uniform up to 12 ms beyond the 8 ms of the model; the gyro on the drone does not share it."""
+    task = replace(TASK, noise=replace(QUIET, pose_jitter_s=0.012), lumped_delay=False)
+    drone = weightless(late(0.008))
+
+    @jax.jit
+    def ages(key):
+        def one(episode, _):
+            episode, _ = step(task, episode, jnp.zeros(4))
+            return episode, episode.state.position[0] - episode.estimate.position[0]
+
+        return jax.lax.scan(one, reset(task, drone, key, COASTING), length=400)[1]
+
+    age = np.asarray(ages(jax.random.PRNGKey(0)))[10:]
+    assert age.min() == pytest.approx(0.008, abs=5e-4)
+    assert age.max() == pytest.approx(0.02, abs=5e-4)
+    assert age.std() == pytest.approx(0.012 / np.sqrt(12), rel=0.1)
+    assert abs(np.corrcoef(age[1:], age[:-1])[0, 1]) < 0.15
+    with pytest.raises(CfbError, match=r"can be 0\.02 s"):
+        reset(replace(task, longest_delay_s=0.01), drone, jax.random.PRNGKey(0))
+
+
 def test_an_environment_flies_the_delay_of_its_model():
     env = TargetVectorEnv(16, replace(TASK, starts=Starts(near=0.0)), late(0.030))
     _, info = env.reset(seed=0)

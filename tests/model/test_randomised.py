@@ -11,6 +11,7 @@ import pytest
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, require_possible, rollout_final, sample_drone
+from cfb_mjx.model.effects import Gust, RotorDrag, Wind
 from cfb_mjx.model.randomised import differences
 from cfb_mjx.parameters import (
     Randomisation,
@@ -117,7 +118,7 @@ def test_parameters_alone_draw_as_before(nominal):
 def test_impossible_or_meaningless_ranges_are_refused(of_type, nominal):
     ranges = load_randomisation(of_type)
     bare = Quadrotor.from_file("cfb")
-    with pytest.raises(CfbError, match="varies rotor_drag, which this drone does not have; take model mine"):
+    with pytest.raises(CfbError, match="varies rotor_drag, which this drone does not have; add it to the model"):
         sample_drone(jax.random.key(0), bare, ranges)
     with pytest.raises(CfbError, match="varies effects, which are no parameters; draw with sample_drone"):
         sample_parameters(jax.random.key(0), nominal.parameters, ranges)
@@ -131,6 +132,64 @@ def test_impossible_or_meaningless_ranges_are_refused(of_type, nominal):
     assert np.isnan(lost.effects[0].coefficient)
     with pytest.raises(CfbError, match="model cfb: no number has a spread between drones"):
         load_randomisation("cfb")
+
+
+@pytest.fixture
+def windy(tmp_path):
+    path = tmp_path / "windy.yaml"
+    path.write_text(
+        "format: cfb_mjx randomisation 1\nname: windy\n"
+        "ranges: {mass: {half_width: 0.1, unit: relative}}\n"
+        "effects:\n  wind: {velocity: {half_width: [2.0, 2.0, 0.5], unit: m/s}}\n"
+        "  rotor_drag: {coefficient: {half_width: 0.5, unit: relative}}\n"
+        "  gust: {seed: {half_width: 40, unit: '1'}}\n"
+    )
+    return path
+
+
+def test_a_file_varies_effects(windy):
+    ranges = load_randomisation(windy)
+    drone = Quadrotor(
+        load_model_file("cfb-guards").parameters(),
+        (Wind([0.0, 0.0, 0.0], 0.0), RotorDrag(0.02), Gust([0.5, 0.5, 0.2], 1.0, 50.0)),
+    )
+    drones = jax.vmap(lambda key: sample_drone(key, drone, ranges))(jax.random.split(jax.random.key(1), 1000))
+    wind, drag, gust = drones.effects
+    for values, center, width in (
+        (wind.velocity, np.zeros(3), np.array([2.0, 2.0, 0.5])),
+        (drag.coefficient[:, None], 0.02, 0.01),
+        (gust.seed[:, None], 50.0, 40.0),
+    ):
+        share = (np.asarray(values) - center) / width
+        assert np.all(np.abs(share) <= 1 + 1e-9)
+        assert np.all(share.max(axis=0) > 0.95)
+        assert np.all(share.min(axis=0) < -0.95)
+    shares = np.asarray(jax.vmap(lambda one: differences(drone, one, ranges))(drones))
+    assert shares.shape == (1000, 1 + 3 + 1 + 1)
+    np.testing.assert_allclose(shares.std(axis=0), 1 / np.sqrt(3), rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "word"),
+    [
+        ("unit: m/s", "unit: km/h", "wind.velocity.unit must be 'relative' or 'm/s', found 'km/h'"),
+        ("velocity:", "speed:", "wind has no field speed; it has velocity, conductance, felt"),
+        ("[2.0, 2.0, 0.5]", "[2.0, 2.0]", r"wind.velocity.half_width must have 1 or 3 numbers"),
+        ("  wind:", "  drag:", "varies drag, which this drone does not have"),
+        ("half_width: 40", "half_width: -1", "effects.gust.seed.half_width = -1 must be zero or positive"),
+        (", unit: m/s", "", "effects.wind.velocity.unit must be 'relative' or the field's unit"),
+        ("unit: m/s", "unit: m/s, shared: true", "unknown key 'effects.wind.velocity.shared'"),
+        ("  gust: {seed: {half_width: 40, unit: '1'}}", "  gust: 3", "'effects' must be a mapping of effects"),
+    ],
+)
+def test_a_file_that_varies_effects_wrongly_is_refused(windy, was, now, word):
+    text = windy.read_text()
+    assert was in text
+    windy.write_text(text.replace(was, now, 1))
+    effects = (Wind([0.0, 0.0, 0.0], 0.0), RotorDrag(0.02), Gust([0.5, 0.5, 0.2], 1.0, 50.0))
+    drone = Quadrotor(load_model_file("cfb-guards").parameters(), effects)
+    with pytest.raises(CfbError, match=word):
+        sample_drone(jax.random.key(0), drone, load_randomisation(windy))
 
 
 def test_the_shipped_type_draws_drones_that_fly():

@@ -38,6 +38,9 @@ class Noise:
     velocity_mps: float = 0.005
     attitude_rad: float = 0.001
     rate_radps: float = 0.01
+    pose_jitter_s: float = 0.0
+    """By up to so much every reading is later than the model's ``pose_delay``, drawn anew and uniformly: what a radio
+    or a motion capture's network adds."""
 
 
 QUIET = Noise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -148,7 +151,7 @@ def longest_delay_s(task: Task, nominal: Quadrotor, magnitude: Float[Array, ""] 
                 )
             width = float(magnitude) * max(spread.half_width)
             value = value * (1 + width) if spread.relative else value + width
-        longest = max(longest, value)
+        longest = max(longest, value + (task.noise.pose_jitter_s if name == "pose_delay" else 0.0))
     return longest
 
 
@@ -381,7 +384,11 @@ def _pose(state: State) -> Pose:
 
 def _estimate(task: Task, model: Quadrotor, past: DelayLine, target: Array, key: PRNGKeyArray) -> Estimate:
     parameters, noise = model.parameters, task.noise
-    late = past.read(parameters.pose_delay)
+    delay = parameters.pose_delay
+    if noise.pose_jitter_s:
+        # Of a key of its own: the noise stays what it is without jitter.
+        delay = delay + noise.pose_jitter_s * jax.random.uniform(jax.random.fold_in(key, 1), (), delay.dtype)
+    late = past.read(delay)
     if not task.lumped_delay:
         gyro = DelayLine(past.samples.body_rate, past.dt).read(parameters.gyro_delay)
         late = Pose(late.position, late.velocity, late.quaternion, gyro)

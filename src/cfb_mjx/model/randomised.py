@@ -21,7 +21,7 @@ from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters import Randomisation, sample_parameters
 from cfb_mjx.parameters import require_possible as require_possible_parameters
 from cfb_mjx.parameters.limits import concrete
-from cfb_mjx.parameters.randomisation import largest_magnitude
+from cfb_mjx.parameters.randomisation import Range, largest_magnitude
 
 
 def sample_drone(
@@ -48,12 +48,13 @@ def sample_drone(
     parameters = sample_parameters(key, nominal.parameters, replace(randomisation, effects=()), magnitude)
     drone = eqx.tree_at(lambda m: m.parameters, nominal, parameters)
     for effect, field, spread in randomisation.effects:
-        at, own = _found(nominal, effect, randomisation)
+        at, own = _found(nominal, effect, field, spread, randomisation)
         value = jnp.asarray(getattr(own, field))
         # By its name: adding a range never changes the draws of the others.
         of_field = jax.random.fold_in(key, crc32(f"{effect}.{field}".encode()))
         unit = jax.random.uniform(of_field, value.shape, value.dtype, -1.0, 1.0)
-        drawn = value + magnitude * spread.width.astype(value.dtype) * unit
+        reach = spread.width.astype(value.dtype) * (value if spread.relative else 1.0)
+        drawn = value + magnitude * reach * unit
         if field in own.limits:
             drawn = jnp.where(own.limits[field].holds(drawn), drawn, jnp.nan)
         drone = eqx.tree_at(lambda m, i=at, f=field: getattr(m.effects[i], f), drone, drawn)
@@ -81,7 +82,7 @@ def require_possible(
     require_possible_parameters(nominal.parameters, randomisation, magnitude, what)
     asked = concrete(magnitude)
     for effect, field, spread in randomisation.effects:
-        _, own = _found(nominal, effect, randomisation)
+        _, own = _found(nominal, effect, field, spread, randomisation)
         center, limits = concrete(getattr(own, field)), own.limits.get(field)
         if asked is None or center is None or limits is None:
             continue
@@ -109,17 +110,34 @@ def differences(nominal: Quadrotor, drone: Quadrotor, randomisation: Randomisati
         change = (drawn - mean) / (spread.width.astype(mean.dtype) * (mean if spread.relative else 1.0))
         found.append(jnp.atleast_1d(change[0] if spread.shared and change.ndim else change))
     for effect, field, spread in randomisation.effects:
-        mean, drawn = (getattr(_found(model, effect, randomisation)[1], field) for model in (nominal, drone))
-        width = spread.width.astype(mean.dtype)
-        found.append(jnp.atleast_1d((drawn - mean) / np.where(width > 0, width, 1.0)))
+        at, _ = _found(nominal, effect, field, spread, randomisation)
+        mean, drawn = (getattr(model.effects[at], field) for model in (nominal, drone))
+        width = spread.width.astype(mean.dtype) * (mean if spread.relative else 1.0)
+        found.append(jnp.atleast_1d((drawn - mean) / jnp.where(width != 0, width, 1.0)))
     return jnp.concatenate(found)
 
 
-def _found(nominal: Quadrotor, effect: str, randomisation: Randomisation) -> tuple[int, Effect]:
+def _found(
+    nominal: Quadrotor, effect: str, field: str, spread: Range, randomisation: Randomisation
+) -> tuple[int, Effect]:
+    """Where a drone has the effect that a range is of."""
+    name = f"randomisation '{randomisation.name}'"
     for i, own in enumerate(nominal.effects):
-        if type(own).name == effect:
-            return i, own
+        if type(own).name != effect:
+            continue
+        if field not in own.units:
+            raise CfbError(f"{name}: {effect} has no field {field}; it has {', '.join(own.units)}.")
+        if spread.unit not in ("", "relative", own.units[field]):
+            raise CfbError(
+                f"{name}: {effect}.{field}.unit must be 'relative' or '{own.units[field]}', found '{spread.unit}'."
+            )
+        size = getattr(type(own).neutral(), field).shape
+        if len(spread.half_width) not in (1, *size):
+            raise CfbError(
+                f"{name}: {effect}.{field}.half_width must have {' or '.join(map(str, {1, *size}))} numbers."
+            )
+        return i, own
     raise CfbError(
-        f"randomisation '{randomisation.name}' varies {effect}, which this drone does not have; take model "
-        f"{randomisation.name}, or one fitted from it."
+        f"{name} varies {effect}, which this drone does not have; add it to the model's effects, neutral if you like, "
+        "or take a model that has it."
     )

@@ -32,12 +32,14 @@ class Range:
     """Half-width of a uniform draw about the nominal value.
 
     ``relative`` widths are fractions of the nominal value; others carry the parameter's unit. ``shared`` draws one
-    number for all motors or axes of the parameter.
+    number for all motors or axes of the parameter. ``unit`` is what a file says of an effect's field, whose effect is
+    only known where there is a drone.
     """
 
     half_width: tuple[float, ...]
     relative: bool
     shared: bool
+    unit: str = ""
 
     @property
     def width(self) -> np.ndarray:
@@ -78,15 +80,22 @@ def load_randomisation(name_or_path: str | Path = "paper") -> Randomisation:
     if _is_model(name_or_path):
         return _between_drones(load_model_file(name_or_path))
     path, document = load_named(name_or_path, "randomisation", FORMAT, "randomisation")
-    refuse_unknown(document, {"format", "name", "description", "ranges"}, path, "")
-    ranges = document.get("ranges") or {}
+    refuse_unknown(document, {"format", "name", "description", "ranges", "effects"}, path, "")
+    ranges, effects = document.get("ranges") or {}, document.get("effects") or {}
     if not isinstance(ranges, dict):
         raise CfbError(f"{path}: 'ranges' must be a mapping of parameter names.")
+    if not (isinstance(effects, dict) and all(isinstance(fields, dict) for fields in effects.values())):
+        raise CfbError(f"{path}: 'effects' must be a mapping of effects, each of its fields' ranges.")
     ranges = current_names(ranges, path, "ranges.")
     refuse_unknown(ranges, set(SPECIFICATIONS), path, "ranges.")
     return Randomisation(
         name=str(document.get("name", path.stem)),
         ranges=tuple((key, _range(key, raw, path)) for key, raw in ranges.items()),
+        effects=tuple(
+            (effect, field, _range_of_effect(f"effects.{effect}.{field}", raw, path))
+            for effect, fields in effects.items()
+            for field, raw in fields.items()
+        ),
     )
 
 
@@ -123,30 +132,51 @@ def _only_relative(key: str) -> bool:
 
 
 def _range(key: str, raw, path: Path) -> Range:
-    if not isinstance(raw, dict):
-        raise CfbError(f"{path}: ranges.{key} must be a mapping with half_width and unit.")
-    refuse_unknown(raw, {"half_width", "unit", "shared", "source"}, path, f"ranges.{key}.")
-    unit = SPECIFICATIONS[key].unit
-    if raw.get("unit") not in ("relative", unit):
-        raise CfbError(f"{path}: ranges.{key}.unit must be 'relative' or '{unit}', found {told(raw.get('unit'))}.")
-    width = raw.get("half_width")
-    widths = width if isinstance(width, list) else [width]
-    size = SPECIFICATIONS[key].shape
-    if not all(isinstance(w, int | float) and not isinstance(w, bool) and 0 <= w < float("inf") for w in widths):
-        raise CfbError(f"{path}: ranges.{key}.half_width = {told(width)} must be zero or positive.")
+    specification, where = SPECIFICATIONS[key], f"ranges.{key}"
+    widths = _widths(where, raw, path)
+    if raw.get("unit") not in ("relative", specification.unit):
+        raise CfbError(
+            f"{path}: {where}.unit must be 'relative' or '{specification.unit}', found {told(raw.get('unit'))}."
+        )
+    size = specification.shape
     if len(widths) not in (1, *size):
-        raise CfbError(f"{path}: ranges.{key}.half_width must have 1 or {size[0] if size else 1} numbers.")
+        raise CfbError(f"{path}: {where}.half_width must have 1 or {size[0] if size else 1} numbers.")
     relative = raw["unit"] == "relative"
     if not relative and _only_relative(key):
-        raise CfbError(f"{path}: ranges.{key}.unit must be 'relative': a width in {unit} would allow the wrong sign.")
+        raise CfbError(
+            f"{path}: {where}.unit must be 'relative': a width in {specification.unit} would allow the wrong sign."
+        )
     if relative and max(widths) >= 1:
         raise CfbError(
-            f"{path}: ranges.{key}.half_width = {told(width)} relative would allow values of the wrong sign."
+            f"{path}: {where}.half_width = {told(raw['half_width'])} relative would allow values of the wrong sign."
         )
     shared = raw.get("shared", False)
     if not isinstance(shared, bool):
-        raise CfbError(f"{path}: ranges.{key}.shared must be true or false, found {told(shared)}.")
-    return Range(tuple(float(w) for w in widths), relative, shared)
+        raise CfbError(f"{path}: {where}.shared must be true or false, found {told(shared)}.")
+    return Range(widths, relative, shared)
+
+
+def _range_of_effect(where: str, raw, path: Path) -> Range:
+    widths = _widths(where, raw, path)
+    unit = raw.get("unit")
+    if not isinstance(unit, str):
+        raise CfbError(f"{path}: {where}.unit must be 'relative' or the field's unit, found {told(unit)}.")
+    if "shared" in raw:
+        raise CfbError(f"{path}: unknown key '{where}.shared'.")
+    return Range(widths, unit == "relative", False, unit)
+
+
+def _widths(where: str, raw, path: Path) -> tuple[float, ...]:
+    if not isinstance(raw, dict):
+        raise CfbError(f"{path}: {where} must be a mapping with half_width and unit.")
+    refuse_unknown(raw, {"half_width", "unit", "shared", "source"}, path, f"{where}.")
+    width = raw.get("half_width")
+    widths = width if isinstance(width, list) else [width]
+    if not widths or not all(
+        isinstance(w, int | float) and not isinstance(w, bool) and 0 <= w < float("inf") for w in widths
+    ):
+        raise CfbError(f"{path}: {where}.half_width = {told(width)} must be zero or positive.")
+    return tuple(float(w) for w in widths)
 
 
 def sample_parameters(
