@@ -19,28 +19,38 @@ NOMINAL = ("randomisation.magnitude=0", "randomisation.graded=0.0")
 PPO = (*NOMINAL, "ppo.steps=16000000", "checkpoints=16")
 QUICK = (*NOMINAL, "checkpoints=16")
 RANDOM = ("ppo.steps=16000000", "checkpoints=16")
-UNLIMITED = (*PPO, "ppo.advantage_limit=1e9")
+ALONE = (
+    "ppo.copies=1",
+    "ppo.drones=512",
+    "ppo.minibatches=8",
+    "ppo.gae_lambda=0.99",
+    "ppo.entropy_cost=1e-3",
+    "ppo.last_entropy=1",
+)
+"""Without copies, which takes larger updates."""
+UNLIMITED = (*PPO, *ALONE, "ppo.advantage_limit=1e9")
 VARIANTS = {
     "analytic": ("quick-analytic", QUICK, "back-propagation, horizon 1 s"),
     "ppo": ("target", PPO, "PPO as in `target`"),
-    "ppo-unlimited": ("target", UNLIMITED, "advantages not limited"),
-    "ppo-lambda": ("target", (*UNLIMITED, "ppo.gae_lambda=0.95"), "not limited, gae_lambda 0.95"),
-    "ppo-random": ("target", RANDOM, "the paper's randomisation"),
-    "ppo-random-unlimited": ("target", (*RANDOM, "ppo.advantage_limit=1e9"), "the same, not limited"),
-    "ppo-random-detrended": (
+    "ppo-alone": ("target", (*PPO, *ALONE), "no copies, larger updates"),
+    "ppo-unlimited": ("target", UNLIMITED, "the same, advantages not limited"),
+    "ppo-lambda": ("target", (*UNLIMITED, "ppo.gae_lambda=0.95"), "no copies, not limited, gae_lambda 0.95"),
+    "ppo-random": ("target", RANDOM, "`target` with the paper's randomisation"),
+    "ppo-random-alone": ("target", (*RANDOM, *ALONE), "the same without copies, larger updates"),
+    "ppo-random-unlimited": (
         "target",
-        (*RANDOM, "ppo.detrended=true", "ppo.gae_lambda=0.97"),
-        "the paper's randomisation, `detrended`, gae_lambda 0.97",
+        (*RANDOM, *ALONE, "ppo.advantage_limit=1e9"),
+        "the same, advantages not limited",
     ),
     "ppo-rare": (
         "target",
         (*UNLIMITED, "ppo.drones=2048"),
-        "not limited, drones x 4, updates / 4",
+        "no copies, not limited, drones x 4, updates / 4",
     ),
 }
 MARKS_MM = (100, 50, 25)
 BRAX = {
-    "brax": (None, "Brax's own trainer, the numbers of `target`, observations normalised"),
+    "brax": (None, "Brax's own trainer, the numbers of `ppo-alone`, observations normalised"),
     "brax-random": ("paper", "the same with the paper's randomisation"),
 }
 """Not a configuration of ours: which drones, and what it is."""
@@ -99,7 +109,7 @@ def by_brax(name: str, seed: int, results) -> None:
         return
     say(f"{name}-{seed}")
     drones, _ = BRAX[name]
-    ours = load_config("target", PPO).ppo
+    ours = load_config("target", (*PPO, *ALONE)).ppo
     task = TargetTask(randomisation=None if drones is None else load_randomisation(drones))
     judge, rows, began, judging = Judge(plants=None, random_drones=0), [], time.perf_counter(), 0.0
     settings = {

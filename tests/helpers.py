@@ -237,6 +237,7 @@ SMALL_TRAINING = (
     "ppo.unroll=4",
     "ppo.steps=128",
     "ppo.minibatches=2",
+    "ppo.copies=2",
     "ppo.epochs=2",
     "ppo.value_hidden=[8]",
 )

@@ -18,6 +18,7 @@ SMALL = (
     "ppo.unroll=4",
     "ppo.steps=128",
     "ppo.minibatches=2",
+    "ppo.copies=2",
     "ppo.epochs=1",
     "ppo.value_hidden=[8]",
 )

@@ -34,6 +34,7 @@ SIZES = (
     "ppo.unroll=4",
     "ppo.steps=1280",
     "ppo.minibatches=2",
+    "ppo.copies=2",
     "ppo.epochs=1",
     "ppo.value_hidden=[8]",
 )

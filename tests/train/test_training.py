@@ -18,10 +18,10 @@ from cfb_mjx.parameters import load_model_file, load_randomisation, save_model_f
 from cfb_mjx.train import run
 from cfb_mjx.train.analytic import Analytic
 from cfb_mjx.train.brax_compat import brax_ppo, parts
-from cfb_mjx.train.config import AnalyticSettings, load_config
+from cfb_mjx.train.config import AnalyticSettings, PpoSettings, load_config
 from cfb_mjx.train.flying import Hover
 from cfb_mjx.train.plants import load_plants
-from cfb_mjx.train.ppo import Ppo, detrended
+from cfb_mjx.train.ppo import Ppo, beside_copies
 from cfb_mjx.train.run import BEST, CHECKPOINT, CURVE, POLICY, UPDATES, Training, segments, train
 from tests.helpers import SMALL_TRAINING, watch_keys
 
@@ -195,32 +195,52 @@ def test_the_learner_is_shown_no_reward_below_the_least_and_failed_drones_begin_
     np.testing.assert_array_equal(after.count[:3], config.ppo.unroll - 1)
 
 
-def test_a_value_that_is_wrong_all_the_while_tells_nothing_of_a_command():
-    """Brax's advantages with values wrong by a constant for each drone, detrended, are those of the right values."""
-    of_reward, of_value = jax.random.split(jax.random.key(0))
-    rewards, values = jax.random.normal(of_reward, (32, 5)), jax.random.normal(of_value, (33, 5))
-    over = jnp.zeros((32, 5)).at[10, 4].set(1.0)
+def test_what_a_value_errs_by_in_all_copies_tells_nothing_of_a_command():
+    """Brax's advantages with values wrong by anything that copies share are, beside the copies, those of the right."""
+    of_reward, of_value, of_error = jax.random.split(jax.random.key(0), 3)
+    rewards, values = jax.random.normal(of_reward, (32, 12)), jax.random.normal(of_value, (33, 12))
+    error = jnp.repeat(3 * jax.random.normal(of_error, (33, 3)), 4, axis=1)
+    cut = jnp.zeros((32, 12)).at[10, 4:8].set(1.0)
 
-    def advantages(wrong):
+    def advantages(values):
         _, found = parts().losses.compute_gae(
-            truncation=jnp.zeros_like(over),
-            termination=over,
+            truncation=cut,
+            termination=jnp.zeros_like(cut),
             rewards=rewards,
-            values=values[:-1] + wrong,
-            bootstrap_value=values[-1] + wrong,
+            values=values[:-1],
+            bootstrap_value=values[-1],
             lambda_=0.97,
             discount=0.99,
         )
         return found
 
-    right, shifted = advantages(0.0), advantages(jnp.arange(5.0))
-    assert float(jnp.abs(shifted - right)[:, 1:].max(axis=0).min()) > 0.1
-    found = detrended(shifted, over, 0.97 * 0.99)
-    np.testing.assert_allclose(found[:, :4], detrended(right, over, 0.97 * 0.99)[:, :4], atol=1e-4)
-    np.testing.assert_allclose(found[:, :4].mean(axis=0), 0.0, atol=1e-5)
-    # What the end of an episode cost is told as it is.
-    np.testing.assert_array_equal(found[:, 4], shifted[:, 4])
-    assert float(jnp.var(found[:, :4])) > 0.3 * float(jnp.var(right[:, :4]))
+    right, wrong = advantages(values), advantages(values + error)
+    assert float(jnp.std(wrong - right)) > float(jnp.std(right))
+    np.testing.assert_allclose(beside_copies(wrong, 4), beside_copies(right, 4), atol=1e-4)
+    np.testing.assert_allclose(beside_copies(right, 4).reshape(32, 3, 4).mean(axis=-1), 0.0, atol=1e-5)
+    np.testing.assert_array_equal(beside_copies(right, 1), right)
+
+
+def test_copies_fly_the_same_episode_with_other_commands():
+    """Drone, target and noise alike, and the same command of it, whichever of them fails or runs out of time."""
+    settings = PpoSettings(drones=24, copies=3, minibatches=2, unroll=64, steps=1, value_hidden=(8,))
+    task = TargetTask(randomisation=load_randomisation("paper"), episode_s=0.8)
+    ppo = Ppo(settings, task, Quadrotor.from_file("cfb-guards"))
+    state = ppo.begin(jax.random.PRNGKey(1), NeuralController.random(jax.random.PRNGKey(0), task.layout, (8, 8)))
+    before = np.asarray(state.episodes.count)
+    state, _ = ppo.update(state)
+
+    def in_groups(x):
+        return np.asarray(x).reshape(8, 3, -1)
+
+    for same in (state.episodes.model.parameters.mass, state.episodes.target, state.episodes.count):
+        np.testing.assert_array_equal(in_groups(same), in_groups(same)[:, :1].repeat(3, axis=1))
+    # Episodes have ended, and began at different times.
+    assert np.any(np.asarray(state.episodes.count) < before + 64)
+    assert len(set(in_groups(state.episodes.count)[:, 0, 0])) > 3
+    position = in_groups(state.episodes.state.position)
+    assert np.all(np.ptp(position, axis=1).max(axis=-1) > 0)
+    assert np.ptp(in_groups(state.episodes.model.parameters.mass)[:, 0]) > 1e-3
 
 
 # In the middle of a segment, and after its last update.

@@ -65,10 +65,11 @@ class FlipAnalyticSettings(AnalyticSettings):
 class PpoSettings:
     """Proximal policy optimisation (Schulman et al. 2017)."""
 
-    drones: int = 512
+    drones: int = 128
+    """Copies included."""
     unroll: int = 128
     """Commands of every drone between two updates of the policy."""
-    minibatches: int = 8
+    minibatches: int = 4
     epochs: int = 4
     steps: int = 100_000_000
     """Commands in total."""
@@ -79,15 +80,17 @@ class PpoSettings:
     last_rate: float = 0.02
     """Share of both rates that is left at the end: the smaller, the less the last policy is off by chance."""
     discount: float = 0.995
-    gae_lambda: float = 0.99
+    gae_lambda: float = 0.98
     clipping: float = 0.2
     advantage_limit: float = 3.0
     """Advantages larger than so many times their mean magnitude count as that: the few drones that fail, by a lot,
     would otherwise drown what all the others have to learn about their last decimetre."""
-    detrended: bool = False
-    """Whether what a value wrong by one and the same amount adds to a drone's advantages is taken out of them, and
-    their mean, where no episode ends."""
-    entropy_cost: float = 1e-3
+    copies: int = 4
+    """Drones that fly the same episode with other actions: each one's advantage is counted from the mean of its copies,
+    so that what the value network errs by in all of them cancels. They begin and end together."""
+    entropy_cost: float = 3e-3
+    """At the start; it falls to ``last_entropy`` of that along a line."""
+    last_entropy: float = 0.02
     reward_scaling: float = 0.02
     least_reward: float = -30.0
     """Lower rewards, the paper's failure of -300, count as this to the learner."""
@@ -112,8 +115,13 @@ class PpoSettings:
 
 @dataclass(frozen=True)
 class FlipPpoSettings(PpoSettings):
-    """The same for flips: what a command does to a turn is over sooner."""
+    """The same for flips: what a command does to a turn is over sooner, and the value network errs little."""
 
+    drones: int = 512
+    minibatches: int = 8
+    copies: int = 1
+    entropy_cost: float = 1e-3
+    last_entropy: float = 1.0
     steps: int = 40_000_000
     discount: float = 0.97
     gae_lambda: float = 0.95
@@ -252,6 +260,7 @@ _AT_LEAST = {
     "ppo.drones": 1,
     "ppo.unroll": 1,
     "ppo.minibatches": 1,
+    "ppo.copies": 1,
     "ppo.epochs": 1,
     "ppo.steps": 1,
     "ppo.warm_up": 0,
@@ -312,14 +321,17 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
     if len(config.observation.setpoint_scales) != (2 if config.task == "flip" else 0):
         raise CfbError(f"{where}: observation.setpoint_scales needs one number for each set-point of {config.task}.")
     near = "starts.entering" if config.task == "flip" else "starts.near"
-    for key in ("ppo.last_rate", near, "randomisation.graded", "ppo.discount", "ppo.gae_lambda"):
+    for key in ("ppo.last_rate", "ppo.last_entropy", near, "randomisation.graded", "ppo.discount", "ppo.gae_lambda"):
         if not 0 <= _at(config, key) <= 1:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must lie between 0 and 1.")
     for key in ("network.hidden", "ppo.value_hidden"):
         if not _at(config, key) or min(_at(config, key)) < 1:
             raise CfbError(f"{where}: {key} must name at least one layer, each of at least one neuron.")
-    if config.ppo.drones % config.ppo.minibatches:
-        raise CfbError(f"{where}: ppo.drones = {config.ppo.drones} must be a multiple of ppo.minibatches.")
+    if config.ppo.drones % (config.ppo.minibatches * config.ppo.copies):
+        raise CfbError(
+            f"{where}: ppo.drones = {config.ppo.drones} must be a multiple of ppo.minibatches times ppo.copies, "
+            f"{config.ppo.minibatches} x {config.ppo.copies}."
+        )
     load_randomisation(config.randomisation.ranges)
 
 

@@ -2,7 +2,8 @@
 
 Brax's own ``train`` hands out neither its optimizer nor its environments, so a run of it cannot go on where it was
 interrupted; this one is a page long, and its whole state is one pytree. Brax's loss divides advantages by a spread that
-a few failures decide; here they are limited first. Episodes are drawn anew at every reset, drone
+a few failures decide; here they are limited first, and counted from those of copies that differ by their actions
+alone, without which they are mostly what the value network errs by. Episodes are drawn anew at every reset, drone
 included. The value network sees what the drone itself cannot: the true state, rotor speeds and the drawn drone.
 """
 
@@ -15,7 +16,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
@@ -71,7 +71,7 @@ class Ppo:
         self.warm_up, self.first_std = (settings.warm_up, settings.warm_std) if trained else (0, settings.first_std)
         self.first_rate = LEAST_RATE if trained else 1.0
         self.devices = Devices.take() if over is None else over
-        self.devices.require(settings.drones // settings.minibatches, "drones of a minibatch")
+        self.devices.require(settings.drones // settings.minibatches // settings.copies, "starts of a minibatch")
         self.updates = settings.updates
         self.steps_per_update = settings.drones * settings.unroll
         self.brax = parts()
@@ -94,7 +94,8 @@ class Ppo:
     def begin(self, key: PRNGKeyArray, controller: NeuralController) -> PpoState:
         """Drones in flight, and a value network that knows nothing."""
         of_episodes, of_critic, key = jax.random.split(key, 3)
-        episodes = in_progress(self.task, self.nominal, self.settings.drones, of_episodes)
+        episodes = in_progress(self.task, self.nominal, self.settings.drones // self.settings.copies, of_episodes)
+        episodes = self._copied(episodes)
         first = jax.tree.map(lambda x: x[0], episodes)
         inputs = self._show(first)["hidden"].shape[-1]
         critic = Network.random(of_critic, (inputs, *self.settings.value_hidden, 1), "swish")
@@ -107,6 +108,10 @@ class Ppo:
         """The mean of the policy."""
         return NeuralController(state.actor.network, self.task.layout)
 
+    def _copied(self, one_of_each):
+        """Every drone ``copies`` times."""
+        return jax.tree.map(lambda x: jnp.repeat(x, self.settings.copies, axis=0), one_of_each)
+
     def _show(self, episode: Episode) -> dict[str, Array]:
         return {"seen": observe(self.task, episode), "hidden": privileged(self.task, self.nominal, episode)}
 
@@ -117,8 +122,10 @@ class Ppo:
         # Every device needs what all drones saw: a batch is drawn from all of them.
         data, last = self.devices.whole((data, show(episodes)["hidden"]))
         learning = jnp.where(state.count < self.warm_up, 0.0, 1.0)
+        left = 1 - (1 - self.settings.last_entropy) * state.count / self.updates
+        weights = learning, learning * self.settings.entropy_cost * left
         learnt, losses = jax.lax.scan(
-            partial(self._epoch, learning, data, last),
+            partial(self._epoch, weights, data, last),
             (state.actor, state.critic, state.optimizer, state.rate),
             jax.random.split(of_learning, self.settings.epochs),
         )
@@ -144,7 +151,8 @@ class Ppo:
         def drawn(key):
             of_reset, of_flight = jax.random.split(key)
             noise = jax.vmap(lambda key: jax.random.normal(key, (self.settings.drones, 4)))
-            return jax.random.split(of_reset, self.settings.drones), noise(jax.random.split(of_flight, each))
+            of_reset = jax.random.split(of_reset, self.settings.drones // self.settings.copies)
+            return self._copied(of_reset), noise(jax.random.split(of_flight, each))
 
         # For all drones at once, so that what a drone is given does not depend on which device flies it.
         of_reset, noise = jax.vmap(drawn)(jax.random.split(key, self.settings.unroll // each))
@@ -167,29 +175,34 @@ class Ppo:
             raw = noise * normal.scale + normal.loc
             action = self.distribution.postprocess(raw)
             after, outcome = jax.vmap(partial(step, self.task))(episodes, 0.5 * (1 + action))
-            over = outcome.failed | outcome.timed_out
+            # Copies begin and end together.
+            over = (outcome.failed | outcome.timed_out).reshape(-1, self.settings.copies)
+            over = jnp.repeat(jnp.any(over, axis=1), self.settings.copies)
             kept = shown | {
                 "raw": raw,
                 "log_prob": self.distribution.log_prob(logits, raw),
                 "reward": self.settings.reward_scaling * jnp.maximum(outcome.reward, self.settings.least_reward),
                 "failed": 1.0 * outcome.failed,
-                "cut": 1.0 * (outcome.timed_out & ~outcome.failed),
+                "cut": 1.0 * (over & ~outcome.failed),
             }
             return choose(over, fresh, after), (kept, outcome)
 
         return jax.lax.scan(some, episodes, (of_reset, noise))
 
-    def _epoch(self, learning, data: dict[str, Array], last: Array, learnt: tuple, key: PRNGKeyArray):
+    def _epoch(self, weights, data: dict[str, Array], last: Array, learnt: tuple, key: PRNGKeyArray):
         of_order, of_entropy = jax.random.split(key)
         count = self.settings.minibatches
         # Whole flights of some of the drones make a batch, of which every device takes its share.
-        order = self.devices.along(jax.random.permutation(of_order, self.settings.drones).reshape(count, -1), 1)
+        copies = self.settings.copies
+        order = jax.random.permutation(of_order, self.settings.drones // copies)
+        order = (copies * order[:, None] + jnp.arange(copies)).reshape(count, -1)
+        order = self.devices.along(order, 1)
         batches = jax.tree.map(lambda x: self.devices.along(jnp.moveaxis(x[:, order], 1, 0), 2), data)
         batches = batches, self.devices.along(last[order], 1), jax.random.split(of_entropy, count)
 
         def one(learnt, batch):
             actor, critic, optimizer, rate = learnt
-            gradient, metrics = jax.grad(self._loss, has_aux=True)((actor, critic), learning, *batch)
+            gradient, metrics = jax.grad(self._loss, has_aux=True)((actor, critic), weights, *batch)
             changes, optimizer = self.optimizer.update(gradient, optimizer)
             if most := self.settings.largest_kl:
                 # How far the steps before this one have led.
@@ -204,7 +217,7 @@ class Ppo:
         return jax.lax.scan(one, learnt, batches)
 
     def _loss(
-        self, both: tuple[Actor, Network], learning: Array | float, data: dict, last: Array, key: PRNGKeyArray
+        self, both: tuple[Actor, Network], weights: tuple[Array, Array], data: dict, last: Array, key: PRNGKeyArray
     ) -> tuple[Array, dict]:
         logits = _logits(both[0], data["seen"])
         values = self._value(both[1], data["hidden"])
@@ -218,9 +231,7 @@ class Ppo:
             lambda_=self.settings.gae_lambda,
             discount=self.settings.discount,
         )
-        if self.settings.detrended:
-            both = self.settings.discount * self.settings.gae_lambda
-            advantage = detrended(advantage, jnp.maximum(data["failed"], data["cut"]), both)
+        advantage = beside_copies(advantage, self.settings.copies)
         most = self.settings.advantage_limit * jnp.mean(jnp.abs(advantage))
         advantage = jnp.clip(advantage, -most, most)
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
@@ -230,7 +241,7 @@ class Ppo:
         gain = jnp.mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - near, 1 + near) * advantage))
         value_loss = jnp.mean((returns - values) ** 2) / 4
         entropy = jnp.mean(self.distribution.entropy(logits, key))
-        loss = value_loss - learning * (gain + self.settings.entropy_cost * entropy)
+        loss = value_loss - weights[0] * gain - weights[1] * entropy
         return loss, {
             "loss": loss,
             "value_loss": value_loss,
@@ -245,18 +256,21 @@ class Ppo:
         return self.ideal + critic(shown)[..., 0]
 
 
-def detrended(advantage: Float[Array, "n drones"], over: Float[Array, "n drones"], decay: float) -> Array:
-    """Advantages of an unroll, less their mean and what a value too high by a constant makes of them.
+def beside_copies(advantage: Float[Array, "n drones"], copies: int) -> Float[Array, "n drones"]:
+    """Advantages less the mean of the drone's copies at the same command.
+
+    Copies began alike and see the same noise, so what the value network errs by is nearly the same in all of them; what
+    is left is what their own actions made of it. A copy's command does not depend on the others' advantages, so the
+    gradient stays unbiased, but for the factor (copies - 1) / copies.
 
     Args:
-        advantage: generalised advantages (Schulman et al. 2016), from the first command to the last.
-        over: 1 where an episode ends. Drones of which one does keep their advantages, for these say what it cost.
-        decay: discount times lambda: the error of the value is seen from every command to the unroll's end.
+        advantage: generalised advantages (Schulman et al. 2016); copies beside each other.
+        copies: of every drone; 1: nothing is changed.
     """
-    seen = 1 - decay ** np.arange(len(advantage), 0, -1.0)
-    basis, _ = np.linalg.qr(np.stack([np.ones_like(seen), seen], axis=1))
-    basis, whole = jnp.asarray(basis, advantage.dtype), 1 - jnp.max(over, axis=0)
-    return advantage - whole * (basis @ (basis.T @ advantage))
+    if copies == 1:
+        return advantage
+    of_each = advantage.reshape(len(advantage), -1, copies)
+    return (of_each - jnp.mean(of_each, axis=-1, keepdims=True)).reshape(advantage.shape)
 
 
 def _logits(actor: Actor, seen: Array) -> Array:
