@@ -33,15 +33,15 @@ class Wanted:
     """Of the randomisation a margin is looked for with: above one where hardly any drone fails at one."""
 
 
-# About 1000 deg/s is 17.5 rad/s; the drone overshoots what is asked of it by a twentieth.
+# About 1000 deg/s is 17.5 rad/s; the drone overshoots what is asked of it by a tenth.
 FLIPS = {
     "flip": Wanted(1, "margin", "One turn, for the most drones.", {"rate_radps": 17.0}, magnitude=1.2),
-    "double-flip": Wanted(2, "margin", "Two turns, for the most drones.", {"rate_radps": 18.5}),
+    "double-flip": Wanted(2, "margin", "Two turns, for the most drones.", {"rate_radps": 17.1}),
     "double-flip-paper": Wanted(
         2,
         "margin",
         "Two turns as the paper flew them: 1000 deg/s, and 3.5 m/s to be stopped.",
-        {"rate_radps": 17.0},
+        {"rate_radps": 15.7},
         {"fall_mps": 3.5},
     ),
     "double-flip-low": Wanted(2, "height", "Two turns within the least height."),

@@ -128,11 +128,12 @@ def test_a_search_never_does_worse_than_what_it_is_given():
         search(given, TargetTask(), DRONE, margin, key)
 
 
-def test_the_shipped_flip_policy_says_where_it_comes_from():
-    policy = load_policy(shipped_policies()["flip"])
+@pytest.mark.parametrize("name", ["flip", "flip-analytic"])
+def test_the_shipped_flip_policies_say_where_they_come_from(name):
+    policy = load_policy(shipped_policies()[name])
     assert policy.task == "flip"
     # What it does not say, as it was trained before there was such a setting, is the default.
-    assert config_from(policy.training["config"], "policy") == load_config("flip-analytic")
+    assert config_from(policy.training["config"], "policy") == load_config(name)
     assert policy.lumped_delay
 
 

@@ -119,7 +119,8 @@ def search(
     task = with_room(task, nominal)
     low, high = (jnp.stack([jnp.asarray(x, float) for x in side]) for side in within)
     of_nominal, of_plants, of_draws = jax.random.split(key, 3)
-    few = jax.random.split(of_nominal, 4)
+    # A flight in sixteen that stops late is enough to be noticed.
+    few = jax.random.split(of_nominal, 16)
     many = jax.random.split(of_plants, plants)
     mean, std = jnp.full(len(low), 0.5), jnp.full(len(low), 0.35)
     given = jnp.clip(jnp.stack([jnp.asarray(x, float) for x in manoeuvre.knobs]), low, high)
