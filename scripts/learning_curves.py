@@ -247,6 +247,7 @@ def figure(found: dict[str, list[dict]], path) -> None:
         "#000000",
         "#F0E442",
         "#332288",
+        "#882255",
     )
     with context():
         plot = new_figure(9.2, 3.4)
