@@ -1,8 +1,9 @@
 """A payload fixed to the body, ``height`` above the rotors' centre (negative: below) and ``offset`` beside it.
 
-It adds its mass, draws the centre of gravity towards itself, and adds m M / (m + M) (|d|^2 - d_k^2) to the moment of
-inertia about axis k and -m M / (m + M) d_i d_j to its products, d being the way from the old centre of gravity to the
-payload (parallel axes, about the common centre). The payload's own moment of inertia is left out.
+It adds its mass, draws the centre of gravity towards itself and adds m M / (m + M) (|d|^2 - d_k^2) to the moment of
+inertia about axis k, d being the way from the old centre of gravity to the payload (parallel axes, about the common
+centre). The payload's own moment of inertia and, where the payload lies beside the z axis, products of inertia are left
+out.
 """
 
 from __future__ import annotations
@@ -13,10 +14,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.model.effects.base import INERTIAL, Condition, Effect, Wrench
+from cfb_mjx.model.effects.base import Effect
 from cfb_mjx.model.effects.fields import number, vector
-from cfb_mjx.model.effects.inertia_products import turned_by_products
-from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
@@ -45,7 +44,7 @@ class Payload(Effect):
     # To first order: what hangs beside the axis has an inertia of its own besides.
     said_by: ClassVar[dict[str, str]] = {"offset": "cog_offset"}
     # Hung on the drone as its own inertia and centre of gravity leave it.
-    rank: ClassVar[int] = INERTIAL
+    rank: ClassVar[int] = 1
     probes: ClassVar[tuple[dict[str, float], ...]] = (
         {"height": -0.02, "offset": 0.0},
         {"height": 0.02, "offset": 0.0},
@@ -72,11 +71,3 @@ class Payload(Effect):
         return eqx.tree_at(
             lambda p: (p.mass, p.center_of_gravity, p.inertia), parameters, (total, center, parameters.inertia + added)
         )
-
-    def body(self, wrench: Wrench, condition: Condition) -> Wrench:
-        # The way from the common centre, M / (m + M) of that from the old one.
-        place = Vec(*Vec.unstack(self.offset), self.height)
-        x, y, z = place - condition.parameters.center_of_gravity
-        total = condition.parameters.mass
-        scale = -self.mass * total / (total - self.mass)
-        return turned_by_products(wrench, condition, scale * Vec(x * y, x * z, y * z))
