@@ -56,7 +56,7 @@ def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> None:
             continue
         say(f"{run.name} ({len(found)} of {len(runs)} done)")
         training = Training.prepare(config, facts)
-        rows = train(training, folder / run.name, resume=True, report=_report)
+        rows = train(training, folder / run.name, resume=True, report=report)
         score = judge(load_policy(folder / run.name / POLICY).controller)
         found[run.name] = {
             "seed": run.seed,
@@ -77,7 +77,8 @@ def _what_counts(config: dict) -> dict:
     return json.loads(json.dumps({k: v for k, v in whole.items() if k not in (other, "description")}))
 
 
-def _report(row: dict) -> None:
+def report(row: dict) -> None:
+    """A line of a learning curve."""
     say(f"  {row['commands'] / 1e6:.3g} M commands, {row['seconds']:.0f} s, hover {row['hover_mm']:.4g} mm")
 
 

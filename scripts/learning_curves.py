@@ -11,7 +11,7 @@ import json
 import statistics
 import time
 
-from campaign import ROOT, Run, carry_out, facts_line, study_arguments
+from campaign import ROOT, Run, carry_out, facts_line, report, study_arguments
 
 from cfb_mjx.cli.runtime import environment, say
 
@@ -145,7 +145,7 @@ def by_brax(name: str, seed: int, results) -> None:
                 "hover_failed": nominal["failed"],
             }
         )
-        _report(rows[-1])
+        report(rows[-1])
 
     with brax_ppo() as train:
         *_, params, _ = train(
@@ -175,10 +175,6 @@ def by_brax(name: str, seed: int, results) -> None:
         "environment": environment(),
     }
     write_json(results, found)
-
-
-def _report(row: dict) -> None:
-    say(f"  {row['commands'] / 1e6:.3g} M commands, {row['seconds']:.0f} s, hover {row['hover_mm']:.4g} mm")
 
 
 def _reached(run: dict, mark: float) -> tuple[float, float] | None:

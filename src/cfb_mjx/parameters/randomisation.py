@@ -133,7 +133,7 @@ def _only_relative(key: str) -> bool:
 
 def _range(key: str, raw, path: Path) -> Range:
     specification, where = SPECIFICATIONS[key], f"ranges.{key}"
-    widths = _widths(where, raw, path)
+    widths = _widths(where, raw, path, "shared")
     if raw.get("unit") not in ("relative", specification.unit):
         raise CfbError(
             f"{path}: {where}.unit must be 'relative' or '{specification.unit}', found {told(raw.get('unit'))}."
@@ -161,15 +161,14 @@ def _range_of_effect(where: str, raw, path: Path) -> Range:
     unit = raw.get("unit")
     if not isinstance(unit, str):
         raise CfbError(f"{path}: {where}.unit must be 'relative' or the field's unit, found {told(unit)}.")
-    if "shared" in raw:
-        raise CfbError(f"{path}: unknown key '{where}.shared'.")
     return Range(widths, unit == "relative", False, unit)
 
 
-def _widths(where: str, raw, path: Path) -> tuple[float, ...]:
+def _widths(where: str, raw, path: Path, *more: str) -> tuple[float, ...]:
+    """The half-widths of a range, whose keys are the usual ones and ``more``."""
     if not isinstance(raw, dict):
         raise CfbError(f"{path}: {where} must be a mapping with half_width and unit.")
-    refuse_unknown(raw, {"half_width", "unit", "shared", "source"}, path, f"{where}.")
+    refuse_unknown(raw, {"half_width", "unit", "source", *more}, path, f"{where}.")
     width = raw.get("half_width")
     widths = width if isinstance(width, list) else [width]
     if not widths or not all(

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect
 from cfb_mjx.model.effects.fields import hub_positions, number
 from cfb_mjx.model.rotors import RotorLoads
-from cfb_mjx.model.vector import rotate
+from cfb_mjx.model.vector import Vec, rotate
 from cfb_mjx.parameters.limits import Limits
 
 REFERENCE = 0.1
@@ -63,7 +63,17 @@ class GroundEffect(Effect):
         center = condition.position[2] - rotate(condition.quaternion, parameters.center_of_gravity)[2]
         # The last row of the rotation matrix: how high a point beside the centre lies.
         above = along * (2 * (x * z - w * y)) + across * (2 * (y * z + w * x)) + center
-        core = self.height**2
-        gain = self.strength * (core + REFERENCE**2)
-        factor = above.map(lambda z: 1 + gain / (core + jnp.where(z > 0, z, 0.0) ** 2))
-        return RotorLoads(loads.thrust * factor, loads.torque, loads.rate)
+        return RotorLoads(loads.thrust * beside_surface(above, self.strength, self.height), loads.torque, loads.rate)
+
+
+def beside_surface(distance: Vec, strength: Array, reach: Array) -> Vec:
+    """Factors on the rotors' thrusts near a flat surface.
+
+    Args:
+        distance: of every rotor, m; behind the surface it counts as zero.
+        strength: relative gain at `REFERENCE`.
+        reach: distance at which half of the gain at the surface is left, m.
+    """
+    core = reach**2
+    gain = strength * (core + REFERENCE**2)
+    return distance.map(lambda a: 1 + gain / (core + jnp.where(a > 0, a, 0.0) ** 2))

@@ -2,8 +2,8 @@
 
     J_ij = relative_ij sqrt(J_i J_j),   J omega' = tau - omega x J omega with the whole tensor J
 
-A battery that lies askew does this, and turns roll into yaw. Of all forces but those that
-follow from all others (a string's tension) and those of the floor.
+A battery that lies askew does this, and turns roll into yaw. tau is of all forces but a string's tension and those of
+the floor.
 
 Not searched for by `cfb close-loop`: where a drone lacks many effects it takes up what several of them leave. Name it.
 """

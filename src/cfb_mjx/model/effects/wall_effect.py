@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Condition, Effect
 from cfb_mjx.model.effects.fields import hub_positions, number, vector
-from cfb_mjx.model.effects.ground_effect import REFERENCE
+from cfb_mjx.model.effects.ground_effect import beside_surface
 from cfb_mjx.model.rotors import RotorLoads
 from cfb_mjx.model.vector import Vec, rotate, rotate_inverse
 from cfb_mjx.parameters.limits import Limits
@@ -57,7 +57,7 @@ class WallEffect(Effect):
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"reach": 0.05}, {"reach": 0.12}, {"reach": 0.25})
 
     strength: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Relative gain of thrust at `REFERENCE` from the surface."""
+    """Relative gain of thrust 0.1 m from the surface."""
     reach: Float[Array, "*batch"] = eqx.field(converter=number)
     """Distance at which half of the gain at the surface is left."""
     direction: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
@@ -77,7 +77,4 @@ class WallEffect(Effect):
         along, across = hub_positions(parameters)
         center = condition.position - rotate(condition.quaternion, parameters.center_of_gravity)
         away = -(along * in_body[0] + across * in_body[1]) + (self.distance - center.dot(normal))
-        core = self.reach**2
-        gain = self.strength * (core + REFERENCE**2)
-        factor = away.map(lambda a: 1 + gain / (core + jnp.where(a > 0, a, 0.0) ** 2))
-        return RotorLoads(loads.thrust * factor, loads.torque, loads.rate)
+        return RotorLoads(loads.thrust * beside_surface(away, self.strength, self.reach), loads.torque, loads.rate)
