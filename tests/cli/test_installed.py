@@ -1,26 +1,31 @@
 """The wheel works in a clean environment outside the repository: shipped assets and presets are found."""
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+from cfb_mjx.control.policy_file import shipped_policies
+from cfb_mjx.parameters import preset_names
+
 ROOT = Path(__file__).resolve().parents[2]
 PROBE = """
-import cfb_mjx, pathlib
+import cfb_mjx, json, pathlib, sys
 from cfb_mjx.files import shipped
+expected = json.loads(sys.argv[1])
 from cfb_mjx.model import MjxBody, Quadrotor
 from cfb_mjx.parameters import load_randomisation, preset_names
 assert "site-packages" in cfb_mjx.__file__ or "target" in cfb_mjx.__file__, cfb_mjx.__file__
 assert str(shipped("assets", "cfb.xml")).startswith(str(pathlib.Path(cfb_mjx.__file__).parent))
-assert preset_names() == ["cf21b-500", "cf2x", "cfb", "cfb-fleet", "cfb-guards", "cfb-idsia", "cfb-idsia-predictor"]
+assert preset_names() == expected["presets"]
 load_randomisation()
 Quadrotor.from_file("cf21b-500", body=MjxBody(floor=True))
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.train import load_config
 from cfb_mjx.train.plants import load_plants
-assert list(shipped_policies()) == ["flip", "target", "target-adaptive"]
+assert list(shipped_policies()) == expected["policies"]
 assert shipped("data", "study", "ppo", "1-0.npz").exists()
 for policy in shipped_policies().values():
     load_policy(policy)
@@ -47,8 +52,15 @@ def test_wheel_carries_its_data(tmp_path):
     subprocess.run(install, check=True, capture_output=True)
     # The editable install must not shine through: the target comes first on the path, and we are elsewhere.
     environment = {**os.environ, "PYTHONPATH": str(target)}
+    # What the checkout has is what the wheel has to have: a list typed here would go stale with the next policy.
+    expected = json.dumps({"presets": preset_names(), "policies": list(shipped_policies())})
     done = subprocess.run(
-        [sys.executable, "-c", PROBE], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", PROBE, expected],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip().endswith("fine")
