@@ -59,6 +59,7 @@ LAYOUTS = {
     "no history": (Layout(past_estimates=0, past_commands=0), "relu"),
     "long": (Layout(past_estimates=3, estimate_stride=4, past_commands=2, integral=True), "tanh"),
     "body axes": (Layout(control_dt_s=0.004, body_velocity=True, position_limit_m=1.5, position_scale_m=0.5), "swish"),
+    "positions as they are": (Layout(position_bend_m=0.0, position_scale_m=1.0), "tanh"),
     "integral alone": (Layout(past_estimates=1, past_commands=0, integral=True, integral_limit_ms=0.01), "relu"),
 }
 
@@ -91,12 +92,13 @@ def test_a_difference_would_be_seen(built):
     assert compare(adaptive, built(target)[1], sequences=10).largest > 0.01
 
 
-def test_the_contract_alone_is_enough_to_rebuild_the_command(built):
+@pytest.mark.parametrize("name", ["target", "target-adaptive"])
+def test_the_contract_alone_is_enough_to_rebuild_the_command(name, built):
     """From contract.json and the weights, in NumPy and SciPy, with nothing of the library's."""
-    exported, compiled = built(find_deployment("target-adaptive"))
+    exported, compiled = built(find_deployment(name))
     promised = json.loads((exported.folder / "contract.json").read_text())
     policy = promised["policies"]["holder"]
-    archive = np.load(shipped_policies()["target-adaptive"])
+    archive = np.load(shipped_policies()[name])
     weights = [(archive[f"weight_{i}"], archive[f"bias_{i}"]) for i in range(len(policy["layers"]) - 1)]
     rows = random_inputs(np.random.default_rng(5), 2, 45)[1].astype(float)
 
@@ -113,6 +115,9 @@ def test_the_contract_alone_is_enough_to_rebuild_the_command(built):
             if "limit" in part:
                 limit = float(re.search(r"([\d.]+) m$", part["limit"]).group(1))
                 x = x * min(1.0, limit / np.linalg.norm(x))
+            if "bend" in part:
+                b, d = float(re.search(r"([\d.]+) m$", part["bend"]).group(1)), np.linalg.norm(x)
+                x = x * b * np.arcsinh(d / b) / d
             parts.append(x / part["divided_by"])
         return np.concatenate(parts)
 
@@ -121,6 +126,7 @@ def test_the_contract_alone_is_enough_to_rebuild_the_command(built):
         [np.full(4, 2 * promised["first_step"]["hover_command"] - 1)] * 9,
         0.0,
     )
+    near = most = 0.0
     compiled.reset()
     for row, u in zip(rows, compiled.steps(rows), strict=True):
         parts = []

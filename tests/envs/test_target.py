@@ -1,5 +1,6 @@
 """The target task: the paper's reward by hand, what the controller sees and when, and drones drawn at every episode."""
 
+import math
 from dataclasses import replace
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cfb_mjx.envs import Layout, Noise, PaperReward, TargetTask, observe, reset, step
 from cfb_mjx.envs.episode import QUIET
+from cfb_mjx.envs.observation import Estimate, frame
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, State, rollout
 from cfb_mjx.parameters import load_randomisation
@@ -106,7 +108,9 @@ def test_the_observation_is_the_contract():
 
     def frame(e):
         matrix = Rotation.from_quat(np.asarray(e.quaternion)[[1, 2, 3, 0]]).as_matrix()
-        return np.concatenate([e.position / 1.0, e.velocity / 2.0, matrix.ravel(), e.body_rate / 10.0])
+        distance = np.linalg.norm(e.position)
+        position = np.asarray(e.position) / distance * np.arcsinh(distance / 0.1)
+        return np.concatenate([position, e.velocity / 2.0, matrix.ravel(), e.body_rate / 10.0])
 
     integral = sum(0.008 * np.clip(e.position, -0.3, 0.3) for e in estimates[:-1])
     wanted = np.concatenate(
@@ -120,7 +124,29 @@ def test_the_observation_is_the_contract():
 def test_far_targets_look_no_farther_than_the_limit():
     at = state_at((30.0, 40.0, 0.0))
     shown = observe(QUIET_TASK, reset(QUIET_TASK, DRONE, jax.random.PRNGKey(0), at))
+    np.testing.assert_allclose(shown[:3], np.array([0.6, 0.8, 0.0]) * np.arcsinh(8.0 / 0.1), atol=1e-9)
+    straight = replace(QUIET_TASK, layout=Layout(position_scale_m=1.0, position_bend_m=0.0))
+    shown = observe(straight, reset(straight, DRONE, jax.random.PRNGKey(0), at))
     np.testing.assert_allclose(shown[:3], [4.8, 6.4, 0.0], atol=1e-9)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(-3, 1), st.floats(-3, 1))
+def test_near_positions_are_shown_as_they_are_and_far_ones_by_their_logarithm(near, far):
+    near, far = sorted((10.0**near, 10.0**far))
+
+    @jax.jit
+    def shown(y):
+        nothing = jnp.zeros(3)
+        estimate = Estimate(jnp.array([0.0, 1.0, 0.0]) * y, nothing, jnp.array([1.0, 0.0, 0.0, 0.0]), nothing)
+        return frame(Layout(position_limit_m=20.0), estimate)[1]
+
+    assert 0 < shown(near) <= near / 0.1 + 1e-9
+    if near < 0.01:
+        assert shown(near) > 0.998 * near / 0.1
+    # A factor in distance is at most a sum of its logarithm.
+    assert 0 <= shown(far) - shown(near) <= math.log(far / near) + 1e-9
+    assert float(jax.grad(shown)(0.0)) == pytest.approx(1 / 0.1)
 
 
 @settings(max_examples=25, deadline=None)

@@ -89,7 +89,9 @@ def load_policy(path: str | Path) -> PolicyFile:
             if about["format"] != FORMAT:
                 raise CfbError(f"{path}: is a policy of another format ({about['format']!r}, not {FORMAT!r}).")
             shown, activation = about["observation"], about["activation"]
-            layout = Layout(**shown | {"setpoint_scales": tuple(shown.get("setpoint_scales", ()))})
+            # Files from before there was a bend show positions as they are.
+            shown = {"position_bend_m": 0.0} | shown | {"setpoint_scales": tuple(shown.get("setpoint_scales", ()))}
+            layout = Layout(**shown)
             weights = tuple(archive[f"weight_{i}"] for i in range(about["layers"]))
             biases = tuple(archive[f"bias_{i}"] for i in range(about["layers"]))
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):

@@ -125,6 +125,11 @@ def _observation(layout: Layout) -> list[dict[str, Any]]:
                 "divided_by": layout.position_scale_m,
                 "limit": f"shortened to a length of {layout.position_limit_m} m",
             }
+            | (
+                {"bend": f"its length d then made b asinh(d / b), b = {layout.position_bend_m} m"}
+                if layout.position_bend_m
+                else {}
+            )
         )
     frame += [
         {"name": f"velocity, {axes} axes", "length": 3, "unit": "m/s", "divided_by": layout.velocity_scale_mps},

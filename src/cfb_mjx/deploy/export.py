@@ -203,6 +203,7 @@ def _network(name: str, policy: PolicyFile) -> str:
         "past_commands": layout.past_commands,
         "setpoints": len(layout.setpoint_scales),
         "position_limit": literal(layout.position_limit_m),
+        "position_bend": literal(layout.position_bend_m),
         "position_scale": literal(layout.position_scale_m),
         "velocity_scale": literal(layout.velocity_scale_mps),
         "rate_scale": literal(layout.rate_scale_radps),

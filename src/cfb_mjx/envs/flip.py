@@ -22,7 +22,14 @@ from cfb_mjx.parameters import Parameters
 
 SETPOINTS = ("speed_mps", "rate_radps")
 """What they are, in order."""
-FLIP_LAYOUT = Layout(position=False, body_velocity=True, velocity_scale_mps=3.0, setpoint_scales=(3.0, 10.0))
+FLIP_LAYOUT = Layout(
+    position=False,
+    position_scale_m=1.0,
+    position_bend_m=0.0,
+    body_velocity=True,
+    velocity_scale_mps=3.0,
+    setpoint_scales=(3.0, 10.0),
+)
 """What a flip policy sees."""
 
 

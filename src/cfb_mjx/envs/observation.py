@@ -32,7 +32,13 @@ class Layout:
     """Also show the integral of the relative position: with it constant errors of thrust and attitude can be held."""
     position_limit_m: float = 8.0
     """Farther targets look as if they were this far away, in their direction."""
-    position_scale_m: float = 1.0
+    position_scale_m: float = 0.1
+    position_bend_m: float = 0.1
+    """Distances much longer than this are shown on a logarithmic scale, as b asinh(d / b); 0: all as they are.
+
+    A network is nearly linear at first. Of distances shown as they are it makes one gain for all, no larger than a
+    target 6 m away allows.
+    """
     velocity_scale_mps: float = 2.0
     rate_scale_radps: float = 10.0
     integral_input_limit_m: float = 0.3
@@ -106,6 +112,9 @@ def frame(layout: Layout, estimate: Estimate) -> Float[Array, " frame *drones"]:
         # The square root has no slope at zero; the small number keeps the gradient finite there.
         distance = jnp.sqrt(jnp.sum(p * p, axis=0) + 1e-12)
         p = p * jnp.minimum(1.0, layout.position_limit_m / distance)
+        if layout.position_bend_m:
+            distance = jnp.minimum(distance, layout.position_limit_m)
+            p = p * layout.position_bend_m * jnp.arcsinh(distance / layout.position_bend_m) / distance
         parts.insert(0, p / layout.position_scale_m)
     return jnp.concatenate(parts)
 

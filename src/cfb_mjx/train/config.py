@@ -253,6 +253,7 @@ _AT_LEAST = {
     "checkpoints": 1,
     "observation.past_estimates": 0,
     "observation.past_commands": 0,
+    "observation.position_bend_m": 0,
     "observation.estimate_stride": 1,
     "randomisation.magnitude": 0,
     "analytic.drones": 1,
