@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
@@ -21,7 +22,7 @@ from cfb_mjx.train.brax_compat import brax_ppo, parts
 from cfb_mjx.train.config import AnalyticSettings, PpoSettings, load_config
 from cfb_mjx.train.flying import Hover
 from cfb_mjx.train.plants import load_plants
-from cfb_mjx.train.ppo import Ppo, beside_copies
+from cfb_mjx.train.ppo import Ppo, beside_copies, exploring
 from cfb_mjx.train.run import BEST, CHECKPOINT, CURVE, POLICY, UPDATES, Training, segments, train
 from tests.helpers import SMALL_TRAINING, watch_keys
 
@@ -219,6 +220,26 @@ def test_what_a_value_errs_by_in_all_copies_tells_nothing_of_a_command():
     np.testing.assert_allclose(beside_copies(wrong, 4), beside_copies(right, 4), atol=1e-4)
     np.testing.assert_allclose(beside_copies(right, 4).reshape(32, 3, 4).mean(axis=-1), 0.0, atol=1e-5)
     np.testing.assert_array_equal(beside_copies(right, 1), right)
+
+
+@pytest.mark.parametrize("along", ["motors", "axes"])
+def test_exploring_noise_along_axes_has_the_density_of_its_samples(along):
+    """Against SciPy's Gaussian; M1 to M4 stand at front right, back right, back left and front left, M1 turns left."""
+    thrust, roll, pitch, yaw = ((1, 1, 1, 1), (-1, -1, 1, 1), (-1, 1, 1, -1), (-1, 1, -1, 1))
+    stds = np.array([0.3, 0.1, 0.2, 0.5])
+    directions = np.eye(4) if along == "motors" else 0.5 * np.array([thrust, roll, pitch, yaw])
+    loc, covariance = np.array([0.1, -0.2, 0.3, 0.0]), directions.T @ np.diag(stds**2) @ directions
+    distribution = exploring(parts().distribution, along)
+    # Brax adds a thousandth to what the softplus gives.
+    logits = jnp.concatenate([jnp.asarray(loc), jnp.log(jnp.expm1(jnp.asarray(stds) - 1e-3))])
+    drawn = distribution.create_dist(logits).drawn(jax.random.normal(jax.random.key(0), (20_000, 4)))
+    np.testing.assert_allclose(np.cov(drawn, rowvar=False), covariance, atol=0.005)
+    gaussian = multivariate_normal(loc, covariance)
+    logits = jnp.broadcast_to(logits, (20_000, 8))
+    wanted = gaussian.logpdf(drawn) - np.log(1 - np.tanh(np.asarray(drawn)) ** 2).sum(axis=1)
+    np.testing.assert_allclose(distribution.log_prob(logits, drawn), wanted, rtol=1e-4)
+    entropy = np.asarray(distribution.entropy(logits, jax.random.key(1))).mean()
+    assert entropy == pytest.approx(-wanted.mean(), abs=0.02)
 
 
 def test_copies_fly_the_same_episode_with_other_commands():

@@ -16,6 +16,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
@@ -23,10 +24,13 @@ from cfb_mjx.control.neural import Network, NeuralController
 from cfb_mjx.devices import Devices
 from cfb_mjx.envs.episode import Episode, Task, choose, observe, privileged, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.rotors import TORQUE_SIGNS
 from cfb_mjx.train.algorithm import in_progress, strong
 from cfb_mjx.train.brax_compat import parts
 from cfb_mjx.train.config import PpoSettings
 
+AXES = 0.5 * np.array([(1, 1, 1, 1), *TORQUE_SIGNS])
+"""Thrust, roll, pitch and yaw of four commands; orthogonal."""
 LEAST_RATE = 1e-3
 """Of the policy's learning rate that is left where the policy changes too much with its weights."""
 
@@ -36,7 +40,7 @@ class Actor(eqx.Module):
 
     network: Network
     raw_std: Float[Array, "4"]
-    """Its softplus is the standard deviation."""
+    """Its softplus is the standard deviation: of every motor, or along thrust, roll, pitch and yaw."""
 
 
 class PpoState(eqx.Module):
@@ -75,7 +79,7 @@ class Ppo:
         self.updates = settings.updates
         self.steps_per_update = settings.drones * settings.unroll
         self.brax = parts()
-        self.distribution = self.brax.distribution.NormalTanhDistribution(event_size=4)
+        self.distribution = exploring(self.brax.distribution, settings.explore)
         gradient_steps = self.updates * settings.epochs * settings.minibatches
 
         def adam(rate: float) -> optax.GradientTransformation:
@@ -172,7 +176,7 @@ class Ppo:
             shown = jax.vmap(self._show)(episodes)
             logits = _logits(actor, shown["seen"])
             normal = self.distribution.create_dist(logits)
-            raw = noise * normal.scale + normal.loc
+            raw = normal.drawn(noise)
             action = self.distribution.postprocess(raw)
             after, outcome = jax.vmap(partial(step, self.task))(episodes, 0.5 * (1 + action))
             # Copies begin and end together.
@@ -254,6 +258,49 @@ class Ppo:
 
     def _value(self, critic: Network, shown: Array) -> Array:
         return self.ideal + critic(shown)[..., 0]
+
+
+def exploring(distribution, along: str):
+    """Brax's action distribution, tanh of a Gaussian, with independent parts along ``along``: "motors" or "axes".
+
+    Along thrust, roll, pitch and yaw each has a standard deviation of its own. What a yaw torque does is weak and slow,
+    and is lost in the noise of roll and pitch where all four motors are explored alike.
+
+    Args:
+        distribution: Brax's module of that name.
+        along: of what the parts are independent.
+    """
+    turn = jnp.asarray({"motors": np.eye(4), "axes": AXES}[along], jnp.zeros(0).dtype)
+
+    class Gaussian:
+        """In commands before the tanh; log-probabilities and entropies are per part, and their sums those of all."""
+
+        def __init__(self, normal):
+            self.normal = normal
+
+        def drawn(self, noise):
+            return (self.normal.loc + noise * self.normal.scale) @ turn
+
+        def sample(self, seed):
+            return self.normal.sample(seed) @ turn
+
+        def mode(self):
+            return self.normal.mode() @ turn
+
+        def log_prob(self, x):
+            return self.normal.log_prob(x @ turn.T)
+
+        def entropy(self):
+            return self.normal.entropy()
+
+    class Distribution(distribution.NormalTanhDistribution):
+        """Its parameters: means of the commands, standard deviations of the parts before their softplus."""
+
+        def create_dist(self, parameters):
+            loc, raw_std = jnp.split(parameters, 2, axis=-1)
+            return Gaussian(super().create_dist(jnp.concatenate([loc @ turn.T, raw_std], axis=-1)))
+
+    return Distribution(event_size=4)
 
 
 def beside_copies(advantage: Float[Array, "n drones"], copies: int) -> Float[Array, "n drones"]:
