@@ -97,6 +97,9 @@ def test_an_environment_flies_the_delay_of_its_model():
     moved = np.abs(true[-1] - true[-5]).max(axis=1)
     shown = seen[:, :3]
     assert np.linalg.norm(between, axis=1).max() < TASK.layout.position_limit_m
+    # Shown as 0.1 m asinh(d / 0.1 m), in tenths of a metre.
+    distance = np.linalg.norm(seen[:, :3], axis=1, keepdims=True)
+    shown = 0.1 * np.sinh(distance) * seen[:, :3] / distance
     assert np.abs(shown - between).max() < 0.002
     assert moved.max() > 0.05
 

@@ -88,10 +88,10 @@ class PpoSettings:
     copies: int = 4
     """Drones that fly the same episode with other actions: each one's advantage is counted from the mean of its copies,
     so that what the value network errs by in all of them cancels. They begin and end together."""
-    explore: Literal["motors", "axes"] = "axes"
+    explore: Literal["motors", "axes"] = "motors"
     """Exploring noise is independent from motor to motor, or along thrust, roll, pitch and yaw: each of the four has a
     standard deviation of its own."""
-    entropy_cost: float = 1e-3
+    entropy_cost: float = 3e-3
     """At the start; it falls to ``last_entropy`` of that along a line."""
     last_entropy: float = 0.02
     reward_scaling: float = 0.02
@@ -123,7 +123,6 @@ class FlipPpoSettings(PpoSettings):
     drones: int = 512
     minibatches: int = 8
     copies: int = 1
-    explore: Literal["motors", "axes"] = "motors"
     entropy_cost: float = 1e-3
     last_entropy: float = 1.0
     steps: int = 40_000_000
