@@ -246,19 +246,19 @@ def figure(found: dict[str, list[dict]], path) -> None:
         "#56B4E9",
         "#E69F00",
         "#8C8C8C",
-        "#000000",
-        "#F0E442",
-        "#332288",
-        "#882255",
     )
+    # Trained on randomised drones: the colour of what is the same on the nominal one, dashed.
+    plain = list(dict.fromkeys(name.replace("-random", "") for name in found))
+    colour_of = dict(zip(plain, colours[: len(plain)], strict=True))
     with context():
         plot = new_figure(9.2, 3.4)
         axes = plot.subplots(1, 2, sharey=True)
-        for (name, runs), colour in zip(found.items(), colours[: len(found)], strict=True):
+        for name, runs in found.items():
+            colour, line = colour_of[name.replace("-random", "")], "--" if "-random" in name else "-"
             error = np.array([[row["hover_mm"] for row in run["curve"]] for run in runs])
             for axis, key, scale in zip(axes, ("seconds", "commands"), (1, 1e-6), strict=True):
                 at = scale * np.median([[row[key] for row in run["curve"]] for run in runs], axis=0)
-                axis.plot(at, np.median(error, axis=0), color=colour, label=name)
+                axis.plot(at, np.median(error, axis=0), line, color=colour, label=name)
                 axis.fill_between(at, error.min(axis=0), error.max(axis=0), color=colour, alpha=0.15, linewidth=0)
         axes[0].set_xlabel("training, s")
         axes[1].set_xlabel("commands flown, millions")
