@@ -3,7 +3,7 @@
 import pytest
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.train.config import TrainingConfig, load_config
+from cfb_mjx.train.config import TrainingConfig, config_from, load_config
 from cfb_mjx.train.strict import build
 
 
@@ -18,6 +18,17 @@ def test_a_configuration_survives_being_written():
     assert config.network.hidden == (8, 8)
     assert config.ppo.learning_rate == 1e-4
     assert build(TrainingConfig, config.to_mapping(), "again") == config
+
+
+def test_a_configuration_from_before_there_was_a_bend_shows_positions_as_they_are():
+    written = load_config("target").to_mapping()
+    assert load_config("target").observation.position_bend_m == 0.1
+    del written["observation"]["position_bend_m"]
+    assert config_from(written, "an old file").observation.position_bend_m == 0.0
+    assert (
+        config_from({"task": "target", "observation": {"past_estimates": 2}}, "a new one").observation.position_bend_m
+        == 0.1
+    )
 
 
 def test_a_count_may_be_written_with_an_exponent():

@@ -12,6 +12,7 @@ row by row, where ``vmap`` would put them together drone by drone, which on a CP
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -34,7 +35,8 @@ class Layout:
     """Farther targets look as if they were this far away, in their direction."""
     position_scale_m: float = 0.1
     position_bend_m: float = 0.1
-    """Distances much longer than this are shown on a logarithmic scale, as b asinh(d / b); 0: all as they are.
+    """Distances much longer than this are shown on a logarithmic scale, as b asinh(d / b); 0: all as they are,
+    and so where a file gives `position_scale_m` and no bend.
 
     A network is nearly linear at first. Of distances shown as they are it makes one gain for all, no larger than a
     target 6 m away allows.
@@ -62,6 +64,11 @@ class Layout:
         """Length of the observation."""
         past = self.frame * (1 + self.past_estimates) + 4 * self.past_commands
         return past + 3 * self.integral + len(self.setpoint_scales)
+
+
+def with_bend(written: dict[str, Any]) -> dict[str, Any]:
+    """A layout as a file writes it; one with a scale of positions and no bend is older than the bend, and has none."""
+    return {"position_bend_m": 0.0} | written if "position_scale_m" in written else written
 
 
 class Estimate(eqx.Module):

@@ -9,6 +9,7 @@ from typing import Any, Literal
 from cfb_mjx.documents import load_named, parse_yaml, require_seed, told
 from cfb_mjx.envs import FlipReward, FlipStarts, FlipTask, Layout, Noise, PaperReward, Setpoints, Starts, TargetTask
 from cfb_mjx.envs.flip import FLIP_LAYOUT
+from cfb_mjx.envs.observation import with_bend
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters.randomisation import load_randomisation
 from cfb_mjx.train.cost import FlipCost, SmoothCost
@@ -225,6 +226,8 @@ def config_from(mapping: dict[str, Any], where: str) -> TrainingConfig:
     task = mapping.get("task", "target")
     if not isinstance(task, str) or task not in _KINDS:
         raise CfbError(f"{where}: task must be one of {', '.join(_KINDS)}, found {told(task)}.")
+    if isinstance(shown := mapping.get("observation"), dict):
+        mapping = mapping | {"observation": with_bend(shown)}
     return build(_KINDS[task], mapping, where)
 
 
