@@ -284,9 +284,6 @@ def exploring(distribution, along: str):
         def sample(self, seed):
             return self.normal.sample(seed) @ turn
 
-        def mode(self):
-            return self.normal.mode() @ turn
-
         def log_prob(self, x):
             return self.normal.log_prob(x @ turn.T)
 

@@ -63,11 +63,12 @@ static void write_frame(const cfb_network_t *network, const cfb_estimate_t *esti
   };
   if (network->position) {
     const float distance = sqrtf(p[0] * p[0] + p[1] * p[1] + p[2] * p[2] + 1e-12f);
-    const float limited = fminf(distance, network->position_limit);
-    const float bend = network->position_bend;
-    const float ratio = bend > 0.0f ? limited / bend : 0.0f;
-    /* b asinh(d / b): as it is near the target, on a logarithmic scale far from it. */
-    const float shown = bend > 0.0f ? bend * logf(ratio + sqrtf(ratio * ratio + 1.0f)) : limited;
+    float shown = fminf(distance, network->position_limit);
+    if (network->position_bend > 0.0f) {
+      /* b asinh(d / b): as it is near the target, on a logarithmic scale far from it. */
+      const float ratio = shown / network->position_bend;
+      shown = network->position_bend * logf(ratio + sqrtf(ratio * ratio + 1.0f));
+    }
     const float shrink = shown / distance;
     for (int i = 0; i < 3; i++) *frame++ = p[i] * shrink / network->position_scale;
   }
