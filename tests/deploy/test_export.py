@@ -59,7 +59,7 @@ LAYOUTS = {
     "no history": (Layout(past_estimates=0, past_commands=0), "relu"),
     "long": (Layout(past_estimates=3, estimate_stride=4, past_commands=2, integral=True), "tanh"),
     "body axes": (Layout(control_dt_s=0.004, body_velocity=True, position_limit_m=1.5, position_scale_m=0.5), "swish"),
-    "positions as they are": (Layout(position_bend_m=0.0, position_scale_m=1.0), "tanh"),
+    "positions as they are": (Layout(position_bend_m=0.0, position_scale_m=1.0, velocity_bend_mps=0.0), "tanh"),
     "integral alone": (Layout(past_estimates=1, past_commands=0, integral=True, integral_limit_ms=0.01), "relu"),
 }
 
@@ -116,7 +116,7 @@ def test_the_contract_alone_is_enough_to_rebuild_the_command(name, built):
                 limit = float(re.search(r"([\d.]+) m$", part["limit"]).group(1))
                 x = x * min(1.0, limit / np.linalg.norm(x))
             if "bend" in part:
-                b, d = float(re.search(r"([\d.]+) m$", part["bend"]).group(1)), np.linalg.norm(x)
+                b, d = float(re.search(r"([\d.]+) m(/s)?$", part["bend"]).group(1)), np.linalg.norm(x)
                 x = x * b * np.arcsinh(d / b) / d
             parts.append(x / part["divided_by"])
         return np.concatenate(parts)

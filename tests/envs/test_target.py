@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cfb_mjx.envs import Layout, Noise, PaperReward, TargetTask, observe, reset, step
+from cfb_mjx.envs import PAPER_REWARD, Layout, Noise, TargetReward, TargetTask, observe, reset, step
 from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.envs.observation import Estimate, frame
 from cfb_mjx.errors import CfbError
@@ -47,10 +47,26 @@ def test_the_papers_reward_by_hand():
         + 0.15 * 0.0
         + 0.02 * max(0, 1 - np.linalg.norm(torque) / 0.01)
     )
-    got = PaperReward()(at, jnp.zeros(3), jnp.asarray(command), DRONE.parameters)
+    got = PAPER_REWARD(at, jnp.zeros(3), jnp.asarray(command), DRONE.parameters)
     assert np.isclose(got, wanted, atol=1e-5)
     same_attitude = eqx.tree_at(lambda s: s.quaternion, at, -at.quaternion)
-    assert np.isclose(PaperReward()(same_attitude, jnp.zeros(3), jnp.asarray(command), DRONE.parameters), got)
+    assert np.isclose(PAPER_REWARD(same_attitude, jnp.zeros(3), jnp.asarray(command), DRONE.parameters), got)
+
+
+def test_near_rewards_rest_at_the_target():
+    hover = jnp.full(4, 0.55)
+
+    def more(position, velocity):
+        at = state_at(position, velocity)
+        given = [r(at, jnp.zeros(3), hover, DRONE.parameters) for r in (TargetReward(near=3.0), PAPER_REWARD)]
+        return float(given[0] - given[1])
+
+    assert np.isclose(more((0, 0, 0), (0, 0, 0)), 3.0, atol=1e-5)
+    # One width, and one speed, away: half of it each alone, a third together.
+    assert np.isclose(more((0.25, 0, 0), (0, 0, 0)), 1.5, atol=1e-5)
+    assert np.isclose(more((0, 0, 0), (0, 0.6, 0.8)), 1.5, atol=1e-5)
+    assert np.isclose(more((0, 0, 0.25), (1, 0, 0)), 1.0, atol=1e-5)
+    assert TargetReward(near=3.0).largest - PAPER_REWARD.largest == 3.0
 
 
 @pytest.mark.parametrize(
@@ -58,7 +74,7 @@ def test_the_papers_reward_by_hand():
     [((9.9, 0, 0), (0, 0, 29.9), False), ((8, 0, 6.1), (0, 0, 0), True), ((0, 0, 0), (0, -30.1, 0), True)],
 )
 def test_too_fast_ends_the_episode_and_costs_300(velocity, rate, failed):
-    reward = PaperReward()
+    reward = PAPER_REWARD
     at = state_at(velocity=velocity, rate=rate)
     hover = jnp.full(4, 0.55)
     assert bool(reward.failed(at)) == failed
@@ -110,7 +126,9 @@ def test_the_observation_is_the_contract():
         matrix = Rotation.from_quat(np.asarray(e.quaternion)[[1, 2, 3, 0]]).as_matrix()
         distance = np.linalg.norm(e.position)
         position = np.asarray(e.position) / distance * np.arcsinh(distance / 0.1)
-        return np.concatenate([position, e.velocity / 2.0, matrix.ravel(), e.body_rate / 10.0])
+        speed = np.linalg.norm(e.velocity)
+        velocity = np.asarray(e.velocity) / speed * 0.5 * np.arcsinh(speed / 0.5)
+        return np.concatenate([position, velocity / 2.0, matrix.ravel(), e.body_rate / 10.0])
 
     integral = sum(0.008 * np.clip(e.position, -0.3, 0.3) for e in estimates[:-1])
     wanted = np.concatenate(
@@ -132,21 +150,23 @@ def test_far_targets_look_no_farther_than_the_limit():
 
 @settings(max_examples=50, deadline=None)
 @given(st.floats(-3, 1), st.floats(-3, 1))
-def test_near_positions_are_shown_as_they_are_and_far_ones_by_their_logarithm(near, far):
+def test_small_lengths_are_shown_as_they_are_and_large_ones_by_their_logarithm(near, far):
     near, far = sorted((10.0**near, 10.0**far))
 
-    @jax.jit
-    def shown(y):
-        nothing = jnp.zeros(3)
-        estimate = Estimate(jnp.array([0.0, 1.0, 0.0]) * y, nothing, jnp.array([1.0, 0.0, 0.0, 0.0]), nothing)
-        return frame(Layout(position_limit_m=20.0), estimate)[1]
+    def shown(what, unit):
+        at = dict.fromkeys(("position", "velocity", "body_rate"), jnp.zeros(3))
+        layout = Layout(position_limit_m=20.0, position_bend_m=0.1, velocity_bend_mps=0.1, velocity_scale_mps=0.1)
+        index = {"position": 1, "velocity": 4}[what]
+        along = jnp.array([0.0, 1.0, 0.0]) * unit
+        return frame(layout, Estimate(**at | {what: along}, quaternion=jnp.array([1.0, 0.0, 0.0, 0.0])))[index]
 
-    assert 0 < shown(near) <= near / 0.1 + 1e-9
-    if near < 0.01:
-        assert shown(near) > 0.998 * near / 0.1
-    # A factor in distance is at most a sum of its logarithm.
-    assert 0 <= shown(far) - shown(near) <= math.log(far / near) + 1e-9
-    assert float(jax.grad(shown)(0.0)) == pytest.approx(1 / 0.1)
+    for what in ("position", "velocity"):
+        assert 0 < shown(what, near) <= near / 0.1 + 1e-9
+        if near < 0.01:
+            assert shown(what, near) > 0.998 * near / 0.1
+        # A factor in length is at most a sum of its logarithm.
+        assert 0 <= shown(what, far) - shown(what, near) <= math.log(far / near) + 1e-9
+        assert float(jax.grad(lambda y, what=what: shown(what, y))(0.0)) == pytest.approx(1 / 0.1)
 
 
 @settings(max_examples=25, deadline=None)

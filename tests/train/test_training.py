@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
@@ -22,7 +21,7 @@ from cfb_mjx.train.brax_compat import brax_ppo, parts
 from cfb_mjx.train.config import AnalyticSettings, PpoSettings, load_config
 from cfb_mjx.train.flying import Hover
 from cfb_mjx.train.plants import load_plants
-from cfb_mjx.train.ppo import Ppo, beside_copies, exploring
+from cfb_mjx.train.ppo import Ppo, beside_copies
 from cfb_mjx.train.run import BEST, CHECKPOINT, CURVE, POLICY, UPDATES, Training, segments, train
 from tests.helpers import SMALL_TRAINING, watch_keys
 
@@ -162,7 +161,7 @@ def test_updates_lower_what_the_same_flights_cost():
 
 def test_ppo_finds_the_command_that_is_rewarded():
     # Only the torque that a command asks for counts, and only the present: what is best is known, equal commands.
-    only = [f"reward.{name}=0" for name in ("position", "velocity", "attitude", "body_rate", "failure")]
+    only = [f"reward.{name}=0" for name in ("position", "near", "velocity", "attitude", "body_rate", "failure")]
     now = ("reward.torque=1", "ppo.discount=0", "ppo.reward_scaling=1", "ppo.first_std=0.1", "ppo.learning_rate=0.01")
     sizes = ("ppo.drones=64", "ppo.unroll=4", "ppo.steps=7680", "randomisation.magnitude=0")
     config = load_config("target", (*SMALL_TRAINING, *only, *now, *sizes))
@@ -178,22 +177,50 @@ def test_ppo_finds_the_command_that_is_rewarded():
     assert np.mean(rewards[-3:]) > 0.75
 
 
-def test_the_learner_is_shown_no_reward_below_the_least_and_failed_drones_begin_anew():
-    config = load_config("target", (*SMALL_TRAINING, "ppo.least_reward=-7"))
-    task = config.build_task()
-    ppo = Ppo(config.ppo, task, Quadrotor.from_file("cfb-guards"))
+def collected_after_throwing(faster, **changes):
+    """Commands of eight drones, four copies each of two episodes; ``faster`` of them begin too fast."""
+    settings = PpoSettings(drones=8, copies=4, minibatches=2, unroll=24, steps=1, value_hidden=(8,), least_reward=-7.0)
+    task = TargetTask(randomisation=load_randomisation("paper"), **changes)
+    ppo = Ppo(settings, task, Quadrotor.from_file("cfb-guards"))
     state = ppo.begin(jax.random.PRNGKey(0), NeuralController.random(jax.random.PRNGKey(1), task.layout, (8, 8)))
-    fast = state.episodes.state.velocity.at[:3].set(50.0)
-    episodes = eqx.tree_at(lambda e: e.state.velocity, state.episodes, fast)
-    after, data, outcome = eqx.filter_jit(ppo._collect)(state.actor, episodes, jax.random.PRNGKey(2))
-    np.testing.assert_array_equal(outcome.failed[0, :3], True)
-    assert float(outcome.reward[0, :3].max()) < -298
-    scaling = config.ppo.reward_scaling
-    np.testing.assert_array_equal(data["reward"][0, :3], -7 * scaling)
+    episodes, lost = state.episodes
+    episodes = eqx.tree_at(lambda e: e.count, episodes, jnp.zeros_like(episodes.count))
+    episodes = eqx.tree_at(lambda e: e.state.velocity, episodes, episodes.state.velocity.at[faster].set(50.0))
+    after, data, outcome = eqx.filter_jit(ppo._collect)(state.actor, (episodes, lost), jax.random.PRNGKey(2))
+    return settings, episodes, after, data, outcome
+
+
+def test_the_learner_is_shown_no_reward_below_the_least_and_failed_drones_begin_anew():
+    settings, episodes, (after, lost), data, outcome = collected_after_throwing(slice(0, 4))
+    np.testing.assert_array_equal(outcome.failed[0], [True] * 4 + [False] * 4)
+    assert float(outcome.reward[0, :4].max()) < -296
+    scaling = settings.reward_scaling
+    np.testing.assert_array_equal(data["reward"][0, :4], -7 * scaling)
     np.testing.assert_array_equal(data["reward"][1:], outcome.reward[1:] * scaling)
     # Another drone each, and the rest of the commands flown with it.
-    assert not np.any(np.asarray(after.model.parameters.mass)[:3] == np.asarray(episodes.model.parameters.mass)[:3])
-    np.testing.assert_array_equal(after.count[:3], config.ppo.unroll - 1)
+    assert not np.any(np.asarray(after.model.parameters.mass)[:4] == np.asarray(episodes.model.parameters.mass)[:4])
+    np.testing.assert_array_equal(after.count[:4], settings.unroll - 1)
+    np.testing.assert_array_equal(data["flown"], 1.0)
+    assert not np.any(lost)
+
+
+def test_a_copy_that_fails_waits_for_the_others_and_nothing_is_learnt_from_it():
+    _, episodes, (after, lost), data, _ = collected_after_throwing(slice(1, 3))
+    np.testing.assert_array_equal(lost, [False, True, True] + [False] * 5)
+    flown = np.ones((24, 8))
+    flown[1:, 1:3] = 0.0
+    np.testing.assert_array_equal(data["flown"], flown)
+    np.testing.assert_array_equal(data["failed"], 1.0 - np.concatenate([flown[1:], flown[-1:]]))
+    # The others fly on, on the same drone; nobody is cut short.
+    np.testing.assert_array_equal(after.count, [24, 0, 0, 24, 24, 24, 24, 24])
+    np.testing.assert_array_equal(after.model.parameters.mass, episodes.model.parameters.mass)
+    np.testing.assert_array_equal(data["cut"], 0.0)
+    # With their time it is over for those who wait, too.
+    _, episodes, (after, lost), data, _ = collected_after_throwing(slice(1, 3), episode_s=0.08)
+    assert not np.any(lost)
+    np.testing.assert_array_equal(data["cut"][9], [1.0, 0.0, 0.0] + [1.0] * 5)
+    np.testing.assert_array_equal(data["flown"].sum(axis=0), [24, 15, 15, 24, 24, 24, 24, 24])
+    assert not np.any(np.asarray(after.model.parameters.mass)[:4] == np.asarray(episodes.model.parameters.mass)[:4])
 
 
 def test_what_a_value_errs_by_in_all_copies_tells_nothing_of_a_command():
@@ -217,29 +244,16 @@ def test_what_a_value_errs_by_in_all_copies_tells_nothing_of_a_command():
 
     right, wrong = advantages(values), advantages(values + error)
     assert float(jnp.std(wrong - right)) > float(jnp.std(right))
-    np.testing.assert_allclose(beside_copies(wrong, 4), beside_copies(right, 4), atol=1e-4)
-    np.testing.assert_allclose(beside_copies(right, 4).reshape(32, 3, 4).mean(axis=-1), 0.0, atol=1e-5)
-    np.testing.assert_array_equal(beside_copies(right, 1), right)
-
-
-@pytest.mark.parametrize("along", ["motors", "axes"])
-def test_exploring_noise_along_axes_has_the_density_of_its_samples(along):
-    """Against SciPy's Gaussian; M1 to M4 stand at front right, back right, back left and front left, M1 turns left."""
-    thrust, roll, pitch, yaw = ((1, 1, 1, 1), (-1, -1, 1, 1), (-1, 1, 1, -1), (-1, 1, -1, 1))
-    stds = np.array([0.3, 0.1, 0.2, 0.5])
-    directions = np.eye(4) if along == "motors" else 0.5 * np.array([thrust, roll, pitch, yaw])
-    loc, covariance = np.array([0.1, -0.2, 0.3, 0.0]), directions.T @ np.diag(stds**2) @ directions
-    distribution = exploring(parts().distribution, along)
-    # Brax adds a thousandth to what the softplus gives.
-    logits = jnp.concatenate([jnp.asarray(loc), jnp.log(jnp.expm1(jnp.asarray(stds) - 1e-3))])
-    drawn = distribution.create_dist(logits).drawn(jax.random.normal(jax.random.key(0), (20_000, 4)))
-    np.testing.assert_allclose(np.cov(drawn, rowvar=False), covariance, atol=0.005)
-    gaussian = multivariate_normal(loc, covariance)
-    logits = jnp.broadcast_to(logits, (20_000, 8))
-    wanted = gaussian.logpdf(drawn) - np.log(1 - np.tanh(np.asarray(drawn)) ** 2).sum(axis=1)
-    np.testing.assert_allclose(distribution.log_prob(logits, drawn), wanted, rtol=1e-4)
-    entropy = np.asarray(distribution.entropy(logits, jax.random.key(1))).mean()
-    assert entropy == pytest.approx(-wanted.mean(), abs=0.02)
+    all_of_them = jnp.ones((32, 12))
+    found = beside_copies(right, all_of_them, 4)
+    np.testing.assert_allclose(beside_copies(wrong, all_of_them, 4), found, atol=1e-4)
+    np.testing.assert_allclose(found.reshape(32, 3, 4).mean(axis=-1), 0.0, atol=1e-5)
+    np.testing.assert_array_equal(beside_copies(right, all_of_them, 1), right)
+    # Of a copy that is lost nothing is known, and nothing is counted.
+    flown = all_of_them.at[5:, 1].set(0.0)
+    there = np.delete(np.asarray(right).reshape(32, 3, 4)[5:, 0], 1, axis=-1)
+    found = np.delete(np.asarray(beside_copies(right, flown, 4))[5:, :4], 1, axis=-1)
+    np.testing.assert_allclose(found, there - there.mean(axis=-1, keepdims=True), atol=1e-5)
 
 
 def test_copies_fly_the_same_episode_with_other_commands():
@@ -248,20 +262,24 @@ def test_copies_fly_the_same_episode_with_other_commands():
     task = TargetTask(randomisation=load_randomisation("paper"), episode_s=0.8)
     ppo = Ppo(settings, task, Quadrotor.from_file("cfb-guards"))
     state = ppo.begin(jax.random.PRNGKey(1), NeuralController.random(jax.random.PRNGKey(0), task.layout, (8, 8)))
-    before = np.asarray(state.episodes.count)
+    before = np.asarray(state.episodes[0].count)
     state, _ = ppo.update(state)
+    episodes, lost = state.episodes
 
     def in_groups(x):
         return np.asarray(x).reshape(8, 3, -1)
 
-    for same in (state.episodes.model.parameters.mass, state.episodes.target, state.episodes.count):
+    for same in (episodes.model.parameters.mass, episodes.target):
         np.testing.assert_array_equal(in_groups(same), in_groups(same)[:, :1].repeat(3, axis=1))
+    count = np.where(lost, -1, episodes.count)
+    flown = in_groups(count).max(axis=1)
+    assert np.all((in_groups(count)[..., 0] == flown) | in_groups(lost)[..., 0])
     # Episodes have ended, and began at different times.
-    assert np.any(np.asarray(state.episodes.count) < before + 64)
-    assert len(set(in_groups(state.episodes.count)[:, 0, 0])) > 3
-    position = in_groups(state.episodes.state.position)
+    assert np.any(np.asarray(episodes.count) < before + 64)
+    assert len(set(flown[:, 0])) > 3
+    position = in_groups(episodes.state.position)
     assert np.all(np.ptp(position, axis=1).max(axis=-1) > 0)
-    assert np.ptp(in_groups(state.episodes.model.parameters.mass)[:, 0]) > 1e-3
+    assert np.ptp(in_groups(episodes.model.parameters.mass)[:, 0]) > 1e-3
 
 
 # In the middle of a segment, and after its last update.

@@ -112,6 +112,10 @@ def _policy(policy: PolicyFile) -> dict[str, Any]:
     }
 
 
+def _bend(bend: float, unit: str) -> dict[str, str]:
+    return {"bend": f"its length d then made b asinh(d / b), b = {bend} {unit}"} if bend else {}
+
+
 def _observation(layout: Layout) -> list[dict[str, Any]]:
     """Segments of what the network is shown, in order."""
     axes = "body" if layout.body_velocity else "world"
@@ -125,14 +129,11 @@ def _observation(layout: Layout) -> list[dict[str, Any]]:
                 "divided_by": layout.position_scale_m,
                 "limit": f"shortened to a length of {layout.position_limit_m} m",
             }
-            | (
-                {"bend": f"its length d then made b asinh(d / b), b = {layout.position_bend_m} m"}
-                if layout.position_bend_m
-                else {}
-            )
+            | _bend(layout.position_bend_m, "m")
         )
     frame += [
-        {"name": f"velocity, {axes} axes", "length": 3, "unit": "m/s", "divided_by": layout.velocity_scale_mps},
+        {"name": f"velocity, {axes} axes", "length": 3, "unit": "m/s", "divided_by": layout.velocity_scale_mps}
+        | _bend(layout.velocity_bend_mps, "m/s"),
         {"name": "rotation matrix, body to world, by rows", "length": 9, "unit": "1", "divided_by": 1.0},
         {"name": "body rate", "length": 3, "unit": "rad/s", "divided_by": layout.rate_scale_radps},
     ]

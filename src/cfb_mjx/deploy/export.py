@@ -205,6 +205,7 @@ def _network(name: str, policy: PolicyFile) -> str:
         "position_limit": literal(layout.position_limit_m),
         "position_bend": literal(layout.position_bend_m),
         "position_scale": literal(layout.position_scale_m),
+        "velocity_bend": literal(layout.velocity_bend_mps),
         "velocity_scale": literal(layout.velocity_scale_mps),
         "rate_scale": literal(layout.rate_scale_radps),
         "integral_input_limit": literal(layout.integral_input_limit_m),

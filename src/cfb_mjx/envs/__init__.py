@@ -3,11 +3,12 @@
 from cfb_mjx.envs.episode import Episode, Noise, Task, observe, privileged, reset, step, with_room
 from cfb_mjx.envs.flip import FlipReward, FlipStarts, FlipTask, Setpoints
 from cfb_mjx.envs.observation import Estimate, Layout, Memory
-from cfb_mjx.envs.reward import PaperReward
+from cfb_mjx.envs.reward import PAPER_REWARD, TargetReward
 from cfb_mjx.envs.starts import Starts
 from cfb_mjx.envs.target import TargetTask
 
 __all__ = [
+    "PAPER_REWARD",
     "Episode",
     "Estimate",
     "FlipReward",
@@ -16,9 +17,9 @@ __all__ = [
     "Layout",
     "Memory",
     "Noise",
-    "PaperReward",
     "Setpoints",
     "Starts",
+    "TargetReward",
     "TargetTask",
     "Task",
     "observe",

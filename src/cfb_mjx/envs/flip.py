@@ -28,6 +28,7 @@ FLIP_LAYOUT = Layout(
     position_bend_m=0.0,
     body_velocity=True,
     velocity_scale_mps=3.0,
+    velocity_bend_mps=0.0,
     setpoint_scales=(3.0, 10.0),
 )
 """What a flip policy sees."""

@@ -42,6 +42,8 @@ class Layout:
     target 6 m away allows.
     """
     velocity_scale_mps: float = 2.0
+    velocity_bend_mps: float = 0.5
+    """The same for speeds: what brakes half a metre per second in time turns the drone over at six."""
     rate_scale_radps: float = 10.0
     integral_input_limit_m: float = 0.3
     """The integral of each axis grows no faster than if the drone were this far away."""
@@ -68,7 +70,8 @@ class Layout:
 
 def with_bend(written: dict[str, Any]) -> dict[str, Any]:
     """A layout as a file writes it; one with a scale of positions and no bend is older than the bend, and has none."""
-    return {"position_bend_m": 0.0} | written if "position_scale_m" in written else written
+    none = {"position_bend_m": 0.0, "velocity_bend_mps": 0.0}
+    return none | written if "position_scale_m" in written else written
 
 
 class Estimate(eqx.Module):
@@ -113,17 +116,27 @@ def frame(layout: Layout, estimate: Estimate) -> Float[Array, " frame *drones"]:
     if layout.body_velocity:
         velocity = jnp.einsum("i...,ij...->j...", velocity, turn)
     turn = turn.reshape(9, *velocity.shape[1:])
+    if layout.velocity_bend_mps:
+        velocity = velocity * _bent(_length(velocity), layout.velocity_bend_mps)
     parts = [velocity / layout.velocity_scale_mps, turn, estimate.body_rate / layout.rate_scale_radps]
     if layout.position:
         p = estimate.position
-        # The square root has no slope at zero; the small number keeps the gradient finite there.
-        distance = jnp.sqrt(jnp.sum(p * p, axis=0) + 1e-12)
+        distance = _length(p)
         p = p * jnp.minimum(1.0, layout.position_limit_m / distance)
         if layout.position_bend_m:
-            distance = jnp.minimum(distance, layout.position_limit_m)
-            p = p * layout.position_bend_m * jnp.arcsinh(distance / layout.position_bend_m) / distance
+            p = p * _bent(jnp.minimum(distance, layout.position_limit_m), layout.position_bend_m)
         parts.insert(0, p / layout.position_scale_m)
     return jnp.concatenate(parts)
+
+
+def _length(vector: Float[Array, " 3 *drones"]) -> Float[Array, " *drones"]:
+    # The square root has no slope at zero; the small number keeps the gradient finite there.
+    return jnp.sqrt(jnp.sum(vector * vector, axis=0) + 1e-12)
+
+
+def _bent(length: Float[Array, " *drones"], bend: float) -> Float[Array, " *drones"]:
+    """By what a vector of this length is multiplied to be bend asinh(length / bend) long."""
+    return bend * jnp.arcsinh(length / bend) / length
 
 
 def start(layout: Layout, estimate: Estimate, command: Float[Array, " 4 *drones"] | float) -> Memory:

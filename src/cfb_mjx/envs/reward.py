@@ -1,4 +1,4 @@
-"""The paper's reward for flying to a target, when an episode fails, and what rewards are made of."""
+"""The reward for flying to a target, when an episode fails, and what rewards are made of."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ def triangle(error: Float[Array, ""], largest: float) -> Float[Array, ""]:
 
 
 @dataclass(frozen=True)
-class PaperReward:
-    """Weights, widths and limits of the paper (section V). The sum is per control step.
+class TargetReward:
+    """Weights, widths and limits of the paper (section V), and ``near``, which is not the paper's. The sum is per
+    control step.
 
     "L u" is read as the roll and pitch torque that the command asks for once the rotors have followed it, L f(K u):
     its width is given in N m, and u itself has no unit.
@@ -27,6 +28,17 @@ class PaperReward:
 
     position: float = 1.0
     position_width_m: float = 10.0
+    near: float = 2.0
+    """Of a bell about rest at the target, 0 in the paper's reward:
+
+        1 / (1 + |p / near_width|^2 + |v / near_speed|^2 + |(q - 1) / near_attitude|^2)
+
+    The paper's falls by 0.1 per metre: a decimetre is worth less than a learner's own noise. This one falls by up to
+    2.6 x near per metre, has no cusp that would ask for the largest gain, and tells who swings from who is at rest.
+    """
+    near_width_m: float = 0.25
+    near_speed_mps: float = 1.0
+    near_attitude: float = 0.5
     velocity: float = 0.05
     velocity_width_mps: float = 10.0
     attitude: float = 0.15
@@ -44,7 +56,7 @@ class PaperReward:
     @property
     def largest(self) -> float:
         """What a step at rest on the target is worth."""
-        return self.position + self.velocity + self.attitude + self.body_rate + self.torque
+        return self.position + self.near + self.velocity + self.attitude + self.body_rate + self.torque
 
     def failed(self, state: State) -> Bool[Array, ""]:
         """Whether speed or body rate have passed their limits."""
@@ -54,15 +66,22 @@ class PaperReward:
         self, state: State, target: Float[Array, "3"], command: Float[Array, "4"], parameters: Parameters
     ) -> Float[Array, ""]:
         """Reward of ``state`` after ``command`` [0 to 1]; what is judged is the true state, not its estimate."""
+        offset = state.position - target
         turned = 2.0 * jnp.maximum(0.0, 1.0 - jnp.abs(state.quaternion[0]))
+        apart = jnp.sum((offset / self.near_width_m) ** 2) + jnp.sum((state.velocity / self.near_speed_mps) ** 2)
+        apart += turned / self.near_attitude**2
         reward = (
-            self.position * triangle(length(state.position - target), self.position_width_m)
+            self.position * triangle(length(offset), self.position_width_m)
+            + self.near / (1.0 + apart)
             + self.velocity * triangle(length(state.velocity), self.velocity_width_mps)
             + self.attitude * triangle(jnp.sqrt(turned + 1e-12), self.attitude_width)
             + self.body_rate * triangle(length(state.body_rate), self.body_rate_width_radps)
             + self.torque * triangle(length(commanded_torque(parameters, command)), self.torque_width_nm)
         )
         return reward - self.failure * self.failed(state)
+
+
+PAPER_REWARD = TargetReward(near=0.0)
 
 
 def too_fast(state: State, speed_limit_mps: float, rate_limit_radps: float) -> Bool[Array, ""]:

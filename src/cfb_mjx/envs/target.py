@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.envs.episode import Task
-from cfb_mjx.envs.reward import PaperReward, length
+from cfb_mjx.envs.reward import TargetReward, length
 from cfb_mjx.envs.starts import Starts, draw
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
@@ -19,7 +19,7 @@ from cfb_mjx.parameters import Parameters
 class TargetTask(Task):
     """The paper's first task. It asks for nothing beside the target."""
 
-    reward: PaperReward = field(default_factory=PaperReward)
+    reward: TargetReward = field(default_factory=TargetReward)
     starts: Starts = field(default_factory=Starts)
 
     @property
@@ -34,7 +34,7 @@ class TargetTask(Task):
     def judge(
         self, state: State, target: Float[Array, "3"], setpoint: Array, command: Array, parameters: Parameters
     ) -> Float[Array, ""]:
-        """The paper's reward."""
+        """As ``reward`` says."""
         return self.reward(state, target, command, parameters)
 
     def failed(self, state: State) -> Bool[Array, ""]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from cfb_mjx.documents import load_named, parse_yaml, require_seed, told
-from cfb_mjx.envs import FlipReward, FlipStarts, FlipTask, Layout, Noise, PaperReward, Setpoints, Starts, TargetTask
+from cfb_mjx.envs import FlipReward, FlipStarts, FlipTask, Layout, Noise, Setpoints, Starts, TargetReward, TargetTask
 from cfb_mjx.envs.flip import FLIP_LAYOUT
 from cfb_mjx.envs.observation import with_bend
 from cfb_mjx.errors import CfbError
@@ -89,9 +89,6 @@ class PpoSettings:
     copies: int = 4
     """Drones that fly the same episode with other actions: each one's advantage is counted from the mean of its copies,
     so that what the value network errs by in all of them cancels. They begin and end together."""
-    explore: Literal["motors", "axes"] = "motors"
-    """Exploring noise is independent from motor to motor, or along thrust, roll, pitch and yaw: each of the four has a
-    standard deviation of its own."""
     entropy_cost: float = 3e-3
     """At the start; it falls to ``last_entropy`` of that along a line."""
     last_entropy: float = 0.02
@@ -151,7 +148,7 @@ class TrainingConfig:
     """Whether the gyro is as late as the pose, as in the paper, or only by the model's ``gyro_delay``."""
     network: NetworkSettings = field(default_factory=NetworkSettings)
     observation: Layout = field(default_factory=Layout)
-    reward: PaperReward = field(default_factory=PaperReward)
+    reward: TargetReward = field(default_factory=TargetReward)
     starts: Starts = field(default_factory=Starts)
     noise: Noise = field(default_factory=Noise)
     randomisation: RandomisationSettings = field(default_factory=RandomisationSettings)
@@ -228,6 +225,9 @@ def config_from(mapping: dict[str, Any], where: str) -> TrainingConfig:
         raise CfbError(f"{where}: task must be one of {', '.join(_KINDS)}, found {told(task)}.")
     if isinstance(shown := mapping.get("observation"), dict):
         mapping = mapping | {"observation": with_bend(shown)}
+    if task == "target" and isinstance(reward := mapping.get("reward"), dict) and "position" in reward:
+        # Written when there was none, or with the paper before the eyes.
+        mapping = mapping | {"reward": {"near": 0.0} | reward}
     return build(_KINDS[task], mapping, where)
 
 
@@ -260,6 +260,7 @@ _AT_LEAST = {
     "observation.past_estimates": 0,
     "observation.past_commands": 0,
     "observation.position_bend_m": 0,
+    "observation.velocity_bend_mps": 0,
     "observation.estimate_stride": 1,
     "randomisation.magnitude": 0,
     "analytic.drones": 1,

@@ -16,21 +16,17 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import Network, NeuralController
 from cfb_mjx.devices import Devices
 from cfb_mjx.envs.episode import Episode, Task, choose, observe, privileged, reset, step
 from cfb_mjx.model.quadrotor import Quadrotor
-from cfb_mjx.model.rotors import TORQUE_SIGNS
 from cfb_mjx.train.algorithm import in_progress, strong
 from cfb_mjx.train.brax_compat import parts
 from cfb_mjx.train.config import PpoSettings
 
-AXES = 0.5 * np.array([(1, 1, 1, 1), *TORQUE_SIGNS])
-"""Thrust, roll, pitch and yaw of four commands; orthogonal."""
 LEAST_RATE = 1e-3
 """Of the policy's learning rate that is left where the policy changes too much with its weights."""
 
@@ -40,7 +36,7 @@ class Actor(eqx.Module):
 
     network: Network
     raw_std: Float[Array, "4"]
-    """Its softplus is the standard deviation: of every motor, or along thrust, roll, pitch and yaw."""
+    """Its softplus is the standard deviation."""
 
 
 class PpoState(eqx.Module):
@@ -51,8 +47,8 @@ class PpoState(eqx.Module):
     optimizer: Any
     rate: Float[Array, ""]
     """Factor on the policy's learning rate that keeps the KL divergence of an update small."""
-    episodes: Episode
-    """One per drone."""
+    episodes: tuple[Episode, Bool[Array, " drones"]]
+    """One per drone, and who is lost and waits for its copies."""
     key: PRNGKeyArray
     count: Int[Array, ""]
 
@@ -79,7 +75,7 @@ class Ppo:
         self.updates = settings.updates
         self.steps_per_update = settings.drones * settings.unroll
         self.brax = parts()
-        self.distribution = exploring(self.brax.distribution, settings.explore)
+        self.distribution = self.brax.distribution.NormalTanhDistribution(event_size=4)
         gradient_steps = self.updates * settings.epochs * settings.minibatches
 
         def adam(rate: float) -> optax.GradientTransformation:
@@ -106,6 +102,7 @@ class Ppo:
         raw = jnp.log(jnp.expm1(jnp.full(4, self.first_std)))
         actor = Actor(controller.network, raw)
         optimizer, rate = self.optimizer.init((actor, critic)), jnp.asarray(self.first_rate, raw.dtype)
+        episodes = episodes, jnp.zeros(self.settings.drones, bool)
         return strong(PpoState(actor, critic, optimizer, rate, episodes, key, jnp.asarray(0)))
 
     def controller(self, state: PpoState) -> NeuralController:
@@ -124,7 +121,7 @@ class Ppo:
         episodes, data, outcome = self._collect(state.actor, state.episodes, of_flight)
         show = self.devices.divided(jax.vmap(self._show), (0,), 0)
         # Every device needs what all drones saw: a batch is drawn from all of them.
-        data, last = self.devices.whole((data, show(episodes)["hidden"]))
+        data, last = self.devices.whole((data, show(episodes[0])["hidden"]))
         learning = jnp.where(state.count < self.warm_up, 0.0, 1.0)
         left = 1 - (1 - self.settings.last_entropy) * state.count / self.updates
         weights = learning, learning * self.settings.entropy_cost * left
@@ -138,15 +135,15 @@ class Ppo:
         calm = (learning > 0) & (losses["kl"] < self.settings.largest_kl / 4)
         rate = jnp.minimum(jnp.where(calm, 1.5 * rate, rate), 1.0)
         metrics = {
-            "reward": jnp.mean(outcome.reward),
-            "failing": jnp.mean(outcome.failed),
+            "reward": jnp.sum(outcome.reward * data["flown"]) / jnp.sum(data["flown"]),
+            "failing": jnp.mean(data["failed"] * data["flown"]),
             "std": jnp.mean(jax.nn.softplus(learnt[0].raw_std)),
             "rate": rate,
             **losses,
         }
         return PpoState(*learnt, rate, episodes, key, state.count + 1), metrics
 
-    def _collect(self, actor: Actor, episodes: Episode, key: PRNGKeyArray):
+    def _collect(self, actor: Actor, episodes: tuple[Episode, Array], key: PRNGKeyArray):
         """Fly ``unroll`` commands with every drone; data has axes (unroll, drones)."""
         # Drawing drones and starts costs as much as flying: once per few commands is enough, as no drone fails twice
         # within them.
@@ -165,31 +162,45 @@ class Ppo:
         data, outcome = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), flown)
         return episodes, data, outcome
 
-    def _fly(self, actor: Actor, episodes: Episode, of_reset: PRNGKeyArray, noise: Float[Array, "n each drones 4"]):
-        """Fly so many drones; where one fails, another begins, drawn anew once per ``each`` commands."""
+    def _fly(
+        self,
+        actor: Actor,
+        episodes: tuple[Episode, Array],
+        of_reset: PRNGKeyArray,
+        noise: Float[Array, "n each drones 4"],
+    ):
+        """Fly so many drones. Who fails waits until its copies have failed too, or their time is over; then another
+        begins, drawn anew once per ``each`` commands.
+
+        Were all copies ended by the first that fails, the others, a moment from failing, would not learn of it.
+        """
+        copies = self.settings.copies
 
         def some(episodes, given):
             of_reset, noise = given
             return jax.lax.scan(partial(one, self._reset(of_reset)), episodes, noise)
 
         def one(fresh, episodes, noise):
+            episodes, lost = episodes
             shown = jax.vmap(self._show)(episodes)
             logits = _logits(actor, shown["seen"])
             normal = self.distribution.create_dist(logits)
-            raw = normal.drawn(noise)
+            raw = normal.loc + normal.scale * noise
             action = self.distribution.postprocess(raw)
             after, outcome = jax.vmap(partial(step, self.task))(episodes, 0.5 * (1 + action))
-            # Copies begin and end together.
-            over = (outcome.failed | outcome.timed_out).reshape(-1, self.settings.copies)
-            over = jnp.repeat(jnp.any(over, axis=1), self.settings.copies)
+            failed = outcome.failed | lost
+            in_groups = jnp.stack([failed, outcome.timed_out & ~lost]).reshape(2, -1, copies)
+            over = jnp.repeat(jnp.all(in_groups[0], axis=-1) | jnp.any(in_groups[1], axis=-1), copies)
             kept = shown | {
                 "raw": raw,
                 "log_prob": self.distribution.log_prob(logits, raw),
                 "reward": self.settings.reward_scaling * jnp.maximum(outcome.reward, self.settings.least_reward),
-                "failed": 1.0 * outcome.failed,
-                "cut": 1.0 * (over & ~outcome.failed),
+                "failed": 1.0 * failed,
+                "cut": 1.0 * (over & ~failed),
+                "flown": 1.0 * ~lost,
             }
-            return choose(over, fresh, after), (kept, outcome)
+            after = choose(over, fresh, choose(failed, episodes, after))
+            return (after, failed & ~over), (kept, outcome)
 
         return jax.lax.scan(some, episodes, (of_reset, noise))
 
@@ -235,72 +246,40 @@ class Ppo:
             lambda_=self.settings.gae_lambda,
             discount=self.settings.discount,
         )
-        advantage = beside_copies(advantage, self.settings.copies)
-        most = self.settings.advantage_limit * jnp.mean(jnp.abs(advantage))
+        flown = data["flown"]
+
+        def mean(x):
+            return jnp.sum(flown * x) / jnp.sum(flown)
+
+        advantage = beside_copies(advantage, flown, self.settings.copies)
+        most = self.settings.advantage_limit * mean(jnp.abs(advantage))
         advantage = jnp.clip(advantage, -most, most)
-        advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-8)
+        advantage -= mean(advantage)
+        advantage /= jnp.sqrt(mean(advantage**2)) + 1e-8
         log_ratio = self.distribution.log_prob(logits, data["raw"]) - data["log_prob"]
         ratio = jnp.exp(log_ratio)
         near = self.settings.clipping
-        gain = jnp.mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - near, 1 + near) * advantage))
-        value_loss = jnp.mean((returns - values) ** 2) / 4
-        entropy = jnp.mean(self.distribution.entropy(logits, key))
+        gain = mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - near, 1 + near) * advantage))
+        value_loss = mean((returns - values) ** 2) / 4
+        entropy = mean(self.distribution.entropy(logits, key))
         loss = value_loss - weights[0] * gain - weights[1] * entropy
         return loss, {
             "loss": loss,
             "value_loss": value_loss,
-            "value_explained": 1 - jnp.var(returns - values) / jnp.var(returns),
+            "value_explained": 1 - 4 * value_loss / mean((returns - mean(returns)) ** 2),
             "entropy": entropy,
             # The estimate of least variance (Schulman, Approximating KL divergence, 2020).
-            "kl": jnp.mean(ratio - 1 - log_ratio),
-            "clipped": jnp.mean(jnp.abs(ratio - 1) > near),
+            "kl": mean(ratio - 1 - log_ratio),
+            "clipped": mean(jnp.abs(ratio - 1) > near),
         }
 
     def _value(self, critic: Network, shown: Array) -> Array:
         return self.ideal + critic(shown)[..., 0]
 
 
-def exploring(distribution, along: str):
-    """Brax's action distribution, tanh of a Gaussian, with independent parts along ``along``: "motors" or "axes".
-
-    Along thrust, roll, pitch and yaw each has a standard deviation of its own. What a yaw torque does is weak and slow,
-    and is lost in the noise of roll and pitch where all four motors are explored alike.
-
-    Args:
-        distribution: Brax's module of that name.
-        along: of what the parts are independent.
-    """
-    turn = jnp.asarray({"motors": np.eye(4), "axes": AXES}[along], jnp.zeros(0).dtype)
-
-    class Gaussian:
-        """In commands before the tanh; log-probabilities and entropies are per part, and their sums those of all."""
-
-        def __init__(self, normal):
-            self.normal = normal
-
-        def drawn(self, noise):
-            return (self.normal.loc + noise * self.normal.scale) @ turn
-
-        def sample(self, seed):
-            return self.normal.sample(seed) @ turn
-
-        def log_prob(self, x):
-            return self.normal.log_prob(x @ turn.T)
-
-        def entropy(self):
-            return self.normal.entropy()
-
-    class Distribution(distribution.NormalTanhDistribution):
-        """Its parameters: means of the commands, standard deviations of the parts before their softplus."""
-
-        def create_dist(self, parameters):
-            loc, raw_std = jnp.split(parameters, 2, axis=-1)
-            return Gaussian(super().create_dist(jnp.concatenate([loc @ turn.T, raw_std], axis=-1)))
-
-    return Distribution(event_size=4)
-
-
-def beside_copies(advantage: Float[Array, "n drones"], copies: int) -> Float[Array, "n drones"]:
+def beside_copies(
+    advantage: Float[Array, "n drones"], flown: Float[Array, "n drones"], copies: int
+) -> Float[Array, "n drones"]:
     """Advantages less the mean of the drone's copies at the same command.
 
     Copies began alike and see the same noise, so what the value network errs by is nearly the same in all of them; what
@@ -309,12 +288,14 @@ def beside_copies(advantage: Float[Array, "n drones"], copies: int) -> Float[Arr
 
     Args:
         advantage: generalised advantages (Schulman et al. 2016); copies beside each other.
+        flown: one for commands that were flown, zero for those of a copy that is lost.
         copies: of every drone; 1: nothing is changed.
     """
     if copies == 1:
         return advantage
-    of_each = advantage.reshape(len(advantage), -1, copies)
-    return (of_each - jnp.mean(of_each, axis=-1, keepdims=True)).reshape(advantage.shape)
+    of_each, flown = (x.reshape(len(x), -1, copies) for x in (advantage, flown))
+    mean = jnp.sum(flown * of_each, axis=-1, keepdims=True) / jnp.maximum(jnp.sum(flown, axis=-1, keepdims=True), 1.0)
+    return (of_each - mean).reshape(advantage.shape)
 
 
 def _logits(actor: Actor, seen: Array) -> Array:

@@ -52,6 +52,17 @@ static float limited(float x, float limit) { return x > limit ? limit : (x < -li
 
 static int frame_length(const cfb_network_t *network) { return network->position ? 18 : 15; }
 
+static float length_of(const float *vector) {
+  return sqrtf(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2] + 1e-12f);
+}
+
+/* b asinh(length / b): short lengths as they are, long ones on a logarithmic scale; b = 0: all as they are. */
+static float bent(float length, float b) {
+  if (b <= 0.0f) return length;
+  const float ratio = length / b;
+  return b * logf(ratio + sqrtf(ratio * ratio + 1.0f));
+}
+
 static void write_frame(const cfb_network_t *network, const cfb_estimate_t *estimate, float *frame) {
   const float *const p = estimate->position, *const v = estimate->velocity;
   const float w = estimate->quaternion[0], x = estimate->quaternion[1], y = estimate->quaternion[2],
@@ -62,19 +73,14 @@ static void write_frame(const cfb_network_t *network, const cfb_estimate_t *esti
       2.0f * (x * z - w * y),        2.0f * (y * z + w * x),        1.0f - 2.0f * (x * x + y * y),
   };
   if (network->position) {
-    const float distance = sqrtf(p[0] * p[0] + p[1] * p[1] + p[2] * p[2] + 1e-12f);
-    float shown = fminf(distance, network->position_limit);
-    if (network->position_bend > 0.0f) {
-      /* b asinh(d / b): as it is near the target, on a logarithmic scale far from it. */
-      const float ratio = shown / network->position_bend;
-      shown = network->position_bend * logf(ratio + sqrtf(ratio * ratio + 1.0f));
-    }
-    const float shrink = shown / distance;
+    const float distance = length_of(p);
+    const float shrink = bent(fminf(distance, network->position_limit), network->position_bend) / distance;
     for (int i = 0; i < 3; i++) *frame++ = p[i] * shrink / network->position_scale;
   }
+  const float speed = length_of(v), shrink = bent(speed, network->velocity_bend) / speed;
   for (int i = 0; i < 3; i++) {
     const float along = network->body_velocity ? turn[i] * v[0] + turn[3 + i] * v[1] + turn[6 + i] * v[2] : v[i];
-    *frame++ = along / network->velocity_scale;
+    *frame++ = along * shrink / network->velocity_scale;
   }
   for (int i = 0; i < 9; i++) *frame++ = turn[i];
   for (int i = 0; i < 3; i++) *frame++ = estimate->body_rate[i] / network->rate_scale;

@@ -20,7 +20,7 @@ typedef struct {
   /* What is shown. */
   int position, body_velocity, integral; /* yes or no */
   int past_estimates, estimate_stride, past_commands, setpoints;
-  float position_limit, position_bend, position_scale, velocity_scale, rate_scale;
+  float position_limit, position_bend, position_scale, velocity_bend, velocity_scale, rate_scale;
   float integral_input_limit, integral_limit, dt;
   const float *setpoint_scales;
   /* What is made of it. */
