@@ -22,7 +22,7 @@ MODEL = Quadrotor.from_file("cfb-guards")
 quick = partial(jax.jit, compiler_options=helpers.QUICK_COMPILE)
 LAYOUTS = (
     Layout(),
-    Layout(past_estimates=2, estimate_stride=2, past_commands=3, integral=True, body_velocity=True),
+    Layout(past_estimates=2, estimate_stride=2, past_commands=3, integral=True, body_position=True, body_velocity=True),
     Layout(past_estimates=0, past_commands=0, position=False),
 )
 CLOSE = {"rtol": 1e-9, "atol": 1e-11}

@@ -58,7 +58,10 @@ def built(tmp_path_factory):
 LAYOUTS = {
     "no history": (Layout(past_estimates=0, past_commands=0), "relu"),
     "long": (Layout(past_estimates=3, estimate_stride=4, past_commands=2, integral=True), "tanh"),
-    "body axes": (Layout(control_dt_s=0.004, body_velocity=True, position_limit_m=1.5, position_scale_m=0.5), "swish"),
+    "body axes": (
+        Layout(control_dt_s=0.004, body_position=True, body_velocity=True, position_limit_m=1.5, position_scale_m=0.5),
+        "swish",
+    ),
     "positions as they are": (Layout(position_bend_m=0.0, position_scale_m=1.0, velocity_bend_mps=0.0), "tanh"),
     "integral alone": (Layout(past_estimates=1, past_commands=0, integral=True, integral_limit_ms=0.01), "relu"),
 }

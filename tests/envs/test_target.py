@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cfb_mjx.envs import PAPER_REWARD, Layout, Noise, TargetReward, TargetTask, observe, reset, step
+from cfb_mjx.envs import PAPER_REWARD, Layout, Noise, Starts, TargetReward, TargetTask, observe, reset, step
 from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.envs.observation import Estimate, frame
 from cfb_mjx.errors import CfbError
@@ -56,9 +56,9 @@ def test_the_papers_reward_by_hand():
 def test_near_rewards_rest_at_the_target():
     hover = jnp.full(4, 0.55)
 
-    def more(position, velocity):
-        at = state_at(position, velocity)
-        given = [r(at, jnp.zeros(3), hover, DRONE.parameters) for r in (TargetReward(near=3.0), PAPER_REWARD)]
+    def more(position, velocity, turn=None):
+        at = state_at(position, velocity, turn)
+        given = [TargetReward(near=near)(at, jnp.zeros(3), hover, DRONE.parameters) for near in (3.0, 0.0)]
         return float(given[0] - given[1])
 
     assert np.isclose(more((0, 0, 0), (0, 0, 0)), 3.0, atol=1e-5)
@@ -66,7 +66,9 @@ def test_near_rewards_rest_at_the_target():
     assert np.isclose(more((0.25, 0, 0), (0, 0, 0)), 1.5, atol=1e-5)
     assert np.isclose(more((0, 0, 0), (0, 0.6, 0.8)), 1.5, atol=1e-5)
     assert np.isclose(more((0, 0, 0.25), (1, 0, 0)), 1.0, atol=1e-5)
-    assert TargetReward(near=3.0).largest - PAPER_REWARD.largest == 3.0
+    # |q - 1| = 2 sin(angle / 4) = 0.5
+    assert np.isclose(more((0, 0, 0), (0, 0, 0), Rotation.from_rotvec([0, 0, 4 * np.arcsin(0.25)])), 1.5, atol=1e-5)
+    assert TargetReward(near=3.0).largest - TargetReward(near=0.0).largest == 3.0
 
 
 @pytest.mark.parametrize(
@@ -125,9 +127,9 @@ def test_the_observation_is_the_contract():
     def frame(e):
         matrix = Rotation.from_quat(np.asarray(e.quaternion)[[1, 2, 3, 0]]).as_matrix()
         distance = np.linalg.norm(e.position)
-        position = np.asarray(e.position) / distance * np.arcsinh(distance / 0.1)
+        position = matrix.T @ e.position / distance * np.arcsinh(distance / 0.1)
         speed = np.linalg.norm(e.velocity)
-        velocity = np.asarray(e.velocity) / speed * 0.5 * np.arcsinh(speed / 0.5)
+        velocity = matrix.T @ e.velocity / speed * 0.5 * np.arcsinh(speed / 0.5)
         return np.concatenate([position, velocity / 2.0, matrix.ravel(), e.body_rate / 10.0])
 
     integral = sum(0.008 * np.clip(e.position, -0.3, 0.3) for e in estimates[:-1])
@@ -188,13 +190,15 @@ def _drawn(keys, magnitude):
     return jax.vmap(lambda key: reset(RANDOM_TASK, DRONE, key, magnitude=magnitude).model)(keys)
 
 
-def test_starts_reach_as_far_as_they_say_and_half_of_them_begin_nearby():
-    task = TargetTask()
+@pytest.mark.parametrize("near", [0.3, 0.5])
+def test_starts_reach_as_far_as_they_say_and_as_many_as_asked_begin_nearby(near):
+    task = TargetTask(starts=Starts(near=near))
     states = jax.jit(jax.vmap(lambda key: reset(task, DRONE, key).state))(jax.random.split(jax.random.PRNGKey(0), 4000))
     level = np.linalg.norm(states.position[:, :2], axis=1)
     assert 6.0 < level.max() <= 6.5
     assert np.abs(states.position[:, 2]).max() <= 2.0
-    assert 0.5 < np.mean(level < 0.65) < 0.65
+    # Of the others 0.1 + 0.09: difficulty times the root of a uniform number below a tenth.
+    assert np.mean(level < 0.65) == pytest.approx(near + 0.19 * (1 - near), abs=0.03)
     up = Rotation.from_quat(np.asarray(states.quaternion)[:, [1, 2, 3, 0]]).as_matrix()[:, 2, 2]
     assert up.min() < -0.95
     np.testing.assert_allclose(np.linalg.norm(states.quaternion, axis=1), 1, atol=1e-12)

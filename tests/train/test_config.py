@@ -33,10 +33,10 @@ def test_a_configuration_from_before_there_was_a_bend_shows_positions_as_they_ar
 
 def test_a_reward_from_before_there_was_near_is_the_papers():
     written = load_config("target").to_mapping()
-    assert load_config("target").reward.near == 2.0
+    assert load_config("target").reward.near == 3.0
     del written["reward"]["near"]
     assert config_from(written, "an old file").reward.near == 0.0
-    assert config_from({"task": "target", "reward": {"torque": 0.1}}, "a new one").reward.near == 2.0
+    assert config_from({"task": "target", "reward": {"torque": 0.1}}, "a new one").reward.near == 3.0
 
 
 def test_a_count_may_be_written_with_an_exponent():

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import replace
+from itertools import pairwise
 
 import equinox as eqx
 import jax
@@ -187,25 +188,25 @@ def collected_after_throwing(faster, **changes):
     episodes = eqx.tree_at(lambda e: e.count, episodes, jnp.zeros_like(episodes.count))
     episodes = eqx.tree_at(lambda e: e.state.velocity, episodes, episodes.state.velocity.at[faster].set(50.0))
     after, data, outcome = eqx.filter_jit(ppo._collect)(state.actor, (episodes, lost), jax.random.PRNGKey(2))
-    return settings, episodes, after, data, outcome
+    return ppo, state, episodes, after, data, outcome
 
 
 def test_the_learner_is_shown_no_reward_below_the_least_and_failed_drones_begin_anew():
-    settings, episodes, (after, lost), data, outcome = collected_after_throwing(slice(0, 4))
+    ppo, _, episodes, (after, lost), data, outcome = collected_after_throwing(slice(0, 4))
     np.testing.assert_array_equal(outcome.failed[0], [True] * 4 + [False] * 4)
     assert float(outcome.reward[0, :4].max()) < -296
-    scaling = settings.reward_scaling
+    scaling = ppo.settings.reward_scaling
     np.testing.assert_array_equal(data["reward"][0, :4], -7 * scaling)
     np.testing.assert_array_equal(data["reward"][1:], outcome.reward[1:] * scaling)
     # Another drone each, and the rest of the commands flown with it.
     assert not np.any(np.asarray(after.model.parameters.mass)[:4] == np.asarray(episodes.model.parameters.mass)[:4])
-    np.testing.assert_array_equal(after.count[:4], settings.unroll - 1)
+    np.testing.assert_array_equal(after.count[:4], ppo.settings.unroll - 1)
     np.testing.assert_array_equal(data["flown"], 1.0)
     assert not np.any(lost)
 
 
 def test_a_copy_that_fails_waits_for_the_others_and_nothing_is_learnt_from_it():
-    _, episodes, (after, lost), data, _ = collected_after_throwing(slice(1, 3))
+    *_, episodes, (after, lost), data, _ = collected_after_throwing(slice(1, 3))
     np.testing.assert_array_equal(lost, [False, True, True] + [False] * 5)
     flown = np.ones((24, 8))
     flown[1:, 1:3] = 0.0
@@ -216,11 +217,31 @@ def test_a_copy_that_fails_waits_for_the_others_and_nothing_is_learnt_from_it():
     np.testing.assert_array_equal(after.model.parameters.mass, episodes.model.parameters.mass)
     np.testing.assert_array_equal(data["cut"], 0.0)
     # With their time it is over for those who wait, too.
-    _, episodes, (after, lost), data, _ = collected_after_throwing(slice(1, 3), episode_s=0.08)
+    *_, episodes, (after, lost), data, _ = collected_after_throwing(slice(1, 3), episode_s=0.08)
     assert not np.any(lost)
     np.testing.assert_array_equal(data["cut"][9], [1.0, 0.0, 0.0] + [1.0] * 5)
     np.testing.assert_array_equal(data["flown"].sum(axis=0), [24, 15, 15, 24, 24, 24, 24, 24])
     assert not np.any(np.asarray(after.model.parameters.mass)[:4] == np.asarray(episodes.model.parameters.mass)[:4])
+
+
+def test_a_change_of_command_has_its_price_within_a_flight_alone():
+    """Not from the end of one to the beginning of the next, nor of what a lost copy would have flown."""
+    ppo, state, *_, data, _ = collected_after_throwing(slice(1, 3), episode_s=0.08)
+    of_network = ppo.controller(state).network
+    mean = np.tanh(np.asarray(of_network(data["seen"])))
+    changes = []
+    for copy in range(8):
+        # Ten commands a flight; copies 1 and 2 are lost after the first of theirs, and begin again with the others.
+        for begin, end in ((0, 1 if copy in (1, 2) else 10), (10, 20), (20, 24)):
+            changes += [float(np.sum((b - a) ** 2)) for a, b in pairwise(mean[begin:end, copy])]
+    last = data["hidden"][-1]
+    weights = jnp.asarray(1.0), jnp.asarray(0.0)
+    both = state.actor, state.critic
+    total, metrics = jax.jit(ppo._loss)(both, weights, data, last, jax.random.PRNGKey(0))
+    assert float(metrics["change"]) == pytest.approx(np.mean(changes), rel=1e-4)
+    free = Ppo(replace(ppo.settings, smoothness=0.0), ppo.task, ppo.nominal)
+    without, _ = jax.jit(free._loss)(both, weights, data, last, jax.random.PRNGKey(0))
+    assert float(total - without) == pytest.approx(ppo.settings.smoothness * np.mean(changes), rel=1e-3)
 
 
 def test_what_a_value_errs_by_in_all_copies_tells_nothing_of_a_command():

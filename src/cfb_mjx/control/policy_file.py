@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.control.neural import ACTIVATIONS, Network, NeuralController
-from cfb_mjx.envs.observation import Layout, with_bend
+from cfb_mjx.envs.observation import Layout, as_written
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, replacing
 
@@ -89,7 +89,7 @@ def load_policy(path: str | Path) -> PolicyFile:
             if about["format"] != FORMAT:
                 raise CfbError(f"{path}: is a policy of another format ({about['format']!r}, not {FORMAT!r}).")
             shown, activation = about["observation"], about["activation"]
-            layout = Layout(**with_bend(shown) | {"setpoint_scales": tuple(shown.get("setpoint_scales", ()))})
+            layout = Layout(**as_written(shown) | {"setpoint_scales": tuple(shown.get("setpoint_scales", ()))})
             weights = tuple(archive[f"weight_{i}"] for i in range(about["layers"]))
             biases = tuple(archive[f"bias_{i}"] for i in range(about["layers"]))
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):

@@ -123,7 +123,7 @@ def _observation(layout: Layout) -> list[dict[str, Any]]:
     if layout.position:
         frame.append(
             {
-                "name": "position - target",
+                "name": "position - target" + (", body axes" if layout.body_position else ""),
                 "length": 3,
                 "unit": "m",
                 "divided_by": layout.position_scale_m,

@@ -196,6 +196,7 @@ def _network(name: str, policy: PolicyFile) -> str:
         parts.append(_array(scales, np.asarray(layout.setpoint_scales, np.float32)))
     fields = {
         "position": int(layout.position),
+        "body_position": int(layout.body_position),
         "body_velocity": int(layout.body_velocity),
         "integral": int(layout.integral),
         "past_estimates": layout.past_estimates,

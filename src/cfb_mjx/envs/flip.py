@@ -26,6 +26,7 @@ FLIP_LAYOUT = Layout(
     position=False,
     position_scale_m=1.0,
     position_bend_m=0.0,
+    body_position=False,
     body_velocity=True,
     velocity_scale_mps=3.0,
     velocity_bend_mps=0.0,

@@ -51,8 +51,10 @@ class Layout:
     """Largest integral of each axis, m s."""
     position: bool = True
     """Show the position at all."""
-    body_velocity: bool = False
-    """Velocity in body axes, not the world's."""
+    body_position: bool = True
+    """Position in body axes, not the world's: what to do then does not depend on the heading."""
+    body_velocity: bool = True
+    """The same for the velocity."""
     setpoint_scales: tuple[float, ...] = ()
     """One per set-point, which is divided by it."""
 
@@ -68,10 +70,11 @@ class Layout:
         return past + 3 * self.integral + len(self.setpoint_scales)
 
 
-def with_bend(written: dict[str, Any]) -> dict[str, Any]:
-    """A layout as a file writes it; one with a scale of positions and no bend is older than the bend, and has none."""
-    none = {"position_bend_m": 0.0, "velocity_bend_mps": 0.0}
-    return none | written if "position_scale_m" in written else written
+def as_written(written: dict[str, Any]) -> dict[str, Any]:
+    """A layout as a file writes it. One that says how positions are scaled, and not how they are bent or in whose axes
+    they are, is older than both: straight, and the world's."""
+    older = {"position_bend_m": 0.0, "velocity_bend_mps": 0.0, "body_position": False, "body_velocity": False}
+    return older | written if "position_scale_m" in written else written
 
 
 class Estimate(eqx.Module):
@@ -112,17 +115,20 @@ def rotation_matrix(q: Float[Array, " 4 *drones"]) -> Float[Array, "3 3 *drones"
 
 def frame(layout: Layout, estimate: Estimate) -> Float[Array, " frame *drones"]:
     """The numbers of one estimate, scaled."""
-    turn, velocity = rotation_matrix(estimate.quaternion), estimate.velocity
-    if layout.body_velocity:
-        velocity = jnp.einsum("i...,ij...->j...", velocity, turn)
+    turn = rotation_matrix(estimate.quaternion)
+
+    def in_axes(vector, body):
+        return jnp.einsum("i...,ij...->j...", vector, turn) if body else vector
+
+    velocity = in_axes(estimate.velocity, layout.body_velocity)
+    position = in_axes(estimate.position, layout.body_position)
     turn = turn.reshape(9, *velocity.shape[1:])
     if layout.velocity_bend_mps:
         velocity = velocity * _bent(_length(velocity), layout.velocity_bend_mps)
     parts = [velocity / layout.velocity_scale_mps, turn, estimate.body_rate / layout.rate_scale_radps]
     if layout.position:
-        p = estimate.position
-        distance = _length(p)
-        p = p * jnp.minimum(1.0, layout.position_limit_m / distance)
+        distance = _length(position)
+        p = position * jnp.minimum(1.0, layout.position_limit_m / distance)
         if layout.position_bend_m:
             p = p * _bent(jnp.minimum(distance, layout.position_limit_m), layout.position_bend_m)
         parts.insert(0, p / layout.position_scale_m)

@@ -19,17 +19,17 @@ def triangle(error: Float[Array, ""], largest: float) -> Float[Array, ""]:
 
 @dataclass(frozen=True)
 class TargetReward:
-    """Weights, widths and limits of the paper (section V), and ``near``, which is not the paper's. The sum is per
-    control step.
+    """The paper's lengths (section V) with other weights, and ``near``, which is not the paper's: `PAPER_REWARD` is as
+    printed. The sum is per control step.
 
     "L u" is read as the roll and pitch torque that the command asks for once the rotors have followed it, L f(K u):
     its width is given in N m, and u itself has no unit.
     """
 
-    position: float = 1.0
+    position: float = 10.0
     position_width_m: float = 10.0
-    near: float = 2.0
-    """Of a bell about rest at the target, 0 in the paper's reward:
+    near: float = 3.0
+    """Of a bell about rest at the target:
 
         1 / (1 + |p / near_width|^2 + |v / near_speed|^2 + |(q - 1) / near_attitude|^2)
 
@@ -44,8 +44,8 @@ class TargetReward:
     attitude: float = 0.15
     attitude_width: float = 2.0
     """Of |q - [1, 0, 0, 0]|, taken with the sign of q that is nearer."""
-    body_rate: float = 0.15
-    body_rate_width_radps: float = 10.0
+    body_rate: float = 0.45
+    body_rate_width_radps: float = 30.0
     torque: float = 0.02
     torque_width_nm: float = 0.01
     failure: float = 300.0
@@ -81,7 +81,7 @@ class TargetReward:
         return reward - self.failure * self.failed(state)
 
 
-PAPER_REWARD = TargetReward(near=0.0)
+PAPER_REWARD = TargetReward(position=1.0, near=0.0, body_rate=0.15, body_rate_width_radps=10.0)
 
 
 def too_fast(state: State, speed_limit_mps: float, rate_limit_radps: float) -> Bool[Array, ""]:

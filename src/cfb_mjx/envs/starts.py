@@ -21,7 +21,7 @@ class Starts:
     A share ``near`` of the episodes begins with d below 0.1. The rest is uniform.
     """
 
-    near: float = 0.5
+    near: float = 0.2
     distance_m: float = 6.5
     height_m: float = 2.0
     """Largest vertical distance."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from cfb_mjx.documents import load_named, parse_yaml, require_seed, told
 from cfb_mjx.envs import FlipReward, FlipStarts, FlipTask, Layout, Noise, Setpoints, Starts, TargetReward, TargetTask
 from cfb_mjx.envs.flip import FLIP_LAYOUT
-from cfb_mjx.envs.observation import with_bend
+from cfb_mjx.envs.observation import as_written
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters.randomisation import load_randomisation
 from cfb_mjx.train.cost import FlipCost, SmoothCost
@@ -34,7 +35,7 @@ class RandomisationSettings:
     """A shipped randomisation or a YAML file."""
     magnitude: float = 1.0
     """Factor on all ranges; 0 trains on the nominal drone alone."""
-    graded: float = 0.5
+    graded: float = 0.3
     """Share of the episodes that draw their own factor between 0 and ``magnitude``: uniform draws of a dozen numbers
     are never all near their means, and without this the nominal drone itself would never be flown."""
 
@@ -66,15 +67,15 @@ class FlipAnalyticSettings(AnalyticSettings):
 class PpoSettings:
     """Proximal policy optimisation (Schulman et al. 2017)."""
 
-    drones: int = 128
+    drones: int = 256
     """Copies included."""
     unroll: int = 128
     """Commands of every drone between two updates of the policy."""
-    minibatches: int = 4
+    minibatches: int = 8
     epochs: int = 4
     steps: int = 100_000_000
     """Commands in total."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 5e-4
     """At the start; it falls to ``last_rate`` of that along a line."""
     value_learning_rate: float = 1e-3
     """Of the value network, likewise."""
@@ -83,12 +84,15 @@ class PpoSettings:
     discount: float = 0.995
     gae_lambda: float = 0.98
     clipping: float = 0.2
-    advantage_limit: float = 3.0
+    advantage_limit: float = 20.0
     """Advantages larger than so many times their mean magnitude count as that: the few drones that fail, by a lot,
     would otherwise drown what all the others have to learn about their last decimetre."""
     copies: int = 4
     """Drones that fly the same episode with other actions: each one's advantage is counted from the mean of its copies,
     so that what the value network errs by in all of them cancels. They begin and end together."""
+    smoothness: float = 3.0
+    """Price of |u_(k+1) - u_k|^2 of the policy's means, with commands from -1 to 1 (Mysore et al. 2021, CAPS): what is
+    explored costs nothing."""
     entropy_cost: float = 3e-3
     """At the start; it falls to ``last_entropy`` of that along a line."""
     last_entropy: float = 0.02
@@ -119,8 +123,10 @@ class FlipPpoSettings(PpoSettings):
     """The same for flips: what a command does to a turn is over sooner, and the value network errs little."""
 
     drones: int = 512
-    minibatches: int = 8
     copies: int = 1
+    learning_rate: float = 1e-3
+    advantage_limit: float = 3.0
+    smoothness: float = 0.0
     entropy_cost: float = 1e-3
     last_entropy: float = 1.0
     steps: int = 40_000_000
@@ -143,14 +149,14 @@ class TrainingConfig:
     seed: int = 0
     checkpoints: int = 20
     """Over the whole training, evenly spaced; the policy is flown and the learning curve grows at each."""
-    episode_s: float = 6.0
+    episode_s: float = 4.0
     lumped_delay: bool = True
     """Whether the gyro is as late as the pose, as in the paper, or only by the model's ``gyro_delay``."""
     network: NetworkSettings = field(default_factory=NetworkSettings)
     observation: Layout = field(default_factory=Layout)
     reward: TargetReward = field(default_factory=TargetReward)
     starts: Starts = field(default_factory=Starts)
-    noise: Noise = field(default_factory=Noise)
+    noise: Noise = field(default_factory=partial(Noise, pose_jitter_s=0.012))
     randomisation: RandomisationSettings = field(default_factory=RandomisationSettings)
     analytic: AnalyticSettings = field(default_factory=AnalyticSettings)
     ppo: PpoSettings = field(default_factory=PpoSettings)
@@ -185,7 +191,9 @@ class FlipTrainingConfig(TrainingConfig):
     observation: Layout = FLIP_LAYOUT
     reward: FlipReward = field(default_factory=FlipReward)
     starts: FlipStarts = field(default_factory=FlipStarts)
+    noise: Noise = field(default_factory=Noise)
     setpoints: Setpoints = field(default_factory=Setpoints)
+    randomisation: RandomisationSettings = field(default_factory=partial(RandomisationSettings, graded=0.5))
     analytic: FlipAnalyticSettings = field(default_factory=FlipAnalyticSettings)
     ppo: FlipPpoSettings = field(default_factory=FlipPpoSettings)
 
@@ -224,7 +232,7 @@ def config_from(mapping: dict[str, Any], where: str) -> TrainingConfig:
     if not isinstance(task, str) or task not in _KINDS:
         raise CfbError(f"{where}: task must be one of {', '.join(_KINDS)}, found {told(task)}.")
     if isinstance(shown := mapping.get("observation"), dict):
-        mapping = mapping | {"observation": with_bend(shown)}
+        mapping = mapping | {"observation": as_written(shown)}
     if task == "target" and isinstance(reward := mapping.get("reward"), dict) and "position" in reward:
         # Written when there was none, or with the paper before the eyes.
         mapping = mapping | {"reward": {"near": 0.0} | reward}
@@ -273,6 +281,7 @@ _AT_LEAST = {
     "ppo.steps": 1,
     "ppo.warm_up": 0,
     "ppo.largest_kl": 0,
+    "ppo.smoothness": 0,
 }
 _POSITIVE = (
     "episode_s",

@@ -262,12 +262,17 @@ class Ppo:
         gain = mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - near, 1 + near) * advantage))
         value_loss = mean((returns - values) ** 2) / 4
         entropy = mean(self.distribution.entropy(logits, key))
-        loss = value_loss - weights[0] * gain - weights[1] * entropy
+        # From one command to the next of the same flight.
+        follows = (flown * (1 - data["failed"]) * (1 - data["cut"]))[:-1] * flown[1:]
+        change = jnp.sum(jnp.diff(jnp.tanh(logits[..., :4]), axis=0) ** 2, axis=-1)
+        change = jnp.sum(follows * change) / jnp.maximum(jnp.sum(follows), 1.0)
+        loss = value_loss - weights[0] * (gain - self.settings.smoothness * change) - weights[1] * entropy
         return loss, {
             "loss": loss,
             "value_loss": value_loss,
             "value_explained": 1 - 4 * value_loss / mean((returns - mean(returns)) ** 2),
             "entropy": entropy,
+            "change": change,
             # The estimate of least variance (Schulman, Approximating KL divergence, 2020).
             "kl": mean(ratio - 1 - log_ratio),
             "clipped": mean(jnp.abs(ratio - 1) > near),

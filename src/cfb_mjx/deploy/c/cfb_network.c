@@ -63,8 +63,14 @@ static float bent(float length, float b) {
   return b * logf(ratio + sqrtf(ratio * ratio + 1.0f));
 }
 
+/* ``vector`` of the world as the body sees it, or as it is. */
+static void in_axes(const float *vector, const float *turn, int body, float *seen) {
+  for (int i = 0; i < 3; i++)
+    seen[i] = body ? turn[i] * vector[0] + turn[3 + i] * vector[1] + turn[6 + i] * vector[2] : vector[i];
+}
+
 static void write_frame(const cfb_network_t *network, const cfb_estimate_t *estimate, float *frame) {
-  const float *const p = estimate->position, *const v = estimate->velocity;
+  float p[3], v[3];
   const float w = estimate->quaternion[0], x = estimate->quaternion[1], y = estimate->quaternion[2],
               z = estimate->quaternion[3];
   const float turn[9] = {
@@ -72,16 +78,15 @@ static void write_frame(const cfb_network_t *network, const cfb_estimate_t *esti
       2.0f * (x * y + w * z),        1.0f - 2.0f * (x * x + z * z), 2.0f * (y * z - w * x),
       2.0f * (x * z - w * y),        2.0f * (y * z + w * x),        1.0f - 2.0f * (x * x + y * y),
   };
+  in_axes(estimate->position, turn, network->body_position, p);
+  in_axes(estimate->velocity, turn, network->body_velocity, v);
   if (network->position) {
     const float distance = length_of(p);
     const float shrink = bent(fminf(distance, network->position_limit), network->position_bend) / distance;
     for (int i = 0; i < 3; i++) *frame++ = p[i] * shrink / network->position_scale;
   }
   const float speed = length_of(v), shrink = bent(speed, network->velocity_bend) / speed;
-  for (int i = 0; i < 3; i++) {
-    const float along = network->body_velocity ? turn[i] * v[0] + turn[3 + i] * v[1] + turn[6 + i] * v[2] : v[i];
-    *frame++ = along * shrink / network->velocity_scale;
-  }
+  for (int i = 0; i < 3; i++) *frame++ = v[i] * shrink / network->velocity_scale;
   for (int i = 0; i < 9; i++) *frame++ = turn[i];
   for (int i = 0; i < 3; i++) *frame++ = estimate->body_rate[i] / network->rate_scale;
 }

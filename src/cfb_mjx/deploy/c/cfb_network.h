@@ -18,7 +18,7 @@ typedef struct {
 
 typedef struct {
   /* What is shown. */
-  int position, body_velocity, integral; /* yes or no */
+  int position, body_position, body_velocity, integral; /* yes or no */
   int past_estimates, estimate_stride, past_commands, setpoints;
   float position_limit, position_bend, position_scale, velocity_bend, velocity_scale, rate_scale;
   float integral_input_limit, integral_limit, dt;
