@@ -7,6 +7,7 @@ most. `brax` is the trainer of Brax itself. What is done is kept in benchmarks/l
 anew goes on. Writes docs/learning-curves.md and its figure.
 """
 
+import csv
 import json
 import statistics
 import time
@@ -210,7 +211,30 @@ def page(found: dict[str, list[dict]]) -> str:
         cells.append(f"{statistics.median(random):.0f} [{min(random):.0f}, {max(random):.0f}]" if random else "")
         cells.append(f"{statistics.median(run['curve'][-1]['seconds'] for run in runs):.0f}")
         lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *of_shipped("target-ppo", "target")]) + "\n"
+
+
+def of_shipped(name: str, config: str) -> list[str]:
+    """The curve that was kept with a shipped policy, and what trained it."""
+    folder = ROOT / "src" / "cfb_mjx" / "policies" / name
+    facts = json.loads((folder / "training.json").read_text())["environment"]
+    rows = list(csv.DictReader((folder / "curve.csv").read_text().splitlines()))
+    lines = [
+        "",
+        f"## The shipped `{name}`",
+        "",
+        f"`cfb train {config}`, {facts['date']}, {facts['processor']}, Python {facts['python']}, jax {facts['jax']}. "
+        "Flown with the delays of its training; on randomised drones: median of 256 drawn at the paper's magnitude.",
+        "",
+        "| commands | time | hover, nominal, mm | command std | on randomised drones, mm | failed |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        number = {key: float(value) for key, value in row.items()}
+        cells = [f"{number['commands'] / 1e6:.0f} M", f"{number['seconds'] / 60:.1f} min", f"{number['hover_mm']:.1f}"]
+        cells += [f"{number['command_std']:.4f}", f"{number['random_mm']:.0f}", f"{number['random_failed']:.1%}"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return lines
 
 
 def figure(found: dict[str, list[dict]], path) -> None:

@@ -47,6 +47,7 @@ SENSORS = {
 """Changed parameters of the nominal drone, whether the gyro is as late as the pose (None: as the controller has it),
 and changed noise of the estimates."""
 IDSIA = "cfb-idsia"
+CONTROLLERS = ["target", "target-ppo", "target-adaptive", "pid", "mellinger"]
 PAPER_OF = {"target": PAPER_HOVER[1.0], **PAPER_FIRMWARE}
 
 
@@ -54,7 +55,7 @@ def main() -> None:
     """Measure, then write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plants", type=int, default=4096)
-    parser.add_argument("--controllers", nargs="+", default=["target", "target-adaptive", "pid", "mellinger"])
+    parser.add_argument("--controllers", nargs="+", default=CONTROLLERS)
     parser.add_argument("--before", type=Path, help="results of an earlier run")
     arguments = parser.parse_args()
     before = json.loads(arguments.before.read_text()) if arguments.before else None

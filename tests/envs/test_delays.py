@@ -86,7 +86,8 @@ def test_jitter_makes_every_reading_late_by_another_time():
 
 
 def test_an_environment_flies_the_delay_of_its_model():
-    env = TargetVectorEnv(16, replace(TASK, starts=Starts(near=0.0)), late(0.030))
+    in_world = replace(TASK, starts=Starts(near=0.0), layout=replace(TASK.layout, body_position=False))
+    env = TargetVectorEnv(16, in_world, late(0.030))
     _, info = env.reset(seed=0)
     true = [info["position"]]
     for _ in range(8):

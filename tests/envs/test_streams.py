@@ -15,7 +15,7 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from cfb_mjx.envs import FlipStarts, FlipTask, TargetTask, reset, step
+from cfb_mjx.envs import FlipStarts, FlipTask, Starts, TargetTask, reset, step
 from cfb_mjx.envs.episode import QUIET, Streams, mildness
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.rotors import hover_rotor_speed
@@ -28,9 +28,9 @@ COUNT = 20_000
 DRONE = eqx.tree_at(
     lambda m: m.parameters.inertia, Quadrotor.from_file("cfb-guards"), jnp.array([3.0e-5, 3.2e-5, 3.4e-5])
 )
-PAPER = load_randomisation("paper")
+PAPER, NEAR = load_randomisation("paper"), 0.5
 TASKS = {
-    "TargetTask": TargetTask(randomisation=PAPER, graded=0.5),
+    "TargetTask": TargetTask(randomisation=PAPER, graded=0.5, starts=Starts(near=NEAR)),
     "FlipTask": FlipTask(randomisation=PAPER, graded=0.5, starts=FlipStarts(entering=0.0)),
 }
 KEYS = jax.random.split(jax.random.PRNGKey(7), COUNT)
@@ -61,7 +61,7 @@ def test_mild_drones_weigh_what_the_others_do():
 def test_all_that_is_drawn_is_distributed_as_stated(task):
     drawn = _draws(task)
     random = np.random.default_rng(1)
-    scale = random.uniform(size=COUNT) * np.where(random.uniform(size=COUNT) < 0.5, 0.1, 1.0)
+    scale = random.uniform(size=COUNT) * np.where(random.uniform(size=COUNT) < NEAR, 0.1, 1.0)
     share = random.uniform(size=COUNT)
     scaled = {"distance": scale * np.sqrt(share), "tilt": scale * share}
     for name, values in drawn.items():

@@ -9,6 +9,7 @@ from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_randomisation
+from cfb_mjx.train.config import config_from, load_config
 from cfb_mjx.train.flying import hover, six_metres
 
 pytestmark = pytest.mark.xdist_group("training")
@@ -30,11 +31,17 @@ def test_it_hovers_on_the_nominal_drone(name):
     assert np.mean(measured.command_std) < 0.02
 
 
-def test_random_drones_are_held_within_centimetres():
+@pytest.mark.parametrize(("name", "within_m"), [("target-adaptive", 0.06), ("target-ppo", 0.075)])
+def test_random_drones_are_held_within_centimetres(name, within_m):
     task = TargetTask(randomisation=load_randomisation("paper"))
-    measured, _ = hover(pilot_of("target-adaptive"), task, DRONE, jax.random.split(jax.random.PRNGKey(3), 32))
+    measured, _ = hover(pilot_of(name), task, DRONE, jax.random.split(jax.random.PRNGKey(3), 32))
     assert not np.any(measured.failed)
-    assert np.median(measured.mean_distance_m) < 0.06
+    assert np.median(measured.mean_distance_m) < within_m
+
+
+def test_the_policy_of_ppo_is_made_by_the_defaults():
+    policy = load_policy(shipped_policies()["target-ppo"])
+    assert config_from(policy.training["config"], "policy") == load_config("target")
 
 
 def test_six_metres_in_two_seconds():

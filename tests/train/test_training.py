@@ -146,7 +146,14 @@ def test_a_failed_drone_pays_for_the_rest_of_the_horizon_and_harms_no_gradient()
 
 def test_updates_lower_what_the_same_flights_cost():
     config = load_config(
-        "target", (*SMALL_TRAINING, "analytic.learning_rate=0.01", "analytic.horizon_s=0.2", "analytic.updates=400")
+        "target",
+        (
+            *SMALL_TRAINING,
+            "starts.near=0.5",
+            "analytic.learning_rate=0.01",
+            "analytic.horizon_s=0.2",
+            "analytic.updates=400",
+        ),
     )
     task = config.build_task()
     analytic = Analytic(config.analytic, task, Quadrotor.from_file("cfb-guards"))
@@ -163,8 +170,15 @@ def test_updates_lower_what_the_same_flights_cost():
 def test_ppo_finds_the_command_that_is_rewarded():
     # Only the torque that a command asks for counts, and only the present: what is best is known, equal commands.
     only = [f"reward.{name}=0" for name in ("position", "near", "velocity", "attitude", "body_rate", "failure")]
-    now = ("reward.torque=1", "ppo.discount=0", "ppo.reward_scaling=1", "ppo.first_std=0.1", "ppo.learning_rate=0.01")
-    sizes = ("ppo.drones=64", "ppo.unroll=4", "ppo.steps=7680", "randomisation.magnitude=0")
+    now = (
+        "reward.torque=1",
+        "ppo.discount=0",
+        "ppo.reward_scaling=1",
+        "ppo.first_std=0.1",
+        "ppo.learning_rate=0.01",
+        "ppo.smoothness=0",
+    )
+    sizes = ("ppo.drones=64", "ppo.unroll=4", "ppo.steps=10240", "randomisation.magnitude=0")
     config = load_config("target", (*SMALL_TRAINING, *only, *now, *sizes))
     task = config.build_task()
     ppo = Ppo(config.ppo, task, Quadrotor.from_file("cfb-guards"))
@@ -194,7 +208,7 @@ def collected_after_throwing(faster, **changes):
 def test_the_learner_is_shown_no_reward_below_the_least_and_failed_drones_begin_anew():
     ppo, _, episodes, (after, lost), data, outcome = collected_after_throwing(slice(0, 4))
     np.testing.assert_array_equal(outcome.failed[0], [True] * 4 + [False] * 4)
-    assert float(outcome.reward[0, :4].max()) < -296
+    assert float(outcome.reward[0, :4].max()) < ppo.task.largest_reward - 300
     scaling = ppo.settings.reward_scaling
     np.testing.assert_array_equal(data["reward"][0, :4], -7 * scaling)
     np.testing.assert_array_equal(data["reward"][1:], outcome.reward[1:] * scaling)
@@ -299,7 +313,7 @@ def test_copies_fly_the_same_episode_with_other_commands():
     assert np.any(np.asarray(episodes.count) < before + 64)
     assert len(set(flown[:, 0])) > 3
     position = in_groups(episodes.state.position)
-    assert np.all(np.ptp(position, axis=1).max(axis=-1) > 0)
+    assert np.all((np.ptp(position, axis=1).max(axis=-1) > 0) | (flown[:, 0] == 0))
     assert np.ptp(in_groups(episodes.model.parameters.mass)[:, 0]) > 1e-3
 
 

@@ -22,8 +22,8 @@ def export(
     it does when an estimate cannot be.
 
     Args:
-        policy: a shipped policy (target, target-adaptive, flip), a policy file of `cfb train`, or the name of a flip
-            (double-flip, triple-flip ...).
+        policy: a shipped policy (target, target-ppo, target-adaptive, flip), a policy file of `cfb train`, or the name
+            of a flip (double-flip, triple-flip ...).
         output: folder to write to.
         knobs: of a flip policy: a shipped manoeuvre or a YAML file (`cfb fly --keep`); flip by default.
         holder: the target policy that climbs and catches in a flip.

@@ -234,7 +234,7 @@ def config_from(mapping: dict[str, Any], where: str) -> TrainingConfig:
     if isinstance(shown := mapping.get("observation"), dict):
         mapping = mapping | {"observation": as_written(shown)}
     if task == "target" and isinstance(reward := mapping.get("reward"), dict) and "position" in reward:
-        # Written when there was none, or with the paper before the eyes.
+        # A reward written out without it is older than it, or the paper's.
         mapping = mapping | {"reward": {"near": 0.0} | reward}
     return build(_KINDS[task], mapping, where)
 
@@ -311,6 +311,9 @@ _POSITIVE = (
 _POSITIVE_OF = {
     "target": (
         "reward.position_width_m",
+        "reward.near_width_m",
+        "reward.near_speed_mps",
+        "reward.near_attitude",
         "reward.attitude_width",
         "reward.torque_width_nm",
         "analytic.cost.position_width_m",
