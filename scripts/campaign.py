@@ -54,7 +54,7 @@ def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> None:
         described = config.to_mapping()
         if run.name in found and _what_counts(found[run.name]["config"]) == _what_counts(described):
             continue
-        say(f"{run.name} ({len(found)} of {len(runs)} done)")
+        say(f"{run.name} ({sum(r.name in found for r in runs)} of {len(runs)} done)")
         training = Training.prepare(config, facts)
         rows = train(training, folder / run.name, resume=True, report=report)
         score = judge(load_policy(folder / run.name / POLICY).controller)

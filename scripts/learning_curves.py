@@ -20,17 +20,20 @@ NOMINAL = ("randomisation.magnitude=0", "randomisation.graded=0.0")
 PPO = (*NOMINAL, "ppo.steps=16000000", "checkpoints=16")
 QUICK = (*NOMINAL, "checkpoints=16")
 RANDOM = ("ppo.steps=16000000", "checkpoints=16")
-PAPER = ("reward.near=0",)
+NO_BELL = ("reward.near=0",)
+ROUGH = ("ppo.smoothness=0",)
 STRAIGHT = ("observation.position_scale_m=1", "observation.position_bend_m=0", "observation.velocity_bend_mps=0")
 ALONE = ("ppo.copies=1",)
 VARIANTS = {
     "analytic": ("quick-analytic", QUICK, "back-propagation, horizon 1 s"),
     "ppo": ("target", PPO, "PPO as in `target`"),
-    "ppo-paper": ("target", (*PPO, *PAPER), "the paper's reward"),
+    "ppo-paper": ("target-paper", PPO, "the paper's reward as printed"),
     "ppo-straight": ("target", (*PPO, *STRAIGHT), "positions and velocities shown as they are"),
     "ppo-alone": ("target", (*PPO, *ALONE), "no copies"),
     "ppo-random": ("target", RANDOM, "PPO as in `target`, with the paper's randomisation"),
-    "ppo-random-paper": ("target", (*RANDOM, *PAPER), "the paper's reward"),
+    "ppo-random-paper": ("target-paper", RANDOM, "the paper's reward as printed"),
+    "ppo-random-no-bell": ("target", (*RANDOM, *NO_BELL), "no bell about the target, other weights kept"),
+    "ppo-random-rough": ("target", (*RANDOM, *ROUGH), "no price on changes of the command"),
     "ppo-random-straight": ("target", (*RANDOM, *STRAIGHT), "positions and velocities shown as they are"),
     "ppo-random-alone": ("target", (*RANDOM, *ALONE), "no copies"),
 }
@@ -67,7 +70,7 @@ def main() -> None:
     for key, run in json.loads(results.read_text()).items():
         for row in run["curve"]:
             # JSON knows no infinity: every flight was lost.
-            row["hover_mm"] = float("inf") if row["hover_mm"] is None else row["hover_mm"]
+            row |= {key: float("inf") for key in ("hover_mm", "random_mm") if key in row and row[key] is None}
         found.setdefault(key.rpartition("-")[0], []).append(run)
     found = {name: found[name] for name in WHAT if name in found}
     figure(found, ROOT / "docs" / "learning-curves.png")

@@ -69,7 +69,7 @@ def main() -> None:
     from cfb_mjx.files import write_json, write_text
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.train.flying import hover, recovery, six_metres
-    from cfb_mjx.train.judge import Judge
+    from cfb_mjx.train.judge import Judge, summary
 
     judge = Judge(random_drones=arguments.plants)
     described, nominal, plants = judge.described, judge.nominal, judge.plants
@@ -101,13 +101,13 @@ def main() -> None:
             "random_recovered": float(np.mean(thrown.recovered)),
             "recovered": float(np.mean(thrown_nominal.recovered)),
             "sensors": _other_sensors(hover, pilot, calm, nominal, few),
-            IDSIA: _told(hover(pilot, wild, Quadrotor.from_file(IDSIA), many)[0], np.median),
+            IDSIA: summary(hover(pilot, wild, Quadrotor.from_file(IDSIA), many)[0], np.median),
             "factors": _factors(drones, nominal.parameters, distance, well),
             "plants": {},
         }
         for plant, drone in plants.items():
             # A drone that was meant to be the paper's: the firmware's controllers are scaled for that one.
-            results[name]["plants"][plant] = _told(hover(pilot, calm, drone, few)[0], np.mean)
+            results[name]["plants"][plant] = summary(hover(pilot, calm, drone, few)[0], np.mean)
         # Six controllers' compiled programs are more than LLVM may map.
         jax.clear_caches()
     facts = environment()
@@ -118,24 +118,12 @@ def main() -> None:
     print("docs/controllers.md")
 
 
-def _told(measured, middle) -> dict[str, float]:
-    """Error and command std, the ``middle`` of those that did not fail, and how many did."""
-    import numpy as np
-
-    well = ~np.asarray(measured.failed)
-    error, std = (np.asarray(x)[well] for x in (measured.mean_distance_m, measured.command_std))
-    lost = not well.any()
-    return {
-        "hover_mm": math.nan if lost else 1e3 * float(middle(error)),
-        "command_std": math.nan if lost else float(middle(std)),
-        "failed": float(1 - well.mean()),
-    }
-
-
-def _other_sensors(hover, pilot, calm, nominal, keys) -> dict[str, dict[str, float]]:
+def _other_sensors(hover, pilot, calm, nominal, keys) -> dict[str, dict]:
     """The hover test on the nominal drone, its sensors later and noisier than any policy was trained with."""
     import jax.numpy as jnp
     import numpy as np
+
+    from cfb_mjx.train.judge import summary
 
     found = {}
     for name, (changes, lumped, noise) in SENSORS.items():
@@ -143,11 +131,13 @@ def _other_sensors(hover, pilot, calm, nominal, keys) -> dict[str, dict[str, flo
         drone = replace(nominal, parameters=replace(nominal.parameters, **changed))
         lumped = calm.lumped_delay if lumped is None else lumped
         task = replace(calm, lumped_delay=lumped, noise=replace(calm.noise, **noise))
-        found[name] = _told(hover(pilot, task, drone, keys)[0], np.mean)
+        found[name] = summary(hover(pilot, task, drone, keys)[0], np.mean)
     return found
 
 
-def _cell(there: dict[str, float]) -> str:
+def _cell(there: dict) -> str:
+    if there["hover_mm"] is None:
+        return "all lost"
     lost = f", {there['failed']:.2%} failed" if there["failed"] else ""
     return f"{there['hover_mm']:.0f} ({there['command_std']:.3f}){lost}"
 

@@ -2,6 +2,7 @@
 
 import pytest
 
+from cfb_mjx.envs import PAPER_REWARD
 from cfb_mjx.errors import CfbError
 from cfb_mjx.train.config import TrainingConfig, config_from, load_config
 from cfb_mjx.train.strict import build
@@ -37,6 +38,10 @@ def test_a_reward_from_before_there_was_near_is_the_papers():
     del written["reward"]["near"]
     assert config_from(written, "an old file").reward.near == 0.0
     assert config_from({"task": "target", "reward": {"torque": 0.1}}, "a new one").reward.near == 3.0
+
+
+def test_the_papers_reward_is_the_same_in_its_configuration_and_in_python():
+    assert load_config("target-paper").reward == PAPER_REWARD
 
 
 def test_a_count_may_be_written_with_an_exponent():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import numpy as np
 
@@ -9,7 +11,7 @@ from cfb_mjx.control.pilot import Pilot
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file, load_randomisation
-from cfb_mjx.train.flying import hover
+from cfb_mjx.train.flying import Hover, hover
 from cfb_mjx.train.plants import load_plants
 
 FLIGHTS, RANDOM_DRONES = 64, 512
@@ -34,15 +36,8 @@ class Judge:
     def __call__(self, pilot: Pilot) -> dict:
         """Hover error and command std, JSON-like; over randomised drones medians of those that did not fail."""
 
-        def measure(task, drone, keys, kind):
-            measured = hover(pilot, task, drone, keys)[0]
-            well = ~np.asarray(measured.failed)
-            distance, std = np.asarray(measured.mean_distance_m)[well], np.asarray(measured.command_std)[well]
-            return {
-                "hover_mm": float(1e3 * kind(distance)) if well.any() else None,
-                "command_std": float(kind(std)) if well.any() else None,
-                "failed": float(1 - well.mean()),
-            }
+        def measure(task, drone, keys, middle):
+            return summary(hover(pilot, task, drone, keys)[0], middle)
 
         score = {"nominal": measure(self.calm, self.nominal, self.few, np.mean)}
         if len(self.many):
@@ -50,6 +45,18 @@ class Judge:
         return score | {
             "plants": {name: measure(self.calm, drone, self.few, np.mean) for name, drone in self.plants.items()}
         }
+
+
+def summary(measured: Hover, middle: Callable[[np.ndarray], float]) -> dict:
+    """Hover error and command std of many flights, JSON-like: the ``middle`` of those that did not fail, None where all
+    did; and which share failed."""
+    well = ~np.asarray(measured.failed)
+    distance, std = np.asarray(measured.mean_distance_m)[well], np.asarray(measured.command_std)[well]
+    return {
+        "hover_mm": float(1e3 * middle(distance)) if well.any() else None,
+        "command_std": float(middle(std)) if well.any() else None,
+        "failed": float(1 - well.mean()),
+    }
 
 
 def away(score: dict, key: str) -> float | None:

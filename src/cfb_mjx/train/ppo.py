@@ -188,9 +188,9 @@ class Ppo:
             raw = normal.loc + normal.scale * noise
             action = self.distribution.postprocess(raw)
             after, outcome = jax.vmap(partial(step, self.task))(episodes, 0.5 * (1 + action))
-            failed = outcome.failed | lost
-            in_groups = jnp.stack([failed, outcome.timed_out & ~lost]).reshape(2, -1, copies)
-            over = jnp.repeat(jnp.all(in_groups[0], axis=-1) | jnp.any(in_groups[1], axis=-1), copies)
+            failed, timed_out = outcome.failed | lost, outcome.timed_out & ~lost
+            over = jnp.all(failed.reshape(-1, copies), axis=1) | jnp.any(timed_out.reshape(-1, copies), axis=1)
+            over = jnp.repeat(over, copies)
             kept = shown | {
                 "raw": raw,
                 "log_prob": self.distribution.log_prob(logits, raw),
