@@ -8,7 +8,6 @@ what moved. `raptor` among the controllers is RAPTOR's published policy (`pip in
 
 import argparse
 import json
-import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -35,17 +34,6 @@ RAPTOR = [
     "policies were trained on this type and its delay.",
     "",
 ]
-SENSORS = {
-    "pose 24 ms late, the gyro read on the drone": ({"pose_delay": 0.024}, False, {}),
-    "all 16 ms late": ({"pose_delay": 0.016}, True, {}),
-    "pose noise 0.5 mm and 0.5 deg, gyro 0.05 rad/s": (
-        {},
-        None,
-        {"position_m": 0.0005, "attitude_rad": math.radians(0.5), "rate_radps": 0.05},
-    ),
-}
-"""Changed parameters of the nominal drone, whether the gyro is as late as the pose (None: as the controller has it),
-and changed noise of the estimates."""
 IDSIA = "cfb-idsia"
 CONTROLLERS = ["target", "target-ppo", "target-adaptive", "pid", "mellinger"]
 PAPER_OF = {"target": PAPER_HOVER[1.0], **PAPER_FIRMWARE}
@@ -100,7 +88,7 @@ def main() -> None:
             "random_failed": float(1 - well.mean()),
             "random_recovered": float(np.mean(thrown.recovered)),
             "recovered": float(np.mean(thrown_nominal.recovered)),
-            "sensors": _other_sensors(hover, pilot, calm, nominal, few),
+            "sensors": judge.with_sensors(pilot, lumped),
             IDSIA: summary(hover(pilot, wild, Quadrotor.from_file(IDSIA), many)[0], np.median),
             "factors": _factors(drones, nominal.parameters, distance, well),
             "plants": {},
@@ -116,23 +104,6 @@ def main() -> None:
     change = moved(before, whole, _headlines) if before else []
     write_text(ROOT / "docs" / "controllers.md", page(results, facts, arguments.plants, described, change))
     print("docs/controllers.md")
-
-
-def _other_sensors(hover, pilot, calm, nominal, keys) -> dict[str, dict]:
-    """The hover test on the nominal drone, its sensors later and noisier than any policy was trained with."""
-    import jax.numpy as jnp
-    import numpy as np
-
-    from cfb_mjx.train.judge import summary
-
-    found = {}
-    for name, (changes, lumped, noise) in SENSORS.items():
-        changed = {key: jnp.asarray(value, nominal.parameters.pose_delay.dtype) for key, value in changes.items()}
-        drone = replace(nominal, parameters=replace(nominal.parameters, **changed))
-        lumped = calm.lumped_delay if lumped is None else lumped
-        task = replace(calm, lumped_delay=lumped, noise=replace(calm.noise, **noise))
-        found[name] = summary(hover(pilot, task, drone, keys)[0], np.mean)
-    return found
 
 
 def _cell(there: dict) -> str:
@@ -260,7 +231,7 @@ def page(results: dict, facts: dict, plants: int, described, change: list[str]) 
         "| sensors | " + " | ".join(names) + " |",
         "|---|" + "---|" * len(names),
     ]
-    for what in SENSORS:
+    for what in results[names[0]]["sensors"]:
         lines.append(f"| {what} | " + " | ".join(_cell(results[name]["sensors"][what]) for name in names) + " |")
     lines.append(f"| `{IDSIA}`, randomised | " + " | ".join(_cell(results[name][IDSIA]) for name in names) + " |")
     lines += [

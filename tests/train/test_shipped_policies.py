@@ -5,12 +5,14 @@ import numpy as np
 import pytest
 
 from cfb_mjx.control.neural import NeuralController
+from cfb_mjx.control.pilot import find_pilot
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_randomisation
 from cfb_mjx.train.config import config_from, load_config
 from cfb_mjx.train.flying import hover, six_metres
+from cfb_mjx.train.judge import Judge
 
 pytestmark = pytest.mark.xdist_group("training")
 
@@ -42,6 +44,14 @@ def test_random_drones_are_held_within_centimetres(name, within_m):
 def test_the_policy_of_ppo_is_made_by_the_defaults():
     policy = load_policy(shipped_policies()["target-ppo"])
     assert config_from(policy.training["config"], "policy") == load_config("target")
+
+
+def test_the_firmware_needs_its_gyro_on_the_drone_and_not_its_pose():
+    """Its rate loop is fast and its position loop slow: of what the judge changes, late rates alone make it swing."""
+    late_pose, all_late, _ = Judge(plants=None, random_drones=0).with_sensors(find_pilot("pid", DRONE), False).values()
+    assert late_pose["failed"] == 0
+    assert late_pose["command_std"] < 0.05
+    assert all_late["command_std"] > 0.15
 
 
 def test_six_metres_in_two_seconds():

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.control.pilot import Pilot
@@ -15,6 +18,17 @@ from cfb_mjx.train.flying import Hover, hover
 from cfb_mjx.train.plants import load_plants
 
 FLIGHTS, RANDOM_DRONES = 64, 512
+SENSORS = {
+    "pose 24 ms late, the gyro read on the drone": ({"pose_delay": 0.024}, False, {}),
+    "all 16 ms late": ({"pose_delay": 0.016}, True, {}),
+    "pose noise 0.5 mm and 0.5 deg, gyro 0.05 rad/s": (
+        {},
+        None,
+        {"position_m": 0.0005, "attitude_rad": math.radians(0.5), "rate_radps": 0.05},
+    ),
+}
+"""Changed parameters of the nominal drone, whether the gyro is as late as the pose (None: as the controller has it),
+and changed noise of the estimates."""
 
 
 class Judge:
@@ -23,13 +37,15 @@ class Judge:
     Args:
         plants: set of drones with effects, of `load_plants`; None: without them.
         random_drones: of the paper's full randomisation.
+        sensors: whether `with_sensors` is told, too.
     """
 
-    def __init__(self, plants: str | None = "off-nominal", random_drones: int = RANDOM_DRONES):
+    def __init__(self, plants: str | None = "off-nominal", random_drones: int = RANDOM_DRONES, sensors: bool = False):
         self.described = load_model_file("cfb-guards")
         self.nominal = Quadrotor.from_file(self.described)
         self.plants = {} if plants is None else load_plants(self.described, plants)
         self.calm, self.wild = TargetTask(), TargetTask(randomisation=load_randomisation("paper"))
+        self.sensors = sensors
         self.few = jax.random.split(jax.random.PRNGKey(0), FLIGHTS)
         self.many = jax.random.split(jax.random.PRNGKey(1), random_drones)
 
@@ -42,9 +58,27 @@ class Judge:
         score = {"nominal": measure(self.calm, self.nominal, self.few, np.mean)}
         if len(self.many):
             score["random"] = measure(self.wild, self.nominal, self.many, np.median)
+        if self.sensors:
+            score["sensors"] = self.with_sensors(pilot)
         return score | {
             "plants": {name: measure(self.calm, drone, self.few, np.mean) for name, drone in self.plants.items()}
         }
+
+    def with_sensors(self, pilot: Pilot, lumped_delay: bool = True) -> dict[str, dict]:
+        """The hover test on the nominal drone, its sensors later and noisier than the model says: `SENSORS`.
+
+        Args:
+            pilot: the controller.
+            lumped_delay: whether it is meant for a gyro as late as the pose.
+        """
+        found = {}
+        for name, (changes, lumped, noise) in SENSORS.items():
+            changed = {key: jnp.asarray(value, self.nominal.parameters.mass.dtype) for key, value in changes.items()}
+            drone = replace(self.nominal, parameters=replace(self.nominal.parameters, **changed))
+            lumped = lumped_delay if lumped is None else lumped
+            task = replace(self.calm, lumped_delay=lumped, noise=replace(self.calm.noise, **noise))
+            found[name] = summary(hover(pilot, task, drone, self.few)[0], np.mean)
+        return found
 
 
 def summary(measured: Hover, middle: Callable[[np.ndarray], float]) -> dict:
