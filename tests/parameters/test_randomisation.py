@@ -128,6 +128,17 @@ def test_the_other_reading_of_motor_dynamics_leaves_the_gain_alone(nominal):
     assert not jnp.any(drawn.motor_time_constant == nominal.motor_time_constant)
 
 
+def test_latencies_are_the_paper_s_ranges_and_one_more(nominal):
+    plain, late = (dict(load_randomisation(name).ranges) for name in ("paper", "paper-latency"))
+    assert set(late) - set(plain) == {"pose_delay"}
+    assert all(late[name] == plain[name] for name in plain)
+    keys = jax.random.split(jax.random.key(0), 500)
+    drawn = jax.vmap(lambda key: sample_parameters(key, nominal, load_randomisation("paper-latency")))(keys)
+    assert jnp.all(drawn.pose_delay > 0)
+    assert drawn.pose_delay.min() < 0.1 * nominal.pose_delay
+    assert drawn.pose_delay.max() > 1.9 * nominal.pose_delay
+
+
 def _ranges(text):
     return f"format: cfb_mjx randomisation 1\nranges:\n  {text}\n"
 
