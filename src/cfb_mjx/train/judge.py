@@ -37,15 +37,13 @@ class Judge:
     Args:
         plants: set of drones with effects, of `load_plants`; None: without them.
         random_drones: of the paper's full randomisation.
-        sensors: whether `with_sensors` is told, too.
     """
 
-    def __init__(self, plants: str | None = "off-nominal", random_drones: int = RANDOM_DRONES, sensors: bool = False):
+    def __init__(self, plants: str | None = "off-nominal", random_drones: int = RANDOM_DRONES):
         self.described = load_model_file("cfb-guards")
         self.nominal = Quadrotor.from_file(self.described)
         self.plants = {} if plants is None else load_plants(self.described, plants)
         self.calm, self.wild = TargetTask(), TargetTask(randomisation=load_randomisation("paper"))
-        self.sensors = sensors
         self.few = jax.random.split(jax.random.PRNGKey(0), FLIGHTS)
         self.many = jax.random.split(jax.random.PRNGKey(1), random_drones)
 
@@ -58,8 +56,6 @@ class Judge:
         score = {"nominal": measure(self.calm, self.nominal, self.few, np.mean)}
         if len(self.many):
             score["random"] = measure(self.wild, self.nominal, self.many, np.median)
-        if self.sensors:
-            score["sensors"] = self.with_sensors(pilot)
         return score | {
             "plants": {name: measure(self.calm, drone, self.few, np.mean) for name, drone in self.plants.items()}
         }
