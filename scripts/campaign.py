@@ -3,6 +3,7 @@
 import argparse
 import json
 import math
+import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,18 +23,27 @@ class Run:
     seed: int
 
 
-def study_arguments(description: str, option: str, choices: Iterable[str]) -> argparse.Namespace:
-    """Read a study's command line: which of ``choices`` to run, how many seeds, or only the page; set jax up for it."""
+def study_arguments(description: str, option: str, choices: Iterable[str], **flags: str) -> argparse.Namespace:
+    """Read a study's command line: which of ``choices`` to run, how many seeds, or only the page; set jax up for it.
+
+    Args:
+        description: of the study.
+        option: how ``choices`` are chosen from.
+        choices: what the study compares.
+        flags: further switches of this study, with what each does.
+    """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(option, nargs="+", choices=list(choices), default=list(choices), dest="chosen")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--page-only", action="store_true", help="write the page from the results that are there")
+    for name, text in flags.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", action="store_true", help=text)
     arguments = parser.parse_args()
     configure_jax(x64=False)
     return arguments
 
 
-def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> None:
+def carry_out(runs: list[Run], results: Path, folder: Path, judge, kept: Path | None = None) -> None:
     """Train what ``results`` does not hold yet, and judge it.
 
     Args:
@@ -41,6 +51,7 @@ def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> None:
         results: JSON file that grows with every run: name to seed, score, curve, config and environment.
         folder: for checkpoints and policies.
         judge: controller to numbers.
+        kept: where policies are copied to, by the names of their runs.
     """
     from cfb_mjx.control.policy_file import load_policy
     from cfb_mjx.files import write_json
@@ -58,6 +69,8 @@ def carry_out(runs: list[Run], results: Path, folder: Path, judge) -> None:
         training = Training.prepare(config, facts)
         rows = train(training, folder / run.name, resume=True, report=report)
         score = judge(load_policy(folder / run.name / POLICY).controller)
+        if kept:
+            shutil.copy(folder / run.name / POLICY, kept / f"{run.name}.npz")
         found[run.name] = {
             "seed": run.seed,
             "score": score,

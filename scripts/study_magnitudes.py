@@ -1,45 +1,52 @@
 """How much randomisation? The paper's study, in simulation, with PPO and with back-propagation.
 
-    python scripts/study_magnitudes.py [--algorithms analytic ppo] [--seeds 3] [--page-only]
+    python scripts/study_magnitudes.py [--algorithms analytic ppo] [--seeds 3] [--judge-anew | --page-only]
 
-Hours for all of it; what is done is kept in benchmarks/magnitudes-ALGORITHM.json, and a run begun anew goes on. Writes
-docs/magnitudes.md and its figure.
+Hours for all of it; what is done is kept in benchmarks/magnitudes-ALGORITHM.json and data/study, and a run begun
+anew goes on. Writes docs/magnitudes.md and its figure.
 """
 
 import json
 import math
+from pathlib import Path
 
 from campaign import ROOT, Run, carry_out, facts_line, study_arguments
 
 from cfb_mjx.reproduce.paper import PAPER_FIRMWARE, PAPER_HOVER
+from cfb_mjx.train.judge import away
 
 MAGNITUDES = (0.0, 0.5, 1.0, 1.5)
 CONFIGS = {"analytic": "study-analytic", "ppo": "study-ppo"}
+ELSEWHERE = "cfb-idsia"
 TITLES = {"analytic": "back-propagation", "ppo": "PPO"}
 
 
 def main() -> None:
     """Train what is missing, judge, write."""
-    arguments = study_arguments(__doc__, "--algorithms", CONFIGS)
+    arguments = study_arguments(
+        __doc__, "--algorithms", CONFIGS, judge_anew="fly the kept policies again, train nothing"
+    )
     from cfb_mjx.files import write_json, write_text
 
     firmware = ROOT / "benchmarks" / "magnitudes-firmware.json"
     if not arguments.page_only:
-        from cfb_mjx.train.judge import Judge
-
-        judge = Judge()
-        if not firmware.exists():
-            from cfb_mjx.control.pilot import find_pilot
-
-            write_json(firmware, {name: judge(find_pilot(name, judge.nominal)) for name in PAPER_FIRMWARE})
+        judged = judge()
+        if arguments.judge_anew or not firmware.exists():
+            write_json(firmware, {name: judged(name) for name in PAPER_FIRMWARE})
         for algorithm in arguments.chosen:
+            kept, results = ROOT / "data" / "study" / algorithm, _results(algorithm)
+            if arguments.judge_anew:
+                found = json.loads(results.read_text())
+                write_json(results, {n: run | {"score": judged(kept / f"{n}.npz")} for n, run in found.items()})
+                continue
             # By seed, so that an unfinished study has every magnitude.
             runs = [
                 Run(f"{m:g}-{seed}", CONFIGS[algorithm], (f"randomisation.magnitude={m}",), seed)
                 for seed in range(arguments.seeds)
                 for m in MAGNITUDES
             ]
-            carry_out(runs, _results(algorithm), ROOT / "out" / "magnitudes" / algorithm, judge)
+            trained = ROOT / "out" / "magnitudes" / algorithm
+            carry_out(runs, results, trained, judged, kept)
     found = {a: json.loads(_results(a).read_text()) for a in CONFIGS if _results(a).exists()}
     from cfb_mjx.view.magnitudes import magnitudes_figure
 
@@ -47,6 +54,26 @@ def main() -> None:
     magnitudes_figure(runs, PAPER_HOVER, ROOT / "docs" / "magnitudes.png")
     write_text(ROOT / "docs" / "magnitudes.md", page(found, json.loads(firmware.read_text())))
     print("docs/magnitudes.md, docs/magnitudes.png")
+
+
+def judge():
+    """Controller, or the name of one, to its score: nominal, randomised, off-nominal drones and one from elsewhere."""
+    import numpy as np
+
+    from cfb_mjx.control.pilot import find_pilot
+    from cfb_mjx.model import Quadrotor
+    from cfb_mjx.train.flying import hover
+    from cfb_mjx.train.judge import Judge, summary
+
+    drones = Judge()
+    elsewhere = Quadrotor.from_file(ELSEWHERE)
+
+    def score(pilot) -> dict:
+        pilot = find_pilot(pilot, drones.nominal) if isinstance(pilot, str | Path) else pilot
+        there = summary(hover(pilot, drones.calm, elsewhere, drones.few)[0], np.mean)
+        return drones(pilot) | {ELSEWHERE: there}
+
+    return score
 
 
 def _results(algorithm: str):
@@ -57,15 +84,26 @@ def _scores(runs: dict, magnitude: float) -> list[dict]:
     return [run["score"] for name, run in runs.items() if name.rpartition("-")[0] == f"{magnitude:g}"]
 
 
-def _of(scores: list[dict]) -> dict[str, list]:
-    from cfb_mjx.train.judge import away
+APART = {
+    "nominal": lambda score, key: score["nominal"][key],
+    "off-nominal": lambda score, key: away(score, key),
+    ELSEWHERE: lambda score, key: None if score[ELSEWHERE]["failed"] else score[ELSEWHERE][key],
+    "randomised": lambda score, key: score["random"][key],
+}
 
+
+def _of(scores: list[dict]) -> dict[str, list]:
     return {
         "nominal": [s["nominal"]["hover_mm"] for s in scores],
         "nominal_std": [s["nominal"]["command_std"] for s in scores],
         "away": [away(s, "hover_mm") for s in scores],
         "away_std": [away(s, "command_std") for s in scores],
         "random": [s["random"]["hover_mm"] for s in scores],
+        **{
+            f"{where} {axes}": [pick(s, f"{axes}_mm") for s in scores]
+            for where, pick in APART.items()
+            for axes in ("horizontal", "vertical")
+        },
         "random_failed": [s["random"]["failed"] for s in scores],
     }
 
@@ -82,17 +120,47 @@ def _span(values: list, digits: str) -> str:
     return f"{mean} [{format(min(there), digits)}, {format(max(there), digits)}]{lost}"
 
 
-def _best(runs: dict) -> list[str]:
-    """Which magnitude holds the off-nominal drones best: on the mean of the seeds, and seed by seed."""
-    away = {m: _of(_scores(runs, m))["away"] for m in MAGNITUDES if _scores(runs, m)}
+def _best(runs: dict, key: str) -> str:
+    """Which magnitude holds some drones best: on the mean of the seeds, and seed by seed."""
+    errors = {m: _of(_scores(runs, m))[key] for m in MAGNITUDES if _scores(runs, m)}
     # Who loses a drone is worse than who keeps it badly.
-    away = {m: [math.inf if v is None else v for v in values] for m, values in away.items()}
-    best = min(away, key=lambda m: sum(away[m]) / len(away[m]))
-    each = zip(*(away[m] for m in away), strict=False)
-    seeds = ", ".join(f"{list(away)[values.index(min(values))]:g}" for values in each)
-    return [
-        f"Off-nominal drones are held best with magnitude {best:g} (seed by seed: {seeds}; the paper's real one: 1)."
+    errors = {m: [math.inf if v is None else v for v in values] for m, values in errors.items()}
+    best = min(errors, key=lambda m: sum(errors[m]) / len(errors[m]))
+    each = zip(*errors.values(), strict=False)
+    return f"{best:g} ({', '.join(f'{list(errors)[values.index(min(values))]:g}' for values in each)})"
+
+
+def _apart(runs: dict) -> list[str]:
+    """Horizontal and vertical error by magnitude, and which magnitude does best in each."""
+    columns = [f"{where} {axes}" for where in APART for axes in ("horizontal", "vertical")]
+    lines = [
+        "",
+        "Horizontal (from the vertical through the target) and vertical error apart, mm:",
+        "",
+        "| magnitude | "
+        + " | ".join(f"{column.replace('horizontal', 'xy').replace('vertical', 'z')}" for column in columns)
+        + " |",
+        "|---|" + "---|" * len(columns),
     ]
+    for magnitude in MAGNITUDES:
+        if scores := _scores(runs, magnitude):
+            of = _of(scores)
+            lines.append(f"| {magnitude:g} | " + " | ".join(_span(of[column], ".1f") for column in columns) + " |")
+    best = [_best(runs, column) for column in columns]
+    return [*lines, "| **best** (by seed) | " + " | ".join(best) + " |"]
+
+
+def _settled(runs: dict) -> list[str]:
+    """How much the error that a training judged itself by changed over its second half."""
+    changes = {}
+    for name, run in runs.items():
+        on, key = "drones of its own", "random_mm"
+        if key not in run["curve"][-1]:
+            on, key = "the nominal drone", "hover_mm"
+        half, end = run["curve"][len(run["curve"]) // 2 - 1][key], run["curve"][-1][key]
+        changes.setdefault(f"magnitude {name.rpartition('-')[0]} (on {on})", []).append(f"{half:.0f} to {end:.0f}")
+    told = "; ".join(f"{which}: {', '.join(texts)}" for which, texts in sorted(changes.items()))
+    return ["", f"How settled: hover error from the middle of each training to its end, mm. {told}."]
 
 
 def page(found: dict, firmware: dict) -> str:
@@ -106,7 +174,8 @@ def page(found: dict, firmware: dict) -> str:
         "The paper trains its position controller with its randomisation scaled by 0, 0.5, 1 and 1.5, flies each on "
         "the real drone, and finds 1 best. Here the same networks fly in simulation: on the nominal drone, on ten "
         "drones with effects of the catalogue that no randomisation contains (`configs/plants/off-nominal.yaml`; they "
-        "stand in for the real one), and on 512 drones of the paper's full randomisation. Hover test of the paper: "
+        "stand in for the real one), on 512 drones of the paper's full randomisation, and on a drone identified "
+        f"elsewhere (`{ELSEWHERE}`). Hover test of the paper: "
         "mean distance over the last 5 of 6 s, std of the commands. Mean of the seeds with the least and the greatest; "
         "over randomised drones the median of those that did not fail. The paper's columns are its real flights.",
         "",
@@ -136,16 +205,13 @@ def page(found: dict, firmware: dict) -> str:
             cells += [_span(s["away"], ".1f"), _span(s["away_std"], ".4f"), _span(s["random"], ".0f")]
             cells += [_span(s["random_failed"], ".2%"), *(f"{x:g}" for x in PAPER_HOVER[magnitude])]
             lines.append("| " + " | ".join(cells) + " |")
-        lines += ["", *_best(of)]
-        if "reward" in last:
-            curves = [[row["reward"] for row in run["curve"]] for run in of.values()]
-            gain = [curve[-1] - curve[len(curve) // 2] for curve in curves]
-            lines += [
-                "",
-                f"From the middle of the trainings to their ends rewards changed by {min(gain):+.3f} to "
-                f"{max(gain):+.3f} per command: where they still rise, errors tell how far learning has come as much "
-                "as what the randomisation is worth.",
-            ]
+        lines += [
+            "",
+            f"Off-nominal drones are held best with magnitude {_best(of, 'away')}; in brackets seed by seed. The "
+            "paper's real one: 1.",
+            *_apart(of),
+            *_settled(of),
+        ]
     lines += [
         "",
         "## The firmware's controllers, same tests",

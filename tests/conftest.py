@@ -83,15 +83,26 @@ def in_haste(request, monkeypatch):
 
 
 MAPS = Path("/proc/self/maps")
-MANY_MAPS = 20_000
+MANY_MAPS, MOST_MAPS = 20_000, 40_000
 """Linux gives a process 65530 memory maps, and every compiled program keeps some: a worker that keeps the programs of
-the whole suite dies of a segmentation fault while it compiles."""
+the whole suite dies while it compiles."""
+
+
+def _forget_programs(beyond: int) -> None:
+    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > beyond:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(autouse=True, scope="module")
 def few_programs():
     """Forget compiled programs between modules once they are many."""
     yield
-    if MAPS.exists() and MAPS.read_bytes().count(b"\n") > MANY_MAPS:
-        jax.clear_caches()
-        gc.collect()
+    _forget_programs(beyond=MANY_MAPS)
+
+
+@pytest.fixture(autouse=True)
+def not_too_many_programs():
+    """Within a module, whose tests share some, only when they are far too many."""
+    yield
+    _forget_programs(beyond=MOST_MAPS)

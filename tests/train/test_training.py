@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, rollout_final
@@ -83,7 +83,7 @@ class Idle(eqx.Module):
 
 def test_no_key_of_a_training_is_used_twice(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "build", lambda *_: Idle())
-    flown = Hover(*np.zeros((2, 1)), np.zeros(1, bool)), None
+    flown = Hover(*np.zeros((4, 1)), np.zeros(1, bool)), None
     monkeypatch.setattr(run, "hover", lambda controller, task, nominal, keys: flown)
     uses = watch_keys(monkeypatch)
     train(small("ppo"), tmp_path)
@@ -406,7 +406,7 @@ def test_the_policy_goes_no_further_in_an_update_than_it_may():
 @pytest.mark.long
 def test_ppo_keeps_what_the_shipped_policy_can_do():
     with jax.enable_x64(False):
-        training = Training.prepare(load_config("target"), {}, shipped_policies()["target"])
+        training = Training.prepare(load_config("target"), {}, "target")
         nominal, task = training.nominal(), training.config.build_task()
         ppo = run.build(training.config, task, nominal, None, True)
         state = ppo.begin(jax.random.PRNGKey(0), training.first_controller(nominal))

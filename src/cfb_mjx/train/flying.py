@@ -99,6 +99,10 @@ class Hover(NamedTuple):
     """Of the paper's hover test, per drone."""
 
     mean_distance_m: Float[Array, "*drones"]
+    horizontal_m: Float[Array, "*drones"]
+    """Mean distance from the vertical through the target."""
+    vertical_m: Float[Array, "*drones"]
+    """Mean difference in height, above or below."""
     command_std: Float[Array, "*drones"]
     """Standard deviation over time, mean of the four motors."""
     failed: Bool[Array, "*drones"]
@@ -121,9 +125,11 @@ def _hover(pilot, task, nominal, keys):
     start = nominal.hover_state((0.0, 0.0, 0.0))
     flown = jax.vmap(lambda key: fly(pilot, task, nominal, key, HOVER_S, start))(keys)
     counted = round(SETTLING_S / pilot.control_dt_s)
-    distance = jnp.linalg.norm(flown.position[:, counted:], axis=-1).mean(axis=1)
+    position = flown.position[:, counted:]
+    distance, horizontal = (jnp.linalg.norm(position[..., :axes], axis=-1).mean(axis=1) for axes in (3, 2))
+    vertical = jnp.abs(position[..., 2]).mean(axis=1)
     spread = flown.command[:, counted:].std(axis=1).mean(axis=-1)
-    return Hover(distance, spread, flown.failed[:, -1]), flown
+    return Hover(distance, horizontal, vertical, spread, flown.failed[:, -1]), flown
 
 
 class Step(NamedTuple):

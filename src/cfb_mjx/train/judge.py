@@ -81,12 +81,14 @@ def summary(measured: Hover, middle: Callable[[np.ndarray], float]) -> dict:
     """Hover error and command std of many flights, JSON-like: the ``middle`` of those that did not fail, None where all
     did; and which share failed."""
     well = ~np.asarray(measured.failed)
-    distance, std = np.asarray(measured.mean_distance_m)[well], np.asarray(measured.command_std)[well]
-    return {
-        "hover_mm": float(1e3 * middle(distance)) if well.any() else None,
-        "command_std": float(middle(std)) if well.any() else None,
-        "failed": float(1 - well.mean()),
+    numbers = {
+        "hover_mm": 1e3 * np.asarray(measured.mean_distance_m),
+        "horizontal_mm": 1e3 * np.asarray(measured.horizontal_m),
+        "vertical_mm": 1e3 * np.asarray(measured.vertical_m),
+        "command_std": np.asarray(measured.command_std),
     }
+    found = {name: float(middle(values[well])) if well.any() else None for name, values in numbers.items()}
+    return found | {"failed": float(1 - well.mean())}
 
 
 def away(score: dict, key: str) -> float | None:

@@ -74,7 +74,7 @@ class Training:
 
     @classmethod
     def prepare(
-        cls, config: TrainingConfig, versions: dict[str, str], start: Path | None = None, force: bool = False
+        cls, config: TrainingConfig, versions: dict[str, str], start: str | Path | None = None, force: bool = False
     ) -> Training:
         """Read what the configuration names.
 
