@@ -16,7 +16,7 @@ from cfb_mjx.cli.runtime import environment, set_up_xla
 from cfb_mjx.deploy.export import RESULTS
 from cfb_mjx.files import write_json, write_text
 
-POLICIES = ("target", "target-adaptive", "flip", "double-flip", "triple-flip")
+POLICIES = ("target", "target-analytic", "target-adaptive", "flip", "double-flip", "triple-flip", "double-flip-ppo")
 NUMBERS, PAGE = ROOT / "benchmarks" / "deploying.json", ROOT / "docs" / "deploying.md"
 
 
@@ -25,7 +25,7 @@ def measure() -> dict:
     found = {}
     for name in POLICIES:
         with tempfile.TemporaryDirectory() as folder:
-            run_export(name, Path(folder) / name, None, "target", True)
+            run_export(name, Path(folder) / name, None, None, True)
             found[name] = json.loads((Path(folder) / name / RESULTS).read_text())
     return {"policies": found, "environment": environment()}
 

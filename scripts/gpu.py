@@ -182,7 +182,7 @@ WORDS = {
 parameters; `rollout_kept`: a command per step and every state returned. `rigid` is the closed form in one kernel,
 the state of a drone in registers from the first step to the last; `rigid-plain` the program XLA makes of it. The
 kernel's default is 128 drones by 4 warps; the last rows are other ways to deal them out.""",
-    "policy": "The shipped policy `target`, a command every 8 ms, two steps each (`rollout_closed_loop`).",
+    "policy": "The shipped policy `target-analytic`, a command every 8 ms, two steps each (`rollout_closed_loop`).",
     "gradient": """Reverse mode through 100 steps: by all parameters, by ten; `rollout_hundred` is the loss alone, in
 the kernel. The reverse pass has no kernel: it is the program XLA makes of it.""",
     "mjx": "`mjx-floor` is with floor contact, `mjx-stock` plain `mjx.step` on the same MJCF without contact.",

@@ -123,7 +123,7 @@ def test_every_drone_of_a_set_is_flown(cfb, tmp_path):
         "  - {name: as it is, effects: []}\n"
         "  - {name: heavy, effects: [{name: payload, parameters: {mass: 0.006, height: 0.0, offset: [0.0, 0.0]}}]}\n"
     )
-    done = cfb("fly", "target", "--on", tmp_path / "set.yaml", "--plants", 2, "--json", tmp_path / "r.json")
+    done = cfb("fly", "target-analytic", "--on", tmp_path / "set.yaml", "--plants", 2, "--json", tmp_path / "r.json")
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "r.json").read_text())
     assert list(result["on"]) == ["as it is", "heavy"]
@@ -145,7 +145,7 @@ def test_every_drone_of_a_set_is_flown(cfb, tmp_path):
         (["fly", "flip", "--task", "hover"], "cannot fly --task hover"),
         (["fly", "target", "--set", "climb_s=1"], "are for flips"),
         (["fly", "flip", "--knobs", "double-flip"], "turn 2 times"),
-        (["fly", "flip", "--holder", "pid"], "--holder pid: must be a target policy"),
+        (["fly", "flip", "--holder", "pid"], "holder pid: must be a target policy"),
         (["fly", "double-flip", "--set", "climb=1"], "climb_s"),
         (["fly", "flip", "--keep", "nowhere/k.yaml"], "nowhere"),
         (["train", "flip", "-o", "x", "--set", "setpoints.rate_radps=[9]"], "setpoints.rate_radps"),

@@ -107,9 +107,9 @@ def test_shipped_manoeuvres_load(name):
 
 
 def test_knobs_survive_a_file(tmp_path):
-    save_manoeuvre(ManoeuvreFile(2, KNOBS, "by hand"), tmp_path / "m.yaml")
+    save_manoeuvre(ManoeuvreFile(2, KNOBS, "by hand", "target-adaptive"), tmp_path / "m.yaml")
     again = load_manoeuvre(tmp_path / "m.yaml")
-    assert again == ManoeuvreFile(2, KNOBS, "by hand")
+    assert again == ManoeuvreFile(2, KNOBS, "by hand", "target-adaptive")
     assert again.knobs.turn_rad == math.inf
     changed = load_manoeuvre(tmp_path / "m.yaml", ("climb_s=0.5", "climb_mps=3"))
     assert changed.knobs == KNOBS._replace(climb_s=0.5, climb_mps=3.0)
@@ -120,6 +120,7 @@ def test_knobs_survive_a_file(tmp_path):
     [
         ("rotations: 2", "knobs must be a mapping"),
         ("rotations: two\nknobs: {}", "rotations must be a whole number"),
+        ("rotations: 2\nholder: 3\nknobs: {}", "holder must be a policy's name or file"),
         ("rotations: 2\nknobs: {climb_m: 1}", "knobs.climb_s is missing"),
         ("rotations: 2\nknobs: {climb_x: 1}", "unknown key 'knobs.climb_x'"),
         ("rotations: 2\nknobs: {climb_m: far, climb_s: 1, turn_s: 1, speed_mps: 0, rate_radps: 9}", "must be a number"),

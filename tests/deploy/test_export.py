@@ -106,10 +106,13 @@ def test_the_contract_alone_is_enough_to_rebuild_the_command(name, built):
     rows = random_inputs(np.random.default_rng(5), 2, 45)[1].astype(float)
 
     def frame(row):
+        to_world = Rotation.from_quat(row[[7, 8, 9, 6]])
         numbers = {
             "position - target": row[:3] - row[13:],
+            "position - target, body axes": to_world.inv().apply(row[:3] - row[13:]),
             "velocity, world axes": row[3:6],
-            "rotation matrix, body to world, by rows": Rotation.from_quat(row[[7, 8, 9, 6]]).as_matrix().reshape(-1),
+            "velocity, body axes": to_world.inv().apply(row[3:6]),
+            "rotation matrix, body to world, by rows": to_world.as_matrix().reshape(-1),
             "body rate": row[10:13],
         }
         parts = []
@@ -392,6 +395,15 @@ def test_an_own_policy_file_is_exported(tmp_path):
     assert promised["policies"]["holder"]["weights_sha256"] == load_policy(tmp_path / "mine.npz").weights_sha256
     assert promised["trained_on"] is None
     assert promised["first_step"]["hover_command"] == pytest.approx(0.55, abs=0.01)
+
+
+def test_a_flip_is_climbed_and_caught_by_whom_its_knobs_were_found_with():
+    def held_by(*arguments, **options):
+        return find_deployment(*arguments, **options).holder.weights_sha256
+
+    assert held_by("double-flip") == held_by("flip", "double-flip") == load_policy("target-analytic").weights_sha256
+    assert held_by("double-flip-ppo") == load_policy("target").weights_sha256
+    assert held_by("double-flip-ppo", holder="target-adaptive") == load_policy("target-adaptive").weights_sha256
 
 
 REFUSED = {

@@ -64,8 +64,8 @@ def test_near_rewards_rest_at_the_target():
     assert np.isclose(more((0, 0, 0), (0, 0, 0)), 3.0, atol=1e-5)
     # One width, and one speed, away: half of it each alone, a third together.
     assert np.isclose(more((0.25, 0, 0), (0, 0, 0)), 1.5, atol=1e-5)
-    assert np.isclose(more((0, 0, 0), (0, 0.6, 0.8)), 1.5, atol=1e-5)
-    assert np.isclose(more((0, 0, 0.25), (1, 0, 0)), 1.0, atol=1e-5)
+    assert np.isclose(more((0, 0, 0), (0, 0.24, 0.32)), 1.5, atol=1e-5)
+    assert np.isclose(more((0, 0, 0.25), (0.4, 0, 0)), 1.0, atol=1e-5)
     # |q - 1| = 2 sin(angle / 4) = 0.5
     assert np.isclose(more((0, 0, 0), (0, 0, 0), Rotation.from_rotvec([0, 0, 4 * np.arcsin(0.25)])), 1.5, atol=1e-5)
     assert TargetReward(near=3.0).largest - TargetReward(near=0.0).largest == 3.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.errors import CfbError
 from cfb_mjx.labelled_plants import Case, physics
 from cfb_mjx.labelled_plants import constants as c
@@ -40,7 +40,7 @@ BEFORE_MOTORS = [
 
 @pytest.fixture(scope="module")
 def target():
-    return load_policy(shipped_policies()["target"]).controller
+    return load_policy("target").controller
 
 
 @pytest.fixture
@@ -128,7 +128,7 @@ def test_a_shipped_policy_flies_the_nominal_plant(target):
 
 def test_only_like_policies_fly_side_by_side(target):
     with pytest.raises(CfbError, match="same observation"):
-        pilot_of([target, load_policy(shipped_policies()["target-adaptive"]).controller])
+        pilot_of([target, load_policy("target-adaptive").controller])
 
 
 def test_a_campaign_holds_what_tracing_needs(target, short_warm_up):

@@ -16,7 +16,7 @@ import pytest
 from test_kernel import _all_effects, _has_kernel, _single, _spread
 
 from cfb_mjx.control.closed_loop import rollout_closed_loop
-from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.model import MjxBody, Quadrotor, acceleration, rollout, rollout_final
 from cfb_mjx.parameters import load_randomisation, sample_parameters
 
@@ -90,7 +90,7 @@ def test_gradient_by_everything(guards, flight):
 
 
 def test_a_policy_in_the_loop(guards):
-    pilot = _single(load_policy(shipped_policies()["target"]).controller)
+    pilot = _single(load_policy("target").controller)
     model = _single(Quadrotor(guards))
     states = _spread(model.hover_state(), 200)
     away = 0.3 * jax.random.normal(jax.random.key(2), (200, 3), jnp.float32)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from cfb_mjx.control.manoeuvre import CATCH, CLIMB, TURN, Manoeuvre
 from cfb_mjx.control.manoeuvre_file import load_manoeuvre
 from cfb_mjx.control.pilot import find_pilot
-from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.errors import CfbError
@@ -31,7 +31,8 @@ WILD = TargetTask(randomisation=load_randomisation("paper"))
 
 
 def shipped(name: str) -> Manoeuvre:
-    return Manoeuvre(find_pilot("target", DRONE), find_pilot("flip", DRONE), load_manoeuvre(name).knobs)
+    described = load_manoeuvre(name)
+    return Manoeuvre(find_pilot(described.holder, DRONE), find_pilot("flip", DRONE), described.knobs)
 
 
 def keys(count: int):
@@ -130,7 +131,7 @@ def test_a_search_never_does_worse_than_what_it_is_given():
 
 @pytest.mark.parametrize("name", ["flip", "flip-analytic"])
 def test_the_shipped_flip_policies_say_where_they_come_from(name):
-    policy = load_policy(shipped_policies()[name])
+    policy = load_policy(name)
     assert policy.task == "flip"
     # What it does not say, as it was trained before there was such a setting, is the default.
     assert config_from(policy.training["config"], "policy") == load_config(name)

@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+import yaml
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.pilot import find_pilot
@@ -20,7 +21,7 @@ DRONE = Quadrotor.from_file("cfb-guards")
 
 
 def pilot_of(name: str) -> NeuralController:
-    policy = load_policy(shipped_policies()[name])
+    policy = load_policy(name)
     assert policy.training["config"]["seed"] == 0
     return policy.controller
 
@@ -33,7 +34,7 @@ def test_it_hovers_on_the_nominal_drone(name):
     assert np.mean(measured.command_std) < 0.02
 
 
-@pytest.mark.parametrize(("name", "within_m"), [("target-adaptive", 0.06), ("target-ppo", 0.075)])
+@pytest.mark.parametrize(("name", "within_m"), [("target-adaptive", 0.06), ("target", 0.075)])
 def test_random_drones_are_held_within_centimetres(name, within_m):
     task = TargetTask(randomisation=load_randomisation("paper"))
     measured, _ = hover(pilot_of(name), task, DRONE, jax.random.split(jax.random.PRNGKey(3), 32))
@@ -41,9 +42,23 @@ def test_random_drones_are_held_within_centimetres(name, within_m):
     assert np.median(measured.mean_distance_m) < within_m
 
 
-def test_the_policy_of_ppo_is_made_by_the_defaults():
-    policy = load_policy(shipped_policies()["target-ppo"])
-    assert config_from(policy.training["config"], "policy") == load_config("target")
+@pytest.mark.parametrize(("name", "config"), [("target", "target-2"), ("target-adaptive", "target-adaptive-2")])
+def test_policies_are_made_by_what_is_shipped(name, config):
+    assert config_from(load_policy(name).training["config"], "policy") == load_config(config)
+
+
+def test_the_policy_of_ppo_begins_with_the_defaults():
+    first = yaml.safe_load((shipped_policies()["target"].parent / "config-1.yaml").read_text())
+    assert config_from(first, "first part") == load_config("target")
+
+
+@pytest.mark.parametrize("name", ["target", "target-adaptive"])
+def test_it_does_not_swing_where_sensors_are_later_or_noisier(name):
+    found = Judge(plants=None, random_drones=0).with_sensors(pilot_of(name))
+    assert [there["failed"] for there in found.values()] == [0, 0, 0]
+    late, all_late, noisy = (there["command_std"] for there in found.values())
+    assert max(late, all_late) < 0.04
+    assert noisy < 0.03
 
 
 def test_the_firmware_needs_its_gyro_on_the_drone_and_not_its_pose():

@@ -93,7 +93,7 @@ Steps per second of all drones together, float32; the best of several runs that 
 `rollout_kept`: with a command per step, and every state returned. `rollout_randomised`: as `rollout`, every drone with
 its own parameters. `rollout_gradient`: reverse-mode gradient of a
 100-step rollout with respect to all parameters, `rollout_ten` with respect to ten, `rollout_hundred` that rollout
-alone. `rollout_policy`: the shipped policy `target` in the loop (`rollout_closed_loop`), a command every 8 ms;
+alone. `rollout_policy`: the shipped policy `target-analytic` in the loop (`rollout_closed_loop`), a command every 8 ms;
 `network_alone`: its network evaluated as often, with nothing to fly or to observe. Bodies: `rigid` closed form; `mjx`
 MuJoCo XLA without contact; `mjx-floor` with floor contact; `mjx-stock` plain `mjx.step` on the same MJCF without
 contact. One JAX device of a CPU is one core of it.

@@ -15,7 +15,7 @@ FLASH, RAM, STEP_S = 64 * 1024, 8 * 1024, 1e-3
 """What a step may take on the drone."""
 
 
-def run_export(policy: str, output: Path, knobs: str | None, holder: str, check: bool) -> None:
+def run_export(policy: str, output: Path, knobs: str | None, holder: str | None, check: bool) -> None:
     """Write the export, check it if that is asked for.
 
     Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -43,10 +44,11 @@ def prepared(
         raise CfbError(
             f"{controller}: is no flip policy and cannot fly --task {task}; give flip, or one of cfb train flip."
         )
-    holder = find_pilot(turn.holder, nominal)
-    if not isinstance(holder, NeuralController) or asks_for_setpoints(holder):
-        raise CfbError(f"--holder {turn.holder}: must be a target policy, for instance target or target-adaptive.")
     described = load_manoeuvre(turn.knobs or task, turn.changes)
+    described = replace(described, holder=turn.holder or described.holder)
+    holder = find_pilot(described.holder, nominal)
+    if not isinstance(holder, NeuralController) or asks_for_setpoints(holder):
+        raise CfbError(f"holder {described.holder}: must be a target policy, for instance target or target-adaptive.")
     if described.rotations != FLIPS[task]:
         raise CfbError(f"--knobs {turn.knobs}: turn {described.rotations} times, --task {task} {FLIPS[task]} times.")
     manoeuvre = Manoeuvre(holder, turner, described.knobs)
@@ -75,5 +77,5 @@ def _fixed(changes: tuple[str, ...], knobs: Knobs) -> dict[str, float]:
 
 
 def _keep(manoeuvre: Manoeuvre, described: ManoeuvreFile, path: Path) -> None:
-    save_manoeuvre(ManoeuvreFile(described.rotations, manoeuvre.knobs, described.description), path)
+    save_manoeuvre(replace(described, knobs=manoeuvre.knobs), path)
     print(f"knobs: {path}")

@@ -39,7 +39,7 @@ class Turn:
 
     knobs: str | None = None
     changes: tuple[str, ...] = ()
-    holder: str = "target"
+    holder: str | None = None
     search: Literal["height", "margin"] | None = None
     keep: Path | None = None
 

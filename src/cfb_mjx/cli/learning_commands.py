@@ -42,7 +42,7 @@ def train(
         algorithm: ppo (the paper's) or analytic (back-propagation through the model); in place of the configuration's.
         seed: of everything random; in place of the configuration's.
         set: changes to the configuration, for instance randomisation.magnitude=0.5 ppo.steps=2e7.
-        start: policy to start from, in place of random weights.
+        start: policy to start from, in place of random weights: a file, or the name of a shipped one.
         resume: go on from the checkpoint in the folder.
         force: train on a model that is a predictor, not a plant.
         devices: of this machine, or of each of several processes, over which the drones are spread.
@@ -78,7 +78,7 @@ def fly(
     log: File = None,
     knobs: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None,
     set: Pairs = (),
-    holder: Annotated[str, tyro.conf.arg(metavar="CONTROLLER")] = "target",
+    holder: Annotated[str | None, tyro.conf.arg(metavar="CONTROLLER")] = None,
     search: Literal["height", "margin"] | None = None,
     keep: File = None,
     devices: int = 1,
@@ -109,7 +109,7 @@ def fly(
         knobs: of a flip: when it switches and what it asks for, a shipped manoeuvre (flip-wide, double-flip-low ...) or
             a YAML file; the task's own by default.
         set: changes to the knobs of a flip, for instance rate_radps=18 climb_s=0.4; a search leaves these alone.
-        holder: the target policy that climbs and catches in a flip.
+        holder: the target policy that climbs and catches in a flip; by default the one its knobs were found with.
         search: look for the knobs of a flip first: least height on the model, or largest margin on drones of the
             randomisation.
         keep: write the knobs that were flown here, for --knobs.

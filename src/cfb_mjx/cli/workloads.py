@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array
 
 from cfb_mjx.control.closed_loop import at_once, rollout_closed_loop
-from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.devices import Devices
 from cfb_mjx.files import shipped
 from cfb_mjx.model import MjxBody, Quadrotor, rollout_final
@@ -140,12 +140,12 @@ def _distance(model: Quadrotor, states: State, commands: Array) -> Array:
 
 
 def rollout_policy(drones: int, over: Devices | None = None) -> Workload:
-    """Closed loop: the shipped policy `target` commands every 8 ms on the true state, two steps of 4 ms each.
+    """Closed loop: the shipped policy `target-analytic` commands every 8 ms on the true state, two steps of 4 ms each.
 
     With ``over`` the drones are divided over several devices.
     """
     model = Quadrotor.from_file("cfb-guards")
-    controller = load_policy(shipped_policies()["target"]).controller
+    controller = load_policy("target-analytic").controller
     states, _ = _start(model, drones)
     offsets = 0.3 * jax.random.normal(jax.random.key(2), (drones, 3))
     states = eqx.tree_at(lambda s: s.position, states, offsets)
@@ -161,7 +161,7 @@ def rollout_policy(drones: int, over: Devices | None = None) -> Workload:
 
 def network_alone(drones: int) -> Workload:
     """The network of `rollout_policy` as often as there, with nothing to fly: no simulator can be faster with it."""
-    controller = load_policy(shipped_policies()["target"]).controller
+    controller = load_policy("target-analytic").controller
     commands, groups = STEPS // 4, -(-drones // at_once())
 
     def one(shown, _):
@@ -177,7 +177,7 @@ def network_alone(drones: int) -> Workload:
 
 def network_file(folder: Path) -> Path:
     """The network of `rollout_policy` as arrays w0, b0, w1 ..., for a peer."""
-    network = load_policy(shipped_policies()["target"]).controller.network
+    network = load_policy("target-analytic").controller.network
     layers = enumerate(zip(network.weights, network.biases, strict=True))
     path = folder / "network.npz"
     np.savez(path, **{f"{k}{i}": np.asarray(x) for i, layer in layers for k, x in zip("wb", layer, strict=True)})

@@ -27,6 +27,8 @@ class ManoeuvreFile:
     rotations: int
     knobs: Knobs
     description: str = ""
+    holder: str = "target"
+    """The target policy that climbs and catches, name or file: the one that the knobs were found with."""
 
 
 def shipped_manoeuvres() -> list[str]:
@@ -41,13 +43,16 @@ def load_manoeuvre(name_or_path: str | Path, changes: tuple[str, ...] = ()) -> M
         CfbError: no such file, an unknown or missing knob, or a value that makes no sense, named.
     """
     path, document = load_named(name_or_path, "manoeuvre", FORMAT, _FOLDER)
-    refuse_unknown(document, {"format", "description", "rotations", "knobs"}, path, "")
+    refuse_unknown(document, {"format", "description", "rotations", "holder", "knobs"}, path, "")
     rotations, raw = document.get("rotations"), document.get("knobs")
     if not isinstance(rotations, int) or isinstance(rotations, bool) or rotations < 1:
         raise CfbError(f"{path}: rotations must be a whole number from 1, found {told(rotations)}.")
     if not isinstance(raw, dict):
         raise CfbError(f"{path}: knobs must be a mapping, found {told(raw)}.")
     refuse_unknown(raw, set(Knobs._fields), path, "knobs.")
+    holder = document.get("holder", ManoeuvreFile.holder)
+    if not isinstance(holder, str):
+        raise CfbError(f"{path}: holder must be a policy's name or file, found {told(holder)}.")
     knobs = dict(raw)
     for change in changes:
         name, equals, text = change.partition("=")
@@ -61,6 +66,7 @@ def load_manoeuvre(name_or_path: str | Path, changes: tuple[str, ...] = ()) -> M
         rotations,
         Knobs(**{name: _number(value, name, path) for name, value in knobs.items()}),
         str(document.get("description", "")).strip(),
+        holder,
     )
 
 
@@ -73,7 +79,7 @@ def save_manoeuvre(manoeuvre: ManoeuvreFile, path: str | Path) -> None:
     # Four digits are less than a hair's breadth and a tenth of a millisecond.
     knobs = {name: round(float(x), 4) for name, x in manoeuvre.knobs._asdict().items() if math.isfinite(x)}
     document: dict[str, Any] = {"format": FORMAT, "description": manoeuvre.description}
-    document |= {"rotations": manoeuvre.rotations, "knobs": knobs}
+    document |= {"rotations": manoeuvre.rotations, "holder": manoeuvre.holder, "knobs": knobs}
     write_text(path, yaml.safe_dump(document, sort_keys=False, width=120))
 
 

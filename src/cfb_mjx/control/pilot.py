@@ -71,7 +71,7 @@ def has_lumped_delay(controller: str | Path) -> bool:
     """
     if controller in ("pid", "mellinger"):
         return False
-    return load_policy(shipped_policies().get(str(controller), controller)).lumped_delay
+    return load_policy(controller).lumped_delay
 
 
 def _measured(estimate: Estimate) -> State:
@@ -93,9 +93,7 @@ def find_pilot(controller: str | Path, nominal: Quadrotor) -> Pilot:
     if controller == "mellinger":
         return MellingerPilot(mellinger.Mellinger())
     found = shipped_policies()
-    if controller in found:
-        return load_policy(found[controller]).controller
-    if Path(controller).suffix != ".npz":
+    if controller not in found and Path(controller).suffix != ".npz":
         names = ", ".join(["pid", "mellinger", *found])
         raise CfbError(f"{controller}: no such controller; give a policy file (.npz) or one of {names}.")
     return load_policy(controller).controller

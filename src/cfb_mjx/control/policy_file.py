@@ -79,9 +79,13 @@ def save_policy(policy: PolicyFile, path: str | Path) -> None:
 def load_policy(path: str | Path) -> PolicyFile:
     """Read a policy written by `save_policy`.
 
+    Args:
+        path: file, or the name of a shipped policy.
+
     Raises:
         CfbError: no such file, or not a policy, or a damaged one.
     """
+    path = shipped_policies().get(str(path), path)
     read_bytes(path, 1)
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:

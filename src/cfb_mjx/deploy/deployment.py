@@ -86,14 +86,14 @@ class Deployment:
         return Quadrotor.from_file(model)
 
 
-def find_deployment(name: str | Path, knobs: str | Path | None = None, holder: str | Path = "target") -> Deployment:
+def find_deployment(name: str | Path, knobs: str | Path | None = None, holder: str | Path | None = None) -> Deployment:
     """What a name or file stands for.
 
     Args:
         name: a shipped policy, a policy file, or a shipped manoeuvre (``double-flip``: the shipped flip policy
             with it).
         knobs: manoeuvre of a flip policy: a shipped one or a YAML file; ``flip`` by default.
-        holder: the target policy that climbs and catches in a flip.
+        holder: the target policy that climbs and catches in a flip; by default the one its knobs were found with.
 
     Raises:
         CfbError: there is no such policy or manoeuvre, or they do not go together.
@@ -102,7 +102,7 @@ def find_deployment(name: str | Path, knobs: str | Path | None = None, holder: s
     if str(name) in shipped_manoeuvres() and str(name) not in shipped:
         if knobs is not None:
             raise CfbError(f"{name} is a manoeuvre already; leave out --knobs, or export flip with them.")
-        return _flip(str(name), load_policy(shipped["flip"]), load_manoeuvre(str(name)), holder)
+        return _flip(str(name), load_policy("flip"), load_manoeuvre(str(name)), holder)
     policy = _policy(name)
     label = Path(name).stem if str(name) not in shipped else str(name)
     if policy.controller.layout.setpoint_scales:
@@ -114,16 +114,14 @@ def find_deployment(name: str | Path, knobs: str | Path | None = None, holder: s
 
 def _policy(name: str | Path) -> PolicyFile:
     shipped = shipped_policies()
-    if str(name) in shipped:
-        return load_policy(shipped[str(name)])
-    if Path(name).suffix != ".npz":
+    if str(name) not in shipped and Path(name).suffix != ".npz":
         names = ", ".join([*shipped, *(m for m in shipped_manoeuvres() if m not in shipped)])
         raise CfbError(f"{name}: no such policy; give a policy file (.npz) or one of {names}.")
     return load_policy(name)
 
 
-def _flip(name: str, turner: PolicyFile, manoeuvre: ManoeuvreFile, holder: str | Path) -> Deployment:
-    held = _policy(holder)
+def _flip(name: str, turner: PolicyFile, manoeuvre: ManoeuvreFile, holder: str | Path | None) -> Deployment:
+    held = _policy(holder or manoeuvre.holder)
     found = Deployment(name, held, turner, manoeuvre)
     _ = found.pilot  # says so where they do not go together
     return found

@@ -34,19 +34,20 @@ class TargetReward:
         1 / (1 + |p / near_width|^2 + |v / near_speed|^2 + |(q - 1) / near_attitude|^2)
 
     The paper's falls by 0.1 per metre: a decimetre is worth less than a learner's own noise. This one falls by up to
-    2.6 x near per metre, has no cusp that would ask for the largest gain, and tells who swings from who is at rest.
+    2.6 x near per metre, has no cusp that would ask for the largest gain, and tells who swings from who is at rest: at
+    half of ``near_speed`` a fifth of it is gone.
     """
     near_width_m: float = 0.25
-    near_speed_mps: float = 1.0
+    near_speed_mps: float = 0.4
     near_attitude: float = 0.5
     velocity: float = 0.05
     velocity_width_mps: float = 10.0
     attitude: float = 0.15
     attitude_width: float = 2.0
     """Of |q - [1, 0, 0, 0]|, taken with the sign of q that is nearer."""
-    body_rate: float = 0.45
+    body_rate: float = 2.0
     body_rate_width_radps: float = 30.0
-    torque: float = 0.02
+    torque: float = 0.1
     torque_width_nm: float = 0.01
     failure: float = 300.0
     """Subtracted in the step that ends an episode."""
@@ -81,7 +82,7 @@ class TargetReward:
         return reward - self.failure * self.failed(state)
 
 
-PAPER_REWARD = TargetReward(position=1.0, near=0.0, body_rate=0.15, body_rate_width_radps=10.0)
+PAPER_REWARD = TargetReward(position=1.0, near=0.0, body_rate=0.15, body_rate_width_radps=10.0, torque=0.02)
 
 
 def too_fast(state: State, speed_limit_mps: float, rate_limit_radps: float) -> Bool[Array, ""]:

@@ -59,7 +59,7 @@ def controllers(folder: Path, real: Path | None) -> Result:
 
 def _why(name: str) -> str:
     if name == "target":
-        return "trained by back-propagation instead of PPO; simulated, without what the real drone has beyond the model"
+        return "a reward with other weights; simulated, without what the real drone has beyond the model"
     return "simulated drone: no wind, no drift" if name == "pid" else "default mass and thrust scale of the firmware"
 
 

@@ -25,7 +25,7 @@ def _flown(name: str, count: int):
 
     nominal = Quadrotor.from_file("cfb-guards")
     of = load_manoeuvre(name)
-    manoeuvre = Manoeuvre(find_pilot("target", nominal), find_pilot("flip", nominal), of.knobs)
+    manoeuvre = Manoeuvre(find_pilot(of.holder, nominal), find_pilot("flip", nominal), of.knobs)
     measured, flown = flips(manoeuvre, TargetTask(), nominal, jax.random.split(jax.random.PRNGKey(11), count))
     return of, measured, flown, manoeuvre.control_dt_s
 

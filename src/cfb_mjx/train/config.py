@@ -73,7 +73,7 @@ class PpoSettings:
     """Commands of every drone between two updates of the policy."""
     minibatches: int = 8
     epochs: int = 4
-    steps: int = 100_000_000
+    steps: int = 200_000_000
     """Commands in total."""
     learning_rate: float = 5e-4
     """At the start; it falls to ``last_rate`` of that along a line."""
@@ -90,9 +90,10 @@ class PpoSettings:
     copies: int = 4
     """Drones that fly the same episode with other actions: each one's advantage is counted from the mean of its copies,
     so that what the value network errs by in all of them cancels. They begin and end together."""
-    smoothness: float = 3.0
+    smoothness: float = 6.0
     """Price of |u_(k+1) - u_k|^2 of the policy's means, with commands from -1 to 1 (Mysore et al. 2021, CAPS): what is
-    explored costs nothing."""
+    explored costs nothing. It stands beside advantages that are divided by their spread, which falls as a policy gets
+    better: in units of the reward the price falls with it."""
     entropy_cost: float = 3e-3
     """At the start; it falls to ``last_entropy`` of that along a line."""
     last_entropy: float = 0.02
@@ -193,7 +194,9 @@ class FlipTrainingConfig(TrainingConfig):
     starts: FlipStarts = field(default_factory=FlipStarts)
     noise: Noise = field(default_factory=Noise)
     setpoints: Setpoints = field(default_factory=Setpoints)
-    randomisation: RandomisationSettings = field(default_factory=partial(RandomisationSettings, graded=0.5))
+    randomisation: RandomisationSettings = field(
+        default_factory=partial(RandomisationSettings, ranges="paper", graded=0.5)
+    )
     analytic: FlipAnalyticSettings = field(default_factory=FlipAnalyticSettings)
     ppo: FlipPpoSettings = field(default_factory=FlipPpoSettings)
 
