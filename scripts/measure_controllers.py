@@ -1,32 +1,22 @@
 """Fly every controller through every test, and write docs/controllers.md with its figures.
 
-    python scripts/measure_controllers.py [--plants 4096] [--before EARLIER.json]
+    python scripts/measure_controllers.py [--plants 4096] [--controllers NAME ...]
 
-Minutes. The paper's own numbers are of the real drone and stand beside; beside an earlier run's results the page says
-what moved. `raptor` among the controllers is RAPTOR's published policy (`pip install foundation-policy`).
+A minute each; with no names it writes the page alone. What is not measured anew stays as it is in
+benchmarks/controllers.json. The paper's own numbers are of the real drone and stand beside. `raptor` is RAPTOR's
+published policy (`pip install foundation-policy`).
 """
 
 import argparse
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
-from campaign import ROOT, moved
+from campaign import ROOT, facts_line
 
 from cfb_mjx.cli.runtime import configure_jax, environment, say
 from cfb_mjx.reproduce.paper import PAPER_FIRMWARE, PAPER_HOVER
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-HEADLINES = {
-    "hover_mm": "hover, mm",
-    "command_std": "command std",
-    "arrival_s": "arrival, s",
-    "peak_speed_mps": "peak, m/s",
-    "random_failed": "random drones failed",
-    "random_recovered": "random drones recovered",
-    "recovered": "nominal recovered",
-}
 RAPTOR = [
     "`raptor`: the published policy of RAPTOR (Eschmann, Albani, Loianno 2025; `pip install foundation-policy`), 100 "
     "commands/s, with errors of position and velocity limited to 0.5 m and 1 m/s as its authors' adapter for PX4 does. "
@@ -35,7 +25,8 @@ RAPTOR = [
     "",
 ]
 IDSIA = "cfb-idsia"
-CONTROLLERS = ["target", "target-ppo", "target-adaptive", "pid", "mellinger"]
+CONTROLLERS = ["target", "target-analytic", "target-adaptive", "pid", "mellinger", "raptor"]
+RESULTS = ROOT / "benchmarks" / "controllers.json"
 PAPER_OF = {"target": PAPER_HOVER[1.0], **PAPER_FIRMWARE}
 
 
@@ -43,10 +34,8 @@ def main() -> None:
     """Measure, then write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plants", type=int, default=4096)
-    parser.add_argument("--controllers", nargs="+", default=CONTROLLERS)
-    parser.add_argument("--before", type=Path, help="results of an earlier run")
+    parser.add_argument("--controllers", nargs="*", choices=CONTROLLERS, default=CONTROLLERS)
     arguments = parser.parse_args()
-    before = json.loads(arguments.before.read_text()) if arguments.before else None
     configure_jax(x64=False)
     import jax
     import numpy as np
@@ -63,7 +52,8 @@ def main() -> None:
     described, nominal, plants = judge.described, judge.nominal, judge.plants
     few, many = judge.few, judge.many
     drones = jax.jit(jax.vmap(lambda key: reset(judge.wild, nominal, key).model.parameters))(many)
-    results = {}
+    results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
+    results = {name: r for name, r in results.items() if name in CONTROLLERS and r["drones"] == arguments.plants}
     for name in arguments.controllers:
         say(name)
         pilot = RaptorPilot.published() if name == "raptor" else find_pilot(name, nominal)
@@ -78,6 +68,8 @@ def main() -> None:
         distance = 1e3 * np.asarray(all_of_them.mean_distance_m)
         well = ~np.asarray(all_of_them.failed)
         results[name] = {
+            "environment": environment(),
+            "drones": arguments.plants,
             "hover_mm": 1e3 * float(np.mean(one.mean_distance_m)),
             "command_std": float(np.mean(one.command_std)),
             "arrival_s": float(np.median(step.arrival_s)),
@@ -96,13 +88,11 @@ def main() -> None:
         for plant, drone in plants.items():
             # A drone that was meant to be the paper's: the firmware's controllers are scaled for that one.
             results[name]["plants"][plant] = summary(hover(pilot, calm, drone, few)[0], np.mean)
+        write_json(RESULTS, results)
         # Six controllers' compiled programs are more than LLVM may map.
         jax.clear_caches()
-    facts = environment()
-    whole = {"environment": facts, "plants": arguments.plants} | results
-    write_json(ROOT / "benchmarks" / "controllers.json", whole)
-    change = moved(before, whole, _headlines) if before else []
-    write_text(ROOT / "docs" / "controllers.md", page(results, facts, arguments.plants, described, change))
+    results = {name: results[name] for name in CONTROLLERS if name in results}
+    write_text(ROOT / "docs" / "controllers.md", page(results, arguments.plants, described))
     print("docs/controllers.md")
 
 
@@ -111,17 +101,6 @@ def _cell(there: dict) -> str:
         return "all lost"
     lost = f", {there['failed']:.2%} failed" if there["failed"] else ""
     return f"{there['hover_mm']:.0f} ({there['command_std']:.3f}){lost}"
-
-
-def _headlines(results: dict) -> dict[str, float]:
-    """The numbers of the page, by name."""
-    found = {}
-    for name in (key for key, value in results.items() if isinstance(value, dict) and "hover_mm" in value):
-        r = results[name]
-        found |= {f"{name}: {what}": r[key] for key, what in HEADLINES.items()}
-        found[f"{name}: median hover of random drones, mm"] = r["random_hover_mm"]["0.5"]
-        found |= {f"{name}: hover, {plant}, mm": there["hover_mm"] for plant, there in r["plants"].items()}
-    return found
 
 
 def _factors(drones, nominal, distance, well) -> dict[str, dict[str, float]]:
@@ -163,15 +142,14 @@ def _hover_squared(parameters):
     return np.asarray(parameters.mass) / (thrust * np.asarray(parameters.motor_gain)[..., 0] ** 2)
 
 
-def page(results: dict, facts: dict, plants: int, described, change: list[str]) -> str:
+def page(results: dict, plants: int, described) -> str:
     """The Markdown page."""
     names = list(results)
     lines = [
         "# Controllers, measured",
         "",
-        f"Written by `python scripts/measure_controllers.py {' '.join(Path(a).name for a in sys.argv[1:])}` on "
-        f"{facts['date']}, {facts['processor']}, Python {facts['python']}, jax {facts['jax']}, cfb_mjx "
-        f"{facts['cfb_mjx']}. In simulation: model `{described.name}`, estimates 8 ms late and noisy, the gyro too "
+        f"{facts_line('python scripts/measure_controllers.py', list(results.values()), 'measured')} In simulation: "
+        f"model `{described.name}`, estimates 8 ms late and noisy, the gyro too "
         "but for the firmware's controllers and RAPTOR, which read it on the drone; noise of the state as in the "
         "paper. The paper's numbers are of its real drone.",
         "",
@@ -187,7 +165,8 @@ def page(results: dict, facts: dict, plants: int, described, change: list[str]) 
     for name in names:
         r = results[name]
         paper = [f"{x:g}" for x in PAPER_OF.get(name, ())] or ["", ""]
-        arrival = f"{r['arrival_s']:.2f}" if r["arrival_s"] < 1e6 else "not within 4"
+        # A file has null for what never is.
+        arrival = "not within 4" if r["arrival_s"] in (None, float("inf")) else f"{r['arrival_s']:.2f}"
         cells = [name, f"{r['hover_mm']:.1f}", f"{r['command_std']:.4f}", *paper, arrival]
         cells += [f"{r['peak_speed_mps']:.2f}", f"{r['overshoot_m']:.2f}"]
         lines.append("| " + " | ".join(cells) + " |")
@@ -247,7 +226,7 @@ def page(results: dict, facts: dict, plants: int, described, change: list[str]) 
     for plant in results[names[0]]["plants"]:
         cells = [_cell(results[name]["plants"][plant]) for name in names]
         lines.append(f"| {plant} | " + " | ".join(cells) + " |")
-    return "\n".join([*lines, *change]) + "\n"
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -144,6 +144,15 @@ def test_messages_in_the_remedies_are_those_of_the_code():
             assert part in said, f"no message of the library says: {part}"
 
 
+def test_cards_of_policies_say_what_was_measured():
+    """With other results under benchmarks, or another policy, `scripts/policy_cards.py` writes others."""
+    cards = _script("policy_cards")
+    folders = sorted(path.parent for path in cards.POLICIES.glob("*/policy.npz"))
+    assert len(folders) == 5
+    for folder in folders:
+        assert (folder / "card.md").read_text() == cards.card(folder), folder.name
+
+
 def test_pages_speak_of_the_project_only():
     for page in [*DOCS.rglob("*.md"), *DOCS.rglob("*.ipynb")]:
         text = page.read_text()

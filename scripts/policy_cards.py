@@ -1,0 +1,154 @@
+"""Write the card of each shipped policy: what trained it, on what, its curve, scores and limits.
+
+    python scripts/policy_cards.py
+
+From the files beside each policy and the results of scripts/measure_controllers.py and scripts/flips.py: run it after
+them.
+"""
+
+import argparse
+import csv
+import json
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+POLICIES = ROOT / "src" / "cfb_mjx" / "policies"
+SWINGS = 0.04
+"""Command std in hover above which a drone visibly swings."""
+CURVE_ROWS = 6
+COLUMNS = {
+    "hover_mm": "hover, nominal, mm",
+    "random_mm": "randomised, median, mm",
+    "command_std": "command std",
+    "rate_error_radps": "rate error, rad/s",
+}
+
+
+def main() -> None:
+    """Write them."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    from cfb_mjx.files import write_text
+
+    for folder in sorted(path.parent for path in POLICIES.glob("*/policy.npz")):
+        write_text(folder / "card.md", card(folder))
+        print((folder / "card.md").relative_to(ROOT))
+
+
+def card(folder: Path) -> str:
+    """The Markdown of one policy."""
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    last = json.loads((folder / "training.json").read_text())
+    flips = config["task"] == "flip"
+    parts = [yaml.safe_load(path.read_text()) for path in sorted(folder.glob("config*.yaml"))]
+    lines = [f"# {folder.name}", ""]
+    for part in parts:
+        lines += [" ".join(part["description"].split()), ""]
+    lines += ["## What trained it", "", *_training(folder, config, last), ""]
+    lines += ["## On what", "", *_conditions(config), ""]
+    lines += ["## Curve", "", *_curve(folder), ""]
+    lines += ["## Scores", "", *(_flips(folder.name) if flips else _scores(folder.name))]
+    return "\n".join(lines) + "\n"
+
+
+def _training(folder: Path, config: dict, last: dict) -> list[str]:
+    facts, end = last["environment"], last["last"]
+    how = {"ppo": "PPO", "analytic": "Back-propagation through the model"}[config["algorithm"]]
+    lines = [
+        f"- {how}, seed {config['seed']}: {end['commands'] / 1e6:.0f} M commands in {end['seconds'] / 60:.0f} min, "
+        f"{facts['date']}, {facts['processor']}, Python {facts['python']}, jax {facts['jax']}, cfb_mjx "
+        f"{facts['cfb_mjx']}."
+    ]
+    if (folder / "training-1.json").exists():
+        first = json.loads((folder / "training-1.json").read_text())["last"]
+        minutes = first["seconds"] / 60
+        lines.append(f"- Begun from a first part of {first['commands'] / 1e6:.0f} M commands in {minutes:.0f} min.")
+    lines.append("- Commands: `README.md` in the folder above. Every number: `config.yaml`, and inside `policy.npz`.")
+    return lines
+
+
+def _conditions(config: dict) -> list[str]:
+    random, noise, seen = config["randomisation"], config["noise"], config["observation"]
+    milder = f", a share {random['graded']:g} of the episodes on milder drones" if random.get("graded") else ""
+    late = f", and up to {1e3 * noise['pose_jitter_s']:g} ms more" if noise.get("pose_jitter_s") else ""
+    whose = "pose and gyro alike" if config.get("lumped_delay", True) else "the gyro read on the drone"
+    lines = [
+        f"- Model `{config['model']}`, randomisation `{random['ranges']}` x {random['magnitude']:g}{milder}.",
+        f"- Estimates as late as the model's `pose_delay`{late}: {whose}. Noise: {1e3 * noise['position_m']:g} mm, "
+        f"{1e3 * noise['velocity_mps']:g} mm/s, {1e3 * noise['attitude_rad']:g} mrad, "
+        f"{1e3 * noise['rate_radps']:g} mrad/s.",
+    ]
+    told = f"{1 + seen['past_estimates']} estimates, {seen['past_commands']} past commands"
+    told += ", an integral of the position error" if seen.get("integral") else ""
+    return [*lines, f"- Sees {told}; a command every {1e3 * seen['control_dt_s']:g} ms."]
+
+
+def _curve(folder: Path) -> list[str]:
+    rows = list(csv.DictReader((folder / "curve.csv").read_text().splitlines()))
+    # Evenly over the training, its end included.
+    chosen = rows[:: -(-len(rows) // CURVE_ROWS)]
+    chosen += [] if chosen[-1] is rows[-1] else [rows[-1]]
+    there = {key: title for key, title in COLUMNS.items() if key in rows[0]}
+    lines = ["| commands | time | " + " | ".join(there.values()) + " |", "|---|---|" + "---|" * len(there)]
+    for row in chosen:
+        cells = [f"{float(row['commands']) / 1e6:.0f} M", f"{float(row['seconds']) / 60:.1f} min"]
+        lines.append("| " + " | ".join(cells + [f"{float(row[key]):.3g}" for key in there]) + " |")
+    return lines
+
+
+def _scores(name: str) -> list[str]:
+    whole = json.loads((ROOT / "benchmarks" / "controllers.json").read_text())
+    if name not in whole:
+        return ["Not measured."]
+    r = whole[name]
+    sensors = {what: there["command_std"] for what, there in r["sensors"].items()}
+    lines = [
+        f"`scripts/measure_controllers.py`, {r['environment']['date']}; all of it in docs/controllers.md.",
+        "",
+        f"- Hover on the nominal drone: {r['hover_mm']:.0f} mm, command std {r['command_std']:.3f}.",
+        f"- Hover on {r['drones']} drones of the paper's randomisation: median {r['random_hover_mm']['0.5']:.0f} mm, "
+        f"95 % within {r['random_hover_mm']['0.95']:.0f} mm; {r['random_failed']:.2%} failed.",
+        f"- Six metres: {r['arrival_s']:.2f} s, peak {r['peak_speed_mps']:.1f} m/s, {r['overshoot_m']:.2f} m beyond.",
+        f"- Thrown at 3 m/s with 60 deg of tilt: {r['random_recovered']:.1%} of these drones recovered within 6 s, "
+        f"{r['recovered']:.1%} of nominal ones.",
+        "",
+        "## Limits",
+        "",
+    ]
+    lines += [
+        f"- {what[0].upper() + what[1:]}: " + ("lost." if std is None else f"command std {std:.3f}, it swings.")
+        for what, std in sensors.items()
+        if std is None or std > SWINGS
+    ]
+    worst, of = max(r["factors"].items(), key=lambda item: item[1]["most_third_mm"] - item[1]["least_third_mm"])
+    lines.append(
+        f"- What costs it most: {worst}; the third of the drones that depart least by it hovers at "
+        f"{of['least_third_mm']:.0f} mm, the third that departs most at {of['most_third_mm']:.0f} mm."
+    )
+    errors = {plant: there["hover_mm"] or float("inf") for plant, there in r["plants"].items()}
+    plant = max(errors, key=errors.get)
+    lines.append(f"- Of the drones with effects it never saw, `{plant}` is held worst: {errors[plant]:.0f} mm.")
+    return lines
+
+
+def _flips(name: str) -> list[str]:
+    whole = json.loads((ROOT / "benchmarks" / "flips.json").read_text())
+    if name != "flip":
+        return ["Not measured here; docs/flips.md is of `flip`."]
+    lines = [
+        f"`scripts/flips.py`, {whole['environment']['date']}; all of it in docs/flips.md.",
+        "",
+        "| flip | holder | height, nominal, m | completed, randomised | 95 % of these within, m |",
+        "|---|---|---|---|---|",
+    ]
+    for flip, of in whole["flips"].items():
+        cells = [flip, of["holder"], f"{of['nominal']['vertical_extent_m']:.2f}", f"{of['completed_random']:.1%}"]
+        lines.append("| " + " | ".join([*cells, f"{of['random_extent_m']['0.95']:.2f}"]) + " |")
+    few = {flip: of["completed_random"] for flip, of in whole["flips"].items()}
+    worst = min(few, key=few.get)
+    return [*lines, "", "## Limits", "", f"- `{worst}` is completed by {few[worst]:.0%} of randomised drones only."]
+
+
+if __name__ == "__main__":
+    main()
