@@ -114,18 +114,15 @@ class Course:
         described = load_model_file("cfb-guards")
         self.nominal = Quadrotor.from_file(described)
         self.plants = load_plants(described)
-        self.holders = {wanted.holder: find_pilot(wanted.holder, self.nominal) for wanted in FLIPS.values()}
         self.turner = find_pilot("flip", self.nominal)
         self.calm, self.wild = TargetTask(), TargetTask(randomisation=load_randomisation("paper"))
         self.few, self.many = (jax.random.split(jax.random.PRNGKey(SEED), n) for n in (NOMINAL, RANDOM))
 
     def manoeuvre(self, name: str):
         """As it lies in configs."""
-        from cfb_mjx.control.manoeuvre import Manoeuvre
-        from cfb_mjx.control.manoeuvre_file import load_manoeuvre
+        from cfb_mjx.deploy.deployment import find_deployment
 
-        described = load_manoeuvre(MANOEUVRES / f"{name}.yaml")
-        return Manoeuvre(self.holders[described.holder], self.turner, described.knobs)
+        return find_deployment(name).pilot
 
     def search(self, name: str) -> None:
         """Find the knobs of one, from those it has if it has any."""
@@ -135,13 +132,14 @@ class Course:
 
         from cfb_mjx.control.manoeuvre import Knobs, Manoeuvre
         from cfb_mjx.control.manoeuvre_file import ManoeuvreFile, save_manoeuvre
+        from cfb_mjx.control.pilot import find_pilot
         from cfb_mjx.train.flip_search import Goal, bounds, search
 
         wanted = FLIPS[name]
         there = (MANOEUVRES / f"{name}.yaml").exists()
         knobs = self.manoeuvre(name).knobs if there else bounds(wanted.rotations).low
         found = search(
-            Manoeuvre(self.holders[wanted.holder], self.turner, knobs),
+            Manoeuvre(find_pilot(wanted.holder, self.nominal), self.turner, knobs),
             replace(self.wild, magnitude=wanted.magnitude),
             self.nominal,
             Goal(wanted.rotations, wanted.aim, **wanted.goal),

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import yaml
 
+from cfb_mjx.control.policy_file import shipped_policies
+
 ROOT = Path(__file__).resolve().parents[1]
-POLICIES = ROOT / "src" / "cfb_mjx" / "policies"
 SWINGS = 0.04
 """Command std in hover above which a drone visibly swings."""
 CURVE_ROWS = 6
@@ -31,9 +32,9 @@ def main() -> None:
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     from cfb_mjx.files import write_text
 
-    for folder in sorted(path.parent for path in POLICIES.glob("*/policy.npz")):
-        write_text(folder / "card.md", card(folder))
-        print((folder / "card.md").relative_to(ROOT))
+    for path in shipped_policies().values():
+        write_text(path.with_name("card.md"), card(path.parent))
+        print(path.with_name("card.md").relative_to(ROOT))
 
 
 def card(folder: Path) -> str:

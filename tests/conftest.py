@@ -102,7 +102,8 @@ def few_programs():
 
 
 @pytest.fixture(autouse=True)
-def not_too_many_programs():
-    """Within a module, whose tests share some, only when they are far too many."""
+def not_too_many_programs(request):
+    """Within a module that compiles a lot (mark ``haste``), whose tests share some, when they are far too many."""
     yield
-    _forget_programs(beyond=MOST_MAPS)
+    if request.node.get_closest_marker("haste") is not None:
+        _forget_programs(beyond=MOST_MAPS)

@@ -14,6 +14,7 @@ import pytest
 
 from cfb_mjx.cli import SUMMARY, main
 from cfb_mjx.cli.commands import COMMANDS
+from cfb_mjx.control.policy_file import shipped_policies
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -147,10 +148,9 @@ def test_messages_in_the_remedies_are_those_of_the_code():
 def test_cards_of_policies_say_what_was_measured():
     """With other results under benchmarks, or another policy, `scripts/policy_cards.py` writes others."""
     cards = _script("policy_cards")
-    folders = sorted(path.parent for path in cards.POLICIES.glob("*/policy.npz"))
-    assert len(folders) == 5
-    for folder in folders:
-        assert (folder / "card.md").read_text() == cards.card(folder), folder.name
+    assert len(shipped_policies()) == 5
+    for name, path in shipped_policies().items():
+        assert path.with_name("card.md").read_text() == cards.card(path.parent), name
 
 
 def test_pages_speak_of_the_project_only():

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from cfb_mjx.control.manoeuvre import CATCH, CLIMB, TURN, Manoeuvre
 from cfb_mjx.control.manoeuvre_file import load_manoeuvre
-from cfb_mjx.control.pilot import find_pilot
 from cfb_mjx.control.policy_file import load_policy
+from cfb_mjx.deploy.deployment import find_deployment
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.errors import CfbError
@@ -31,8 +31,7 @@ WILD = TargetTask(randomisation=load_randomisation("paper"))
 
 
 def shipped(name: str) -> Manoeuvre:
-    described = load_manoeuvre(name)
-    return Manoeuvre(find_pilot(described.holder, DRONE), find_pilot("flip", DRONE), described.knobs)
+    return find_deployment(name).pilot
 
 
 def keys(count: int):

@@ -16,18 +16,15 @@ SIMULATED = "Ours flies in simulation, seen 8 ms late and with noise; the paper'
 def _flown(name: str, count: int):
     import jax
 
-    from cfb_mjx.control.manoeuvre import Manoeuvre
-    from cfb_mjx.control.manoeuvre_file import load_manoeuvre
-    from cfb_mjx.control.pilot import find_pilot
+    from cfb_mjx.deploy.deployment import find_deployment
     from cfb_mjx.envs import TargetTask
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.train.flips import flips
 
     nominal = Quadrotor.from_file("cfb-guards")
-    of = load_manoeuvre(name)
-    manoeuvre = Manoeuvre(find_pilot(of.holder, nominal), find_pilot("flip", nominal), of.knobs)
-    measured, flown = flips(manoeuvre, TargetTask(), nominal, jax.random.split(jax.random.PRNGKey(11), count))
-    return of, measured, flown, manoeuvre.control_dt_s
+    of = find_deployment(name)
+    measured, flown = flips(of.pilot, TargetTask(), nominal, jax.random.split(jax.random.PRNGKey(11), count))
+    return of.manoeuvre, measured, flown, of.pilot.control_dt_s
 
 
 def four_flips(folder: Path, real: Path | None) -> Result:
