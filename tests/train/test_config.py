@@ -67,6 +67,14 @@ def test_a_count_may_be_written_with_an_exponent():
         ("format: cfb_mjx training 1\nepisode_s: 0", "episode_s = 0.0 must be positive"),
         ("format: cfb_mjx training 1\nobservation: {past_commands: -1}", "observation.past_commands = -1"),
         ("format: cfb_mjx training 1\nppo: {drones: 10, minibatches: 4}", "ppo.drones = 10"),
+        (
+            "format: cfb_mjx training 1\nreward: {position: 5}",
+            "reward gives position, but not near: 3.0 (as by default) or near: 0.0",
+        ),
+        (
+            "format: cfb_mjx training 1\nobservation: {position_scale_m: 1}",
+            "position_scale_m, but not position_bend_m: 0.1",
+        ),
         ("format: cfb_mjx training 1\nreward: {near_width_m: 0}", "reward.near_width_m = 0.0 must be positive"),
         ("format: cfb_mjx training 1\nrandomisation: {ranges: nothing}", "nothing: no such randomisation"),
     ],

@@ -35,8 +35,7 @@ class Layout:
     """Farther targets look as if they were this far away, in their direction."""
     position_scale_m: float = 0.1
     position_bend_m: float = 0.1
-    """Distances much longer than this are shown on a logarithmic scale, as b asinh(d / b); 0: all as they are,
-    and so where a file gives `position_scale_m` and no bend.
+    """Distances much longer than this are shown on a logarithmic scale, as b asinh(d / b); 0: all as they are.
 
     A network is nearly linear at first. Of distances shown as they are it makes one gain for all, no larger than a
     target 6 m away allows.
@@ -70,11 +69,14 @@ class Layout:
         return past + 3 * self.integral + len(self.setpoint_scales)
 
 
+BEFORE_BENDS = {"position_bend_m": 0.0, "velocity_bend_mps": 0.0, "body_position": False, "body_velocity": False}
+"""What a layout was before it could be otherwise: straight, and in the world's axes."""
+
+
 def as_written(written: dict[str, Any]) -> dict[str, Any]:
-    """A layout as a file writes it. One that says how positions are scaled, and not how they are bent or in whose axes
-    they are, is older than both: straight, and the world's."""
-    older = {"position_bend_m": 0.0, "velocity_bend_mps": 0.0, "body_position": False, "body_velocity": False}
-    return older | written if "position_scale_m" in written else written
+    """A layout as a policy or a training wrote it. One that says how positions are scaled and none of `BEFORE_BENDS` is
+    older than these."""
+    return BEFORE_BENDS | written if "position_scale_m" in written else written
 
 
 class Estimate(eqx.Module):

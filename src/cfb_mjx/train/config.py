@@ -10,7 +10,7 @@ from typing import Any, Literal
 from cfb_mjx.documents import load_named, parse_yaml, require_seed, told
 from cfb_mjx.envs import FlipReward, FlipStarts, FlipTask, Layout, Noise, Setpoints, Starts, TargetReward, TargetTask
 from cfb_mjx.envs.flip import FLIP_LAYOUT
-from cfb_mjx.envs.observation import as_written
+from cfb_mjx.envs.observation import BEFORE_BENDS
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters.randomisation import load_randomisation
 from cfb_mjx.train.cost import FlipCost, SmoothCost
@@ -207,6 +207,9 @@ class FlipTrainingConfig(TrainingConfig):
 
 
 _KINDS = {"target": TrainingConfig, "flip": FlipTrainingConfig}
+_SHOWN = ("observation", "position_scale_m", BEFORE_BENDS)
+_TOGETHER = {"target": (_SHOWN, ("reward", "position", {"near": 0.0})), "flip": (_SHOWN,)}
+"""Per task: a group, a key of it that older trainings wrote out, and what there is beside it since, as it was then."""
 
 
 def load_config(name_or_path: str | Path = "target", changes: tuple[str, ...] = ()) -> TrainingConfig:
@@ -218,6 +221,7 @@ def load_config(name_or_path: str | Path = "target", changes: tuple[str, ...] = 
     path, document = load_named(name_or_path, "training", FORMAT)
     # Checked before the changes go in, so that a fault of the file is not blamed on the command line.
     config_from(document, str(path))
+    _require_together(document, str(path))
     for change in changes:
         _change(document, change)
     config = config_from(document, str(path) if not changes else f"{path} with {', '.join(changes)}")
@@ -234,12 +238,24 @@ def config_from(mapping: dict[str, Any], where: str) -> TrainingConfig:
     task = mapping.get("task", "target")
     if not isinstance(task, str) or task not in _KINDS:
         raise CfbError(f"{where}: task must be one of {', '.join(_KINDS)}, found {told(task)}.")
-    if isinstance(shown := mapping.get("observation"), dict):
-        mapping = mapping | {"observation": as_written(shown)}
-    if task == "target" and isinstance(reward := mapping.get("reward"), dict) and "position" in reward:
-        # A reward written out without it is older than it, or the paper's.
-        mapping = mapping | {"reward": {"near": 0.0} | reward}
+    for group, key, since in _TOGETHER[task]:
+        if isinstance(given := mapping.get(group), dict) and key in given:
+            # A training that was written out before these existed.
+            mapping = mapping | {group: since | given}
     return build(_KINDS[task], mapping, where)
+
+
+def _require_together(mapping: dict[str, Any], where: str) -> None:
+    """Refuse a group that might mean the defaults of now or of before."""
+    usual = plain(_KINDS[mapping.get("task", "target")]())
+    for group, key, since in _TOGETHER[usual["task"]]:
+        given = mapping.get(group, {})
+        if key in given and (absent := {k: before for k, before in since.items() if k not in given}):
+            now = ", ".join(f"{k}: {told(usual[group][k])}" for k in absent)
+            before = ", ".join(f"{k}: {told(value)}" for k, value in absent.items())
+            raise CfbError(
+                f"{where}: {group} gives {key}, but not {now} (as by default) or {before} (as before they existed)."
+            )
 
 
 def with_changes(config: TrainingConfig, **values: Any) -> TrainingConfig:
