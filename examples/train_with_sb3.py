@@ -1,7 +1,7 @@
 """Train the paper's first task with Stable-Baselines3, and measure how well the policy hovers.
 
     pip install '.[gymnasium]' stable-baselines3
-    python examples/train_with_sb3.py [--commands 6000000] [--drones 256] [--seed 0]
+    python examples/train_with_sb3.py [--commands 6000000] [--drones 256] [--seed 0] [--write FILE.json]
 
 Stable-Baselines3 has vector environments of an interface of its own, older than Gymnasium's: `Drones` is the adapter.
 """
@@ -10,13 +10,17 @@ from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
 import numpy as np
+import stable_baselines3
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
+from cfb_mjx.cli.runtime import environment
 from cfb_mjx.envs import Starts, TargetTask
 from cfb_mjx.envs.gym import TargetVectorEnv
+from cfb_mjx.files import write_json
 
 
 class Drones(VecEnv):
@@ -84,6 +88,7 @@ def main() -> None:
     parser.add_argument("--commands", type=int, default=6_000_000, help="flown in all")
     parser.add_argument("--drones", type=int, default=256, help="flown side by side")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--write", type=Path, metavar="FILE.json", help="keep time and hover error")
     arguments = parser.parse_args()
     drones = VecNormalize(VecMonitor(Drones(TargetVectorEnv(arguments.drones))), norm_obs=False, gamma=0.995)
     model = PPO(
@@ -101,11 +106,15 @@ def main() -> None:
         device="cpu",
         verbose=1,
     )
-    begin = time.time()
+    begin = time.perf_counter()
     model.learn(arguments.commands, log_interval=10)
-    print(f"{model.num_timesteps / 1e6:.1f} M commands in {time.time() - begin:.0f} s")
-    error = hover_error_m(model)
-    print(f"hover error on the nominal drone: mean {1e3 * error.mean():.0f} mm, worst of 64 {1e3 * error.max():.0f} mm")
+    seconds, error = time.perf_counter() - begin, 1e3 * hover_error_m(model)
+    print(f"{model.num_timesteps / 1e6:.1f} M commands in {seconds:.0f} s")
+    print(f"hover error on the nominal drone: mean {error.mean():.0f} mm, worst of 64 {error.max():.0f} mm")
+    if arguments.write:
+        found = {"commands": model.num_timesteps, "seconds": seconds, "mean_mm": error.mean(), "worst_mm": error.max()}
+        versions = environment() | {"stable_baselines3": stable_baselines3.__version__}
+        write_json(arguments.write, found | {"seed": arguments.seed, "environment": versions})
 
 
 if __name__ == "__main__":

@@ -46,6 +46,7 @@ BRAX = {
     "brax-random": (RANDOM, "the same with the paper's randomisation"),
 }
 """Whose task and numbers Brax's trainer gets, and what it is."""
+SB3 = ROOT / "benchmarks" / "sb3.json"
 WHAT = {name: text for name, (*_, text) in {**VARIANTS, **BRAX}.items()}
 
 
@@ -229,7 +230,23 @@ def page(found: dict[str, list[dict]]) -> str:
         cells.append(f"{statistics.median(run['curve'][-1]['seconds'] for run in runs):.0f}")
         lines.append("| " + " | ".join(cells) + " |")
     lines += ["", "## The shipped `target`", *of_shipped("cfb train target", "-1")]
-    return "\n".join([*lines, *of_shipped("cfb train target --config target-2", "")]) + "\n"
+    return "\n".join([*lines, *of_shipped("cfb train target --config target-2", ""), *of_sb3()]) + "\n"
+
+
+def of_sb3() -> list[str]:
+    """What the example with Stable-Baselines3 came to."""
+    command, run = "python examples/train_with_sb3.py --write", json.loads(SB3.read_text())
+    facts = run["environment"]
+    return [
+        "",
+        "## Stable-Baselines3",
+        "",
+        f"`{command} {SB3.relative_to(ROOT)}`, {facts['date']}, {facts['processor']}, Python {facts['python']}, "
+        f"jax {facts['jax']}, stable_baselines3 {facts['stable_baselines3']}: on the nominal drone "
+        f"alone {run['commands'] / 1e6:.1f} M commands in {run['seconds']:.0f} s; then, from within 0.7 m, its "
+        f"mean distance to the target after the first of 6 s is {run['mean_mm']:.0f} mm, the worst of 64 flights' "
+        f"{run['worst_mm']:.0f} mm.",
+    ]
 
 
 def of_shipped(command: str, part: str) -> list[str]:
