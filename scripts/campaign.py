@@ -70,6 +70,7 @@ def carry_out(runs: list[Run], results: Path, folder: Path, judge, kept: Path | 
         rows = train(training, folder / run.name, resume=True, report=report)
         score = judge(load_policy(folder / run.name / POLICY).controller)
         if kept:
+            kept.mkdir(parents=True, exist_ok=True)
             shutil.copy(folder / run.name / POLICY, kept / f"{run.name}.npz")
         found[run.name] = {
             "seed": run.seed,

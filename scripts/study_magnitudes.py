@@ -1,6 +1,6 @@
 """How much randomisation? The paper's study, in simulation, with PPO and with back-propagation.
 
-    python scripts/study_magnitudes.py [--algorithms analytic ppo] [--seeds 3] [--judge-anew | --page-only]
+    python scripts/study_magnitudes.py [--algorithms analytic ppo ppo-long] [--seeds 3] [--judge-anew | --page-only]
 
 Hours for all of it; what is done is kept in benchmarks/magnitudes-ALGORITHM.json and data/study, and a run begun
 anew goes on. Writes docs/magnitudes.md and its figure.
@@ -16,9 +16,11 @@ from cfb_mjx.reproduce.paper import PAPER_FIRMWARE, PAPER_HOVER
 from cfb_mjx.train.judge import away
 
 MAGNITUDES = (0.0, 0.5, 1.0, 1.5)
-CONFIGS = {"analytic": "study-analytic", "ppo": "study-ppo"}
+CONFIGS = {"analytic": "study-analytic", "ppo": "study-ppo", "ppo-long": "study-ppo"}
+CHANGES = {"ppo-long": ("ppo.steps=200000000", "checkpoints=20")}
+MOST_SEEDS = {"ppo-long": 1}
 ELSEWHERE = "cfb-idsia"
-TITLES = {"analytic": "back-propagation", "ppo": "PPO"}
+TITLES = {"analytic": "back-propagation", "ppo": "PPO", "ppo-long": "PPO, as long as `target`"}
 
 
 def main() -> None:
@@ -41,8 +43,13 @@ def main() -> None:
                 continue
             # By seed, so that an unfinished study has every magnitude.
             runs = [
-                Run(f"{m:g}-{seed}", CONFIGS[algorithm], (f"randomisation.magnitude={m}",), seed)
-                for seed in range(arguments.seeds)
+                Run(
+                    f"{m:g}-{seed}",
+                    CONFIGS[algorithm],
+                    (f"randomisation.magnitude={m}", *CHANGES.get(algorithm, ())),
+                    seed,
+                )
+                for seed in range(min(arguments.seeds, MOST_SEEDS.get(algorithm, arguments.seeds)))
                 for m in MAGNITUDES
             ]
             trained = ROOT / "out" / "magnitudes" / algorithm
@@ -188,7 +195,8 @@ def page(found: dict, firmware: dict) -> str:
             "",
             f"## {TITLES[algorithm]}",
             "",
-            f"Configuration `{CONFIGS[algorithm]}`: {last['commands'] / 1e6:.0f} M commands per policy, "
+            f"Configuration `{' '.join((CONFIGS[algorithm], *CHANGES.get(algorithm, ())))}`: "
+            f"{last['commands'] / 1e6:.0f} M commands per policy, "
             f"{min(r['curve'][-1]['seconds'] for r in of.values()):.0f} to "
             f"{max(r['curve'][-1]['seconds'] for r in of.values()):.0f} s.",
             "",
