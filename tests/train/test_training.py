@@ -459,8 +459,8 @@ def test_a_training_goes_on_after_its_folder_and_its_models_have_moved(tmp_path)
 def test_earlier_trainings_are_not_overwritten_nor_mixed(tmp_path):
     train(small("ppo"), tmp_path, evaluate=False)
     before = (tmp_path / POLICY).read_bytes()
-    # Nothing is left to do, and nothing changes.
-    train(small("ppo"), tmp_path, resume=True, evaluate=False)
+    # Nothing is left to do, and nothing changes; a training is the same whatever it is called.
+    train(small("ppo", "description=as it was"), tmp_path, resume=True, evaluate=False)
     assert (tmp_path / POLICY).read_bytes() == before
     with pytest.raises(CfbError, match="holds a training already"):
         train(small("ppo"), tmp_path, evaluate=False)

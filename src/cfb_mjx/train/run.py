@@ -310,9 +310,13 @@ def _found(checkpoint: Path, output: Path, training: Training, resume: bool) -> 
 
 
 def _comparable(part: Any) -> Any:
-    """Without the name of the model's file: what it holds is compared, and folders move."""
-    named = isinstance(part, dict) and str(part.get("model", "")).endswith((".yaml", ".yml"))
-    return {key: value for key, value in part.items() if key != "model"} if named else part
+    """Without what a training does not depend on: its description, and the name of the model's file, since what that
+    holds is compared and folders move."""
+    if not isinstance(part, dict):
+        return part
+    named = str(part.get("model", "")).endswith((".yaml", ".yml"))
+    left_out = {"description", "model"} if named else {"description"}
+    return {key: value for key, value in part.items() if key not in left_out}
 
 
 def _json(value: Any) -> Any:
