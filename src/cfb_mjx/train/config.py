@@ -249,7 +249,7 @@ def _require_together(mapping: dict[str, Any], where: str) -> None:
     """Refuse a group that might mean the defaults of now or of before."""
     usual = plain(_KINDS[mapping.get("task", "target")]())
     for group, key, since in _TOGETHER[usual["task"]]:
-        given = mapping.get(group, {})
+        given = mapping.get(group) or {}
         if key in given and (absent := {k: before for k, before in since.items() if k not in given}):
             now = ", ".join(f"{k}: {told(usual[group][k])}" for k in absent)
             before = ", ".join(f"{k}: {told(value)}" for k, value in absent.items())
