@@ -242,14 +242,14 @@ def page(found: dict[str, list[dict]]) -> str:
 
 def of_sb3() -> list[str]:
     """What the example with Stable-Baselines3 came to."""
-    command, run = "python examples/train_with_sb3.py --write", json.loads(SB3.read_text())
-    facts = run["environment"]
+    run = json.loads(SB3.read_text())
     return [
         "",
         "## Stable-Baselines3",
         "",
-        f"`{command} {SB3.relative_to(ROOT)}`, {facts['date']}, {facts['processor']}, Python {facts['python']}, "
-        f"jax {facts['jax']}, stable_baselines3 {facts['stable_baselines3']}: on the nominal drone alone "
+        facts_line(f"python examples/train_with_sb3.py --write {SB3.relative_to(ROOT)}", [run]),
+        "",
+        f"stable_baselines3 {run['environment']['stable_baselines3']}, on the nominal drone alone: "
         f"{run['commands'] / 1e6:.1f} M commands in {run['seconds']:.0f} s, on a machine that did other things beside. "
         f"Then, from within 0.7 m, its mean distance to the target after the first of 6 s is {run['mean_mm']:.0f} mm, "
         f"the worst of 64 flights' {run['worst_mm']:.0f} mm.",

@@ -8,6 +8,7 @@ anew goes on. Writes docs/magnitudes.md and its figure.
 
 import json
 import math
+from dataclasses import dataclass
 from pathlib import Path
 
 from campaign import ROOT, Run, carry_out, facts_line, study_arguments
@@ -16,17 +17,30 @@ from cfb_mjx.reproduce.paper import PAPER_FIRMWARE, PAPER_HOVER
 from cfb_mjx.train.judge import away
 
 MAGNITUDES = (0.0, 0.5, 1.0, 1.5)
-CONFIGS = {"analytic": "study-analytic", "ppo": "study-ppo", "ppo-long": "study-ppo"}
-CHANGES = {"ppo-long": ("ppo.steps=200000000", "checkpoints=20")}
-MOST_SEEDS = {"ppo-long": 1}
+
+
+@dataclass(frozen=True)
+class Trained:
+    """What every magnitude is trained by."""
+
+    title: str
+    config: str
+    changes: tuple[str, ...] = ()
+    most_seeds: int | None = None
+
+
+ALGORITHMS = {
+    "analytic": Trained("back-propagation", "study-analytic"),
+    "ppo": Trained("PPO", "study-ppo"),
+    "ppo-long": Trained("PPO, as long as `target`", "study-ppo", ("ppo.steps=200000000", "checkpoints=20"), 1),
+}
 ELSEWHERE = "cfb-idsia"
-TITLES = {"analytic": "back-propagation", "ppo": "PPO", "ppo-long": "PPO, as long as `target`"}
 
 
 def main() -> None:
     """Train what is missing, judge, write."""
     arguments = study_arguments(
-        __doc__, "--algorithms", CONFIGS, judge_anew="fly the kept policies again, train nothing"
+        __doc__, "--algorithms", ALGORITHMS, judge_anew="fly the kept policies again, train nothing"
     )
     from cfb_mjx.files import write_json, write_text
 
@@ -36,28 +50,25 @@ def main() -> None:
         if arguments.judge_anew or not firmware.exists():
             write_json(firmware, {name: judged(name) for name in PAPER_FIRMWARE})
         for algorithm in arguments.chosen:
-            kept, results = ROOT / "data" / "study" / algorithm, _results(algorithm)
+            kept, results, by = ROOT / "data" / "study" / algorithm, _results(algorithm), ALGORITHMS[algorithm]
             if arguments.judge_anew:
+                if not results.exists():
+                    continue
                 found = json.loads(results.read_text())
                 write_json(results, {n: run | {"score": judged(kept / f"{n}.npz")} for n, run in found.items()})
                 continue
             # By seed, so that an unfinished study has every magnitude.
             runs = [
-                Run(
-                    f"{m:g}-{seed}",
-                    CONFIGS[algorithm],
-                    (f"randomisation.magnitude={m}", *CHANGES.get(algorithm, ())),
-                    seed,
-                )
-                for seed in range(min(arguments.seeds, MOST_SEEDS.get(algorithm, arguments.seeds)))
+                Run(f"{m:g}-{seed}", by.config, (f"randomisation.magnitude={m}", *by.changes), seed)
+                for seed in range(min(arguments.seeds, by.most_seeds or arguments.seeds))
                 for m in MAGNITUDES
             ]
             trained = ROOT / "out" / "magnitudes" / algorithm
             carry_out(runs, results, trained, judged, kept)
-    found = {a: json.loads(_results(a).read_text()) for a in CONFIGS if _results(a).exists()}
+    found = {a: json.loads(_results(a).read_text()) for a in ALGORITHMS if _results(a).exists()}
     from cfb_mjx.view.magnitudes import magnitudes_figure
 
-    runs = {TITLES[a]: {m: _of(_scores(of, m)) for m in MAGNITUDES} for a, of in found.items()}
+    runs = {ALGORITHMS[a].title: {m: _of(_scores(of, m)) for m in MAGNITUDES} for a, of in found.items()}
     magnitudes_figure(runs, PAPER_HOVER, ROOT / "docs" / "magnitudes.png")
     write_text(ROOT / "docs" / "magnitudes.md", page(found, json.loads(firmware.read_text())))
     print("docs/magnitudes.md, docs/magnitudes.png")
@@ -193,9 +204,9 @@ def page(found: dict, firmware: dict) -> str:
         last = any_run["curve"][-1]
         lines += [
             "",
-            f"## {TITLES[algorithm]}",
+            f"## {ALGORITHMS[algorithm].title}",
             "",
-            f"Configuration `{' '.join((CONFIGS[algorithm], *CHANGES.get(algorithm, ())))}`: "
+            f"Configuration `{' '.join((ALGORITHMS[algorithm].config, *ALGORITHMS[algorithm].changes))}`: "
             f"{last['commands'] / 1e6:.0f} M commands per policy, "
             f"{min(r['curve'][-1]['seconds'] for r in of.values()):.0f} to "
             f"{max(r['curve'][-1]['seconds'] for r in of.values()):.0f} s.",
@@ -236,7 +247,7 @@ def page(found: dict, firmware: dict) -> str:
         plants = list(next(iter(of.values()))["score"]["plants"])
         lines += [
             "",
-            f"## {TITLES[algorithm]}, drone by drone",
+            f"## {ALGORITHMS[algorithm].title}, drone by drone",
             "",
             "Hover error in mm, mean of the seeds with the least and the greatest.",
             "",

@@ -103,6 +103,12 @@ def require_seed(seed: int, where: str) -> None:
         raise CfbError(f"{where} {seed} must be from 0 to {LARGEST_SEED}.")
 
 
+def with_former(written: dict[str, Any], key: str, former: dict[str, Any]) -> dict[str, Any]:
+    """A group that may have been written out, ``key`` among it, before it could hold the keys of ``former``: what it
+    meant then is filled in."""
+    return former | written if key in written else written
+
+
 def is_named(value: Any) -> bool:
     """Whether this is a mapping with a ``name``, all its keys text: an effect, for instance."""
     return isinstance(value, dict) and all(isinstance(k, str) for k in value) and isinstance(value.get("name"), str)

@@ -40,6 +40,13 @@ def test_a_reward_from_before_there_was_near_is_the_papers():
     assert config_from({"task": "target", "reward": {"torque": 0.1}}, "a new one").reward.near == 3.0
 
 
+def test_a_change_of_a_file_is_asked_for_what_came_later_too(tmp_path):
+    (tmp_path / "mine.yaml").write_text("format: cfb_mjx training 1\nreward: {torque: 0.2}")
+    with pytest.raises(CfbError, match=r"mine\.yaml with reward\.position=5: reward gives position, but not near"):
+        load_config(tmp_path / "mine.yaml", ("reward.position=5",))
+    assert load_config(tmp_path / "mine.yaml", ("reward.position=5", "reward.near=1")).reward.near == 1.0
+
+
 def test_the_papers_reward_is_the_same_in_its_configuration_and_in_python():
     assert load_config("target-paper").reward == PAPER_REWARD
 

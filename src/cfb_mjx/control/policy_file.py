@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.control.neural import ACTIVATIONS, Network, NeuralController
-from cfb_mjx.envs.observation import Layout, as_written
+from cfb_mjx.documents import with_former
+from cfb_mjx.envs.observation import BEFORE_BENDS, Layout
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, replacing
 
@@ -93,7 +94,8 @@ def load_policy(path: str | Path) -> PolicyFile:
             if about["format"] != FORMAT:
                 raise CfbError(f"{path}: is a policy of another format ({about['format']!r}, not {FORMAT!r}).")
             shown, activation = about["observation"], about["activation"]
-            layout = Layout(**as_written(shown) | {"setpoint_scales": tuple(shown.get("setpoint_scales", ()))})
+            former = with_former(shown, "position_scale_m", BEFORE_BENDS)
+            layout = Layout(**former | {"setpoint_scales": tuple(shown.get("setpoint_scales", ()))})
             weights = tuple(archive[f"weight_{i}"] for i in range(about["layers"]))
             biases = tuple(archive[f"bias_{i}"] for i in range(about["layers"]))
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):

@@ -12,7 +12,6 @@ row by row, where ``vmap`` would put them together drone by drone, which on a CP
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -70,13 +69,8 @@ class Layout:
 
 
 BEFORE_BENDS = {"position_bend_m": 0.0, "velocity_bend_mps": 0.0, "body_position": False, "body_velocity": False}
-"""What a layout was before it could be otherwise: straight, and in the world's axes."""
-
-
-def as_written(written: dict[str, Any]) -> dict[str, Any]:
-    """A layout as a policy or a training wrote it. One that says how positions are scaled and none of `BEFORE_BENDS` is
-    older than these."""
-    return BEFORE_BENDS | written if "position_scale_m" in written else written
+"""What a layout was before it could be otherwise: straight, and in the world's axes. One that was written out then
+gives ``position_scale_m`` and none of these."""
 
 
 class Estimate(eqx.Module):

@@ -7,7 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from cfb_mjx.documents import load_named, parse_yaml, require_seed, told
+from cfb_mjx.documents import load_named, parse_yaml, require_seed, told, with_former
 from cfb_mjx.envs import FlipReward, FlipStarts, FlipTask, Layout, Noise, Setpoints, Starts, TargetReward, TargetTask
 from cfb_mjx.envs.flip import FLIP_LAYOUT
 from cfb_mjx.envs.observation import BEFORE_BENDS
@@ -220,11 +220,11 @@ def load_config(name_or_path: str | Path = "target", changes: tuple[str, ...] = 
     """
     path, document = load_named(name_or_path, "training", FORMAT)
     # Checked before the changes go in, so that a fault of the file is not blamed on the command line.
-    config_from(document, str(path))
-    _require_together(document, str(path))
-    for change in changes:
-        _change(document, change)
-    config = config_from(document, str(path) if not changes else f"{path} with {', '.join(changes)}")
+    config = _unambiguous(document, str(path))
+    if changes:
+        for change in changes:
+            _change(document, change)
+        config = _unambiguous(document, f"{path} with {', '.join(changes)}")
     _require_sense(config, str(path))
     return config
 
@@ -239,23 +239,25 @@ def config_from(mapping: dict[str, Any], where: str) -> TrainingConfig:
     if not isinstance(task, str) or task not in _KINDS:
         raise CfbError(f"{where}: task must be one of {', '.join(_KINDS)}, found {told(task)}.")
     for group, key, since in _TOGETHER[task]:
-        if isinstance(given := mapping.get(group), dict) and key in given:
-            # A training that was written out before these existed.
-            mapping = mapping | {group: since | given}
+        if isinstance(given := mapping.get(group), dict):
+            # It may have been written out before these existed.
+            mapping = mapping | {group: with_former(given, key, since)}
     return build(_KINDS[task], mapping, where)
 
 
-def _require_together(mapping: dict[str, Any], where: str) -> None:
-    """Refuse a group that might mean the defaults of now or of before."""
-    usual = plain(_KINDS[mapping.get("task", "target")]())
-    for group, key, since in _TOGETHER[usual["task"]]:
-        given = mapping.get(group) or {}
+def _unambiguous(mapping: dict[str, Any], where: str) -> TrainingConfig:
+    """As `config_from`, but a group that might mean the defaults of now or of before is refused."""
+    config = config_from(mapping, where)
+    usual = plain(type(config)())
+    for group, key, since in _TOGETHER[config.task]:
+        given = mapping.get(group, {})
         if key in given and (absent := {k: before for k, before in since.items() if k not in given}):
             now = ", ".join(f"{k}: {told(usual[group][k])}" for k in absent)
             before = ", ".join(f"{k}: {told(value)}" for k, value in absent.items())
             raise CfbError(
                 f"{where}: {group} gives {key}, but not {now} (as by default) or {before} (as before they existed)."
             )
+    return config
 
 
 def with_changes(config: TrainingConfig, **values: Any) -> TrainingConfig:
