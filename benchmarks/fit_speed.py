@@ -27,9 +27,9 @@ sys.path[:0] = [str(ROOT / "tests" / "sysid"), str(ROOT / "benchmarks")]
 from plant import SIGMA, THRUST, Plant, cubic, derivative, fly  # noqa: E402
 from same_residual import by_scipy, of_innovations, of_shooting, timed  # noqa: E402
 
-from cfb_mjx.cli.runtime import environment  # noqa: E402
 from cfb_mjx.files import write_text  # noqa: E402
 from cfb_mjx.parameters import load_model_file  # noqa: E402
+from cfb_mjx.runtime import environment  # noqa: E402
 from cfb_mjx.sysid.identification.fitting import fit  # noqa: E402
 from cfb_mjx.sysid.identification.shooting import shoot  # noqa: E402
 

@@ -17,10 +17,10 @@ import stable_baselines3
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor, VecNormalize
 
-from cfb_mjx.cli.runtime import environment
 from cfb_mjx.envs import Starts, TargetReward, TargetTask
 from cfb_mjx.envs.gym import TargetVectorEnv
 from cfb_mjx.files import write_json
+from cfb_mjx.runtime import environment
 
 
 class Drones(VecEnv):

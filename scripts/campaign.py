@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import configure_jax, environment, say
+from cfb_mjx.runtime import configure_jax, environment, say
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -25,13 +25,13 @@ from real_flights_page import GROUPS, figure, page, summary
 from scipy.signal import butter, sosfiltfilt
 
 from cfb_mjx.cli.refining import by_predictions
-from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import to_body, to_world
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import ModelFile, load_model_file, save_model_file
+from cfb_mjx.runtime import configure_jax, environment
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.flight import usual_delay
 from cfb_mjx.sysid.flow_estimator import fit_flow_estimator

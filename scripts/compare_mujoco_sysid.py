@@ -36,9 +36,9 @@ import mujoco_fit  # noqa: E402
 import open_loop  # noqa: E402
 from same_residual import by_scipy, of_shooting, timed  # noqa: E402
 
-from cfb_mjx.cli.runtime import environment  # noqa: E402
 from cfb_mjx.files import write_text  # noqa: E402
 from cfb_mjx.parameters import load_model_file  # noqa: E402
+from cfb_mjx.runtime import environment  # noqa: E402
 from cfb_mjx.sysid.identification.fitting import fit  # noqa: E402
 from cfb_mjx.sysid.identification.shooting import shoot  # noqa: E402
 

@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.files import write_json, write_text
+from cfb_mjx.runtime import configure_jax, environment
 
 ROOT = Path(__file__).resolve().parents[1]
 GENERATOR = ROOT.parent / "shared" / "cases" / "fit" / "make_fit_logs.py"

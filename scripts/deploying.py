@@ -12,9 +12,9 @@ from pathlib import Path
 from campaign import ROOT, facts_line
 
 from cfb_mjx.cli.exporting import run_export
-from cfb_mjx.cli.runtime import environment, set_up_xla
 from cfb_mjx.deploy.export import RESULTS
 from cfb_mjx.files import write_json, write_text
+from cfb_mjx.runtime import environment, set_up_xla
 
 POLICIES = ("target", "target-analytic", "target-adaptive", "flip", "double-flip", "triple-flip", "double-flip-ppo")
 NUMBERS, PAGE = ROOT / "benchmarks" / "deploying.json", ROOT / "docs" / "deploying.md"

@@ -13,9 +13,9 @@ import numpy as np
 from marked_block import write_block
 from scipy.linalg import polar
 
-from cfb_mjx.cli.runtime import environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog, motion_capture, read_log
+from cfb_mjx.runtime import environment
 
 ROOT = Path(__file__).resolve().parents[1]
 SPAN, TURNING = 0.4, 0.1

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from campaign import ROOT, facts_line, moved
 
-from cfb_mjx.cli.runtime import configure_jax, environment, say
+from cfb_mjx.runtime import configure_jax, environment, say
 
 RANDOM, NOMINAL, SEED = 4096, 64, 11
 PAPER_EXTENT_M = 1.8

@@ -19,8 +19,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.files import write_json, write_text
+from cfb_mjx.runtime import configure_jax, environment
 
 ROOT = Path(__file__).resolve().parents[1]
 DRONES = (1024, 8192, 65536, 524288, 2097152)
@@ -73,7 +73,7 @@ def machine(found: list, keep) -> None:
 
 def open_loop(found: list, keep) -> None:
     """Rollouts with every tuning of the kernel, and without it."""
-    from cfb_mjx.cli import workloads
+    from cfb_mjx.bench import workloads
     from cfb_mjx.model.acceleration import using
     from cfb_mjx.model.kernel import Tuning
 
@@ -89,14 +89,14 @@ def open_loop(found: list, keep) -> None:
 
 def policy(found: list, keep) -> None:
     """The shipped network in the loop."""
-    from cfb_mjx.cli import workloads
+    from cfb_mjx.bench import workloads
 
     over_batches(workloads.rollout_policy, (8192, 65536, 524288), found, keep)
 
 
 def gradient(found: list, keep) -> None:
     """By all parameters, by ten, and the loss alone."""
-    from cfb_mjx.cli import workloads
+    from cfb_mjx.bench import workloads
 
     for make in (workloads.rollout_gradient, workloads.rollout_ten, workloads.rollout_hundred):
         over_batches(make, (8192, 65536, 524288), found, keep)
@@ -104,7 +104,7 @@ def gradient(found: list, keep) -> None:
 
 def mjx(found: list, keep) -> None:
     """The MJX body, with and without floor, and plain `mjx.step`."""
-    from cfb_mjx.cli import workloads
+    from cfb_mjx.bench import workloads
 
     workloads.MJX_WORK = 2_000_000
     for make in (
@@ -117,7 +117,7 @@ def mjx(found: list, keep) -> None:
 
 def ppo(found: list, keep) -> None:
     """Updates of PPO."""
-    from cfb_mjx.cli import workloads
+    from cfb_mjx.bench import workloads
 
     over_batches(workloads.ppo_update, (512, 8192), found, keep)
 

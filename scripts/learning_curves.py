@@ -14,7 +14,7 @@ import time
 
 from campaign import ROOT, Run, carry_out, facts_line, report, study_arguments
 
-from cfb_mjx.cli.runtime import environment, say
+from cfb_mjx.runtime import environment, say
 
 NOMINAL = ("randomisation.magnitude=0", "randomisation.graded=0.0")
 PPO = (*NOMINAL, "ppo.steps=16000000", "checkpoints=16")

@@ -16,8 +16,8 @@ from pathlib import Path
 
 from campaign import ROOT, facts_line
 
-from cfb_mjx.cli.runtime import environment
 from cfb_mjx.files import write_json, write_text
+from cfb_mjx.runtime import environment
 
 NUMBERS, PAGE = ROOT / "benchmarks" / "newcomers-path.json", ROOT / "docs" / "newcomers-path.md"
 STEPS = (

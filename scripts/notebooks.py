@@ -45,7 +45,7 @@ def execute(path: Path) -> None:
 
 if __name__ == "__main__":
     # Before the kernel starts: it inherits them.
-    from cfb_mjx.cli.runtime import set_up_xla
+    from cfb_mjx.runtime import set_up_xla
 
     set_up_xla()
     for name in sys.argv[1:] or sorted((ROOT / "docs" / "notebooks").glob("*.ipynb")):

@@ -19,13 +19,13 @@ import matplotlib
 import numpy as np
 
 from cfb_mjx.cli.evaluating import changed_model
-from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.files import write_text
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.model import Quadrotor, thrust
 from cfb_mjx.model.effects import KNOWN
 from cfb_mjx.model.effects.fields import HOVER_SPEED
 from cfb_mjx.parameters import Entry, ModelFile, load_model_file, save_model_file
+from cfb_mjx.runtime import configure_jax, environment
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.fleet import Fleet, OfDrone, fleet
 from cfb_mjx.sysid.observer import Observer

@@ -65,7 +65,7 @@ def written(text: str, printed: list[str]) -> str:
 
 def main(pages: list[Path]) -> None:
     """Bring the outputs of pages up to date."""
-    from cfb_mjx.cli.runtime import configure_jax
+    from cfb_mjx.runtime import configure_jax
 
     configure_jax(x64=True)
     for page in pages:

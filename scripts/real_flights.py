@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.files import write_text
 from cfb_mjx.logs import read_log
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file
+from cfb_mjx.runtime import configure_jax, environment
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.identification.fitting import fit
 

@@ -5,8 +5,8 @@ from statistics import mean, stdev
 
 from real_flights_benchmark import benchmark_section
 
-from cfb_mjx.cli.runtime import environment
 from cfb_mjx.parameters import ModelFile
+from cfb_mjx.runtime import environment
 from cfb_mjx.sysid.flow_estimator import SPAN
 
 GROUPS = {"gentle": ("random1", "random2", "multisine"), "square": ("square",)}

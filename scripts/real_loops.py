@@ -15,8 +15,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import environment
 from cfb_mjx.files import write_text
+from cfb_mjx.runtime import environment
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "real-loops.md"

@@ -10,7 +10,7 @@ import shutil
 from pathlib import Path
 
 from cfb_mjx.cli.reproducing import ALL, run_reproduce
-from cfb_mjx.cli.runtime import set_up_xla
+from cfb_mjx.runtime import set_up_xla
 
 ROOT = Path(__file__).resolve().parents[1]
 

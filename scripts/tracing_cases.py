@@ -160,8 +160,8 @@ def mild_strengths(seed: int) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    from cfb_mjx.cli.runtime import configure_jax
     from cfb_mjx.files import write_text
+    from cfb_mjx.runtime import configure_jax
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=SEED)

@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 from tracing_cases import LEAST, MOST, SEED, achievable, alone, cases
 
-from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.files import write_text
 from cfb_mjx.labelled_plants import Case, fly_campaigns, label
 from cfb_mjx.parameters import load_model_file
+from cfb_mjx.runtime import configure_jax, environment
 from cfb_mjx.sysid.tracing.fits import ERRORS
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,7 +9,7 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import configure_jax, environment
+from cfb_mjx.runtime import configure_jax, environment
 
 
 def main() -> None:

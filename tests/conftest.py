@@ -8,8 +8,8 @@ from pathlib import Path
 from pkgutil import iter_modules
 
 import cfb_mjx
-from cfb_mjx.cli.runtime import set_up_xla
 from cfb_mjx.plugins import plugged
+from cfb_mjx.runtime import set_up_xla
 
 # As the commands do: large programs compile in half the time. Not for derivatives of MJX (`make test-long`): there
 # jaxlib aborts as soon as the option is named, whatever its value.

@@ -2,7 +2,7 @@
 
 import sys
 
-from cfb_mjx.cli.runtime import configure_jax
+from cfb_mjx.runtime import configure_jax
 
 DEVICES, OUTPUT, *ASKED = int(sys.argv[1]), *sys.argv[2:]
 configure_jax(x64=True, devices=DEVICES)

@@ -111,7 +111,7 @@ def test_changes_may_be_given_together_or_one_by_one(monkeypatch, tmp_path):
 
 
 def test_the_flag_that_breaks_derivatives_of_the_mjx_body_is_taken_back(monkeypatch):
-    from cfb_mjx.cli import runtime
+    from cfb_mjx import runtime
 
     monkeypatch.setenv("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
     monkeypatch.setattr(runtime.metadata, "version", lambda name: {"jaxlib": "0.10.1"}[name])
@@ -124,7 +124,7 @@ def test_the_flag_that_breaks_derivatives_of_the_mjx_body_is_taken_back(monkeypa
 @pytest.mark.parametrize("version", ["0.11.0", "0.12.0.1", "1.0.0"])
 def test_an_option_that_slows_newer_jaxlibs_down_is_not_set_for_them(monkeypatch, version):
     """With jaxlib 0.12 a rollout that keeps its states ran 150 times slower with it."""
-    from cfb_mjx.cli import runtime
+    from cfb_mjx import runtime
 
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     monkeypatch.setattr(runtime.metadata, "version", lambda name: {"jaxlib": version}[name])
@@ -134,7 +134,7 @@ def test_an_option_that_slows_newer_jaxlibs_down_is_not_set_for_them(monkeypatch
 
 def test_several_devices_without_any_flags_of_xla():
     code = (
-        "import os; os.environ.pop('XLA_FLAGS', None); import cfb_mjx.cli.runtime as r; "
+        "import os; os.environ.pop('XLA_FLAGS', None); import cfb_mjx.runtime as r; "
         "r._option_helps = lambda: False; r.configure_jax(x64=False, devices=2); "
         "import jax; print(jax.device_count())"
     )

@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cfb_mjx import cli
-from cfb_mjx.cli.runtime import Progress, say
-from cfb_mjx.cli.terminal import escaped, shown
+from cfb_mjx.runtime import Progress, say
+from cfb_mjx.terminal import escaped, shown
 
 EVIL = "\x1b]0;owned\x07\x1b[2J\r\x9b1A\u202e"
 BYTES = os.fsdecode(b"caf\xe9")  # no UTF-8: a lone surrogate, which cannot be printed

@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from cfb_mjx import __version__
-from cfb_mjx.cli.runtime import set_up_xla
-from cfb_mjx.cli.terminal import shown
 from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.interrupts import heard
+from cfb_mjx.runtime import set_up_xla
+from cfb_mjx.terminal import shown
 
 SUMMARY = {
     "import": "convert a flight log to MCAP",

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from cfb_mjx.cli.runtime import environment
-from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, scratch, together, write_json, write_text
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.alignment import nominal_thrust
 from cfb_mjx.logs.gate import Verdict
 from cfb_mjx.logs.reading import read_judged
+from cfb_mjx.runtime import environment
+from cfb_mjx.terminal import print_paths
 
 _LIFTS, _ENOUGH = 4.0, 50  # m/s^2, rows
 _FAST, _SLOW = 240.0, 95.0  # rows per s: of 250 Hz and 100 Hz, with jitter

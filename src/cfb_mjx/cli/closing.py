@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from cfb_mjx.cli.fitted_model import provenance, require_apart
-from cfb_mjx.cli.runtime import configure_jax, environment, say
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, require_no_file, together, write_json
 from cfb_mjx.logs import FlightLog, read_log, require_own_names
+from cfb_mjx.runtime import configure_jax, environment, say
 
 LEAST_SECONDS = 10.0
 """Of flight to fit: below this nothing could be told from chance."""

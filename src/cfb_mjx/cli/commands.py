@@ -16,8 +16,8 @@ from cfb_mjx.cli.learning_commands import fly, train
 from cfb_mjx.cli.recording_commands import check, import_log
 from cfb_mjx.cli.showing_commands import demo, demo_loop, reproduce, view
 from cfb_mjx.cli.sweep_commands import sweep
-from cfb_mjx.cli.terminal import escaped, shown
 from cfb_mjx.errors import CfbError
+from cfb_mjx.terminal import escaped, shown
 
 
 def evaluate(
@@ -94,14 +94,14 @@ def bench(
         quick: fewer rows and repetitions, for a first look.
         roofline: measure also what this machine can do at most, and how much of it the hot paths use.
     """
-    from cfb_mjx.cli.benchmark import run_bench
+    from cfb_mjx.bench.benchmark import run_bench
 
     run_bench(list(drones), json, markdown, peer_python, quick, roofline)
 
 
 def version() -> None:
     """Print the versions of the library and of what it computes with."""
-    from cfb_mjx.cli.runtime import environment
+    from cfb_mjx.runtime import environment
 
     for name, value in environment().items():
         print(f"{name}: {value}")

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from cfb_mjx.cli.runtime import environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped, together, write_json, write_text
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.parameters import ModelFile, load_model_file, load_randomisation, sample_parameters
+from cfb_mjx.runtime import environment
 from cfb_mjx.view import Section, html_page, prediction_figure, spread_figure
 from cfb_mjx.view.spread import tilt_deg
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cfb_mjx.cli.importing import describe_alignment
-from cfb_mjx.cli.runtime import Progress, configure_jax, environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json
 from cfb_mjx.logs import FlightLog, estimate_command_shift, read_log
+from cfb_mjx.runtime import Progress, configure_jax, environment
 
 if TYPE_CHECKING:
     from cfb_mjx.parameters import ModelFile

@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import configure_jax, environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_no_file, write_json
+from cfb_mjx.runtime import configure_jax, environment
 
 NEAR_M = 1e-3
 """How near each other the C and JAX have to hover."""

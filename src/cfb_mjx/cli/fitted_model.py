@@ -8,8 +8,8 @@ from hashlib import sha256
 from pathlib import Path
 
 from cfb_mjx import __version__
-from cfb_mjx.cli.runtime import environment
 from cfb_mjx.errors import CfbError
+from cfb_mjx.runtime import environment
 
 
 def require_model_path(output: Path) -> None:

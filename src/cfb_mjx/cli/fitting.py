@@ -9,11 +9,11 @@ from pathlib import Path
 
 from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.cli.fitted_model import provenance, require_model_path
-from cfb_mjx.cli.runtime import Progress, configure_jax, environment
-from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, together, write_json
 from cfb_mjx.logs import FlightLog, read_log
+from cfb_mjx.runtime import Progress, configure_jax, environment
+from cfb_mjx.terminal import print_paths
 
 HELD_OUT_SHARE = 0.25
 """Without --held-out, this last share of every log is kept from the fit and judged on."""

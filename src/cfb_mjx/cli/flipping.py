@@ -8,7 +8,6 @@ from pathlib import Path
 import jax
 
 from cfb_mjx.cli.flying import Turn, asks_for_setpoints
-from cfb_mjx.cli.runtime import Progress
 from cfb_mjx.control.manoeuvre import Knobs, Manoeuvre
 from cfb_mjx.control.manoeuvre_file import ManoeuvreFile, load_manoeuvre, save_manoeuvre
 from cfb_mjx.control.neural import NeuralController
@@ -16,6 +15,7 @@ from cfb_mjx.control.pilot import Pilot, find_pilot
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.runtime import Progress
 from cfb_mjx.train.flip_search import Goal, bounds, search
 from cfb_mjx.train.flips import FLIPS
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from cfb_mjx.cli.runtime import configure_jax, environment
-from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.documents import require_seed
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, together, write_json
+from cfb_mjx.runtime import configure_jax, environment
+from cfb_mjx.terminal import print_paths
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 DEFAULT_TASK = "hover"

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from cfb_mjx.cli.runtime import Progress, configure_jax, environment, say
 from cfb_mjx.files import require_no_file, together, write_json, write_text
+from cfb_mjx.runtime import Progress, configure_jax, environment, say
 
 RESULTS, PAGE, FIGURE = "loop.json", "index.html", "loop.png"
 DEFAULT_EFFECT = "payload"

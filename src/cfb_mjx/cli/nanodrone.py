@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import Progress, configure_jax, environment
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json
 from cfb_mjx.logs import read_log
 from cfb_mjx.logs.idsia import read_as_published
+from cfb_mjx.runtime import Progress, configure_jax, environment
 
 DECLARED = "cfb-guards"
 PLANT = "cfb-idsia"

@@ -10,11 +10,11 @@ import numpy as np
 
 from cfb_mjx.cli.evaluating import changed_model, print_table
 from cfb_mjx.cli.fitted_model import provenance, require_apart, require_model_path
-from cfb_mjx.cli.runtime import configure_jax, environment, say
-from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, together, write_json
 from cfb_mjx.logs import FlightLog, read_log, require_own_names
+from cfb_mjx.runtime import configure_jax, environment, say
+from cfb_mjx.terminal import print_paths
 
 if TYPE_CHECKING:
     from cfb_mjx.model.effects import Effect

@@ -6,9 +6,9 @@ import json
 import time
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import configure_jax, environment, say
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import code_identity, output_folder, together, write_json, write_text
+from cfb_mjx.runtime import configure_jax, environment, say
 
 _CHECKOUT = Path(__file__).resolve().parents[3]
 ALL = "all"

@@ -12,8 +12,6 @@ import numpy as np
 
 from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.cli.fitted_model import provenance, require_model_path
-from cfb_mjx.cli.runtime import Progress, configure_jax, environment
-from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, require_folder, together, write_json
 from cfb_mjx.logs import FlightLog, read_log
@@ -22,6 +20,8 @@ from cfb_mjx.logs.bench_points import SteadyPoints, ThrustPoints, joined
 from cfb_mjx.logs.bench_tables import MapTable
 from cfb_mjx.logs.flown import flown_part
 from cfb_mjx.logs.tabular import read_table
+from cfb_mjx.runtime import Progress, configure_jax, environment
+from cfb_mjx.terminal import print_paths
 
 if TYPE_CHECKING:
     from cfb_mjx.parameters import ModelFile

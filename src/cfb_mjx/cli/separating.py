@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cfb_mjx.cli.evaluating import changed_model
-from cfb_mjx.cli.runtime import Progress, configure_jax, environment
-from cfb_mjx.cli.terminal import print_paths
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, require_folder, require_no_file, together, write_json, write_text
+from cfb_mjx.runtime import Progress, configure_jax, environment
+from cfb_mjx.terminal import print_paths
 
 if TYPE_CHECKING:
     from cfb_mjx.sysid.excitation.separation import Told

@@ -18,7 +18,7 @@ def demo(output: Output = Path("out/demo"), real: Path | None = None) -> None:
         real: folder with real flights in the IDSIA layout (validation/*.parquet).
     """
     from cfb_mjx.cli.demo import run_demo
-    from cfb_mjx.cli.runtime import configure_jax
+    from cfb_mjx.runtime import configure_jax
 
     configure_jax(x64=True)
     run_demo(output, real)

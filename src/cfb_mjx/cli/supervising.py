@@ -13,7 +13,7 @@ import sys
 import threading
 from collections.abc import Callable
 
-from cfb_mjx.cli.terminal import Escaped
+from cfb_mjx.terminal import Escaped
 
 KEPT_BYTES = 1 << 16
 _FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

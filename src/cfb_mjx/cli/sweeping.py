@@ -13,10 +13,10 @@ from pathlib import Path
 import tyro
 
 from cfb_mjx import plugins
-from cfb_mjx.cli.runtime import Progress, say
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, require_no_file
 from cfb_mjx.interrupts import ended_by_sigterm
+from cfb_mjx.runtime import Progress, say
 from cfb_mjx.sweep import Folder, Summary, Sweep, Task, drive, load_sweep, open_folder, tasks_of
 from cfb_mjx.sweep.drive import Ended
 from cfb_mjx.sweep.folder import require_own, require_same

@@ -9,10 +9,10 @@ from math import isfinite
 from pathlib import Path
 
 from cfb_mjx.cli.hosts import Hosts, joined
-from cfb_mjx.cli.runtime import Progress, configure_jax, differentiate_mjx, environment, say
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_no_file, together, write_json
 from cfb_mjx.interrupts import ended_by_sigterm
+from cfb_mjx.runtime import Progress, configure_jax, differentiate_mjx, environment, say
 
 NEWEST, EVENTS = "training.json", "events"
 _JUDGED = (

@@ -5,10 +5,10 @@ from __future__ import annotations
 import tempfile
 from pathlib import Path
 
-from cfb_mjx.cli.runtime import Progress, configure_jax
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder
 from cfb_mjx.logs import read_log
+from cfb_mjx.runtime import Progress, configure_jax
 
 
 def run_view(

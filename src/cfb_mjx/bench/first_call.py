@@ -20,7 +20,7 @@ def first_call() -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         for cache in ("empty", "filled"):
             done = subprocess.run(
-                [sys.executable, "-m", "cfb_mjx.cli.first_call", folder], capture_output=True, text=True, check=True
+                [sys.executable, "-m", "cfb_mjx.bench.first_call", folder], capture_output=True, text=True, check=True
             )
             import_s, call_s = map(float, done.stdout.split())
             rows.append({"cache": cache, "import_s": import_s, "call_s": call_s})
@@ -32,7 +32,7 @@ def _measure(cache: str) -> None:
     import os
 
     os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
-    from cfb_mjx.cli.runtime import configure_jax
+    from cfb_mjx.runtime import configure_jax
 
     configure_jax(x64=False)
     import jax

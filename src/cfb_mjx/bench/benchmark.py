@@ -12,15 +12,15 @@ from pathlib import Path
 
 import jax
 
-from cfb_mjx.cli import benchmark_page, workloads
-from cfb_mjx.cli.first_call import first_call
-from cfb_mjx.cli.runtime import configure_jax, environment
-from cfb_mjx.cli.scaling import scaling
-from cfb_mjx.cli.timed_process import TimedProcess
+from cfb_mjx.bench import page, workloads
+from cfb_mjx.bench.first_call import first_call
+from cfb_mjx.bench.scaling import scaling
+from cfb_mjx.bench.timed_process import TimedProcess
 from cfb_mjx.devices import Devices, cores
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json, write_text
 from cfb_mjx.model.acceleration import kernel_is_chosen
+from cfb_mjx.runtime import configure_jax, environment
 
 TURN_S = 0.03
 """Runs shorter than this are repeated for as long within a turn: a single one of microseconds says little."""
@@ -110,17 +110,17 @@ def run_bench(
     result = {"rows": rows, "environment": environment()}
     result |= {"first_call": first_call()} | ({} if quick else {"scaling": scaling()})
     if roofline:
-        from cfb_mjx.cli.roofline import roofline as measure
-        from cfb_mjx.cli.roofline import section
+        from cfb_mjx.bench.roofline import roofline as measure
+        from cfb_mjx.bench.roofline import section
 
         result["roofline"] = measure()
         print(section(result["roofline"]))
-    for line in benchmark_page.ratios(result):
+    for line in page.ratios(result):
         print(line)
     if json is not None:
         write_json(json, result)
     if markdown is not None:
-        write_text(markdown, benchmark_page.page(result, os.environ.get("XLA_FLAGS", "")))
+        write_text(markdown, page.page(result, os.environ.get("XLA_FLAGS", "")))
 
 
 def _open_loop(count: int, several: Devices | None, python: Path | None) -> list:
@@ -183,7 +183,7 @@ def _row(item: workloads.Workload | Peer, drones: int, seconds: float) -> dict:
     else:
         row["peak_mb"] = item.peak_mb
     memory = f"{row['peak_mb']:.1f}" if "peak_mb" in row else ""
-    name = benchmark_page.body(row)
+    name = page.body(row)
     print(
         f"{row['what']:<20}{name:<18}{drones:>7}{row['devices']:>8}{row['steps_per_s']:>12.3g}"
         f"{row['compile_s']:>11.2f}{memory:>11}",

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from cfb_mjx.cli.timed_process import TimedProcess
+from cfb_mjx.bench.timed_process import TimedProcess
 
 DRONES = {"rollout": 8192, "rollout_policy": 8192, "ppo": 512}
 """What is measured, and with how many drones."""
@@ -54,7 +54,7 @@ class _Runner(TimedProcess):
 
     def __init__(self, what: str, drones: int, cores: list[int]):
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "cfb_mjx.cli.scaling", what, str(drones), ",".join(map(str, cores))],
+            [sys.executable, "-m", "cfb_mjx.bench.scaling", what, str(drones), ",".join(map(str, cores))],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -67,7 +67,7 @@ class _Runner(TimedProcess):
 
 def _serve(what: str, drones: int, cores: list[int]) -> None:
     os.sched_setaffinity(0, cores)
-    from cfb_mjx.cli.runtime import configure_jax
+    from cfb_mjx.runtime import configure_jax
 
     configure_jax(x64=False, devices=len(cores))
     from cfb_mjx.devices import Devices
@@ -85,7 +85,7 @@ def _serve(what: str, drones: int, cores: list[int]) -> None:
 def _rollout(what: str, drones: int, over) -> tuple[int, Callable[[], None]]:
     import jax
 
-    from cfb_mjx.cli import workloads
+    from cfb_mjx.bench import workloads
 
     workload = getattr(workloads, what)(drones)
     function, (model, *batch) = workload.trace

@@ -1,10 +1,10 @@
-"""What `cfb_mjx.cli.scaling` measures: one core and two, in processes bound to them."""
+"""What `cfb_mjx.bench.scaling` measures: one core and two, in processes bound to them."""
 
 import os
 
 import pytest
 
-from cfb_mjx.cli.scaling import scaling
+from cfb_mjx.bench.scaling import scaling
 
 SEVERAL = hasattr(os, "sched_getaffinity") and len(os.sched_getaffinity(0)) > 1
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 
-from cfb_mjx.cli import workloads
+from cfb_mjx.bench import workloads
 
 
 def body(row: dict) -> str:
@@ -78,7 +78,7 @@ def page(result: dict, flags: str) -> str:
             f"| {row['what']} | {body(row)} | {row['drones']} | {row['devices']} | {row['steps_per_s']:.3g} "
             f"| {row['compile_s']:.2f} | {memory} |"
         )
-    from cfb_mjx.cli.roofline import section
+    from cfb_mjx.bench.roofline import section
 
     gpu = "" if jax.default_backend() != "cpu" else "On a GPU: [performance-gpu.md](performance-gpu.md).\n"
     comparison = "\n".join(f"- {line}" for line in ratios(result))

@@ -10,8 +10,8 @@ from importlib import metadata
 from pathlib import Path
 
 from cfb_mjx import __version__
-from cfb_mjx.cli.terminal import shown
 from cfb_mjx.interrupts import held_back
+from cfb_mjx.terminal import shown
 
 XLA_CPU_FLAGS = "--xla_backend_extra_options=xla_cpu_use_multi_output_fusion=true"
 """On CPU a time step then becomes a few kernels that share what they compute, instead of some thirty that repeat it:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from cfb_mjx.cli import workloads
-from cfb_mjx.cli.machine import Peaks, peaks
-from cfb_mjx.cli.operations import operations
+from cfb_mjx.bench import workloads
+from cfb_mjx.bench.machine import Peaks, peaks
+from cfb_mjx.bench.operations import operations
 
 REPETITIONS = 5
 HEAD = (
