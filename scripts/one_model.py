@@ -18,7 +18,6 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.files import write_text
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.model import Quadrotor, thrust
@@ -338,7 +337,7 @@ def main() -> None:
         folder, model, mass = rest.split(",")
         preset = declared.get(model, model)
         declared[name] = preset
-        own = changed_model(preset, [f"mass={mass}"])
+        own = load_model_file(preset, [f"mass={mass}"])
         drones.append(Drone(name, Path(folder), own, load_model_file(options.loops / name / "model.yaml")))
     of_type, common = type_of(drones, "cfb-fleet")
     save_model_file(of_type, PRESET)

@@ -18,7 +18,6 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.envs.episode import reset
 from cfb_mjx.errors import CfbError, CfbWarning
@@ -91,7 +90,7 @@ def test_a_parameter_that_cannot_be_is_refused_by_name(key, tmp_path_factory):
         save_model_file(replace(GUARDS, entries={**GUARDS.entries, key: changed}), folder / "drone.yaml")
         refused(lambda: load_model_file(folder / "drone.yaml"), "drone.yaml", f"parameters.{key}", "must")
         text = ",".join(map(repr, np.atleast_1d(value).tolist()))
-        refused(lambda: changed_model("cfb-guards", [f"{key}={text}"]), f"parameters.{key}", "must")
+        refused(lambda: load_model_file("cfb-guards", [f"{key}={text}"]), f"parameters.{key}", "must")
         fields = {name: getattr(NOMINAL, name) for name in SPECIFICATIONS}
         refused(lambda: Parameters(**fields | {key: value}), f"parameters.{key}")
 
@@ -219,7 +218,7 @@ def test_values_of_the_issue_are_refused():
 
 
 def test_grams_are_recognised():
-    refused(lambda: changed_model("cfb-guards", ["mass=38.5"]), "parameters.mass = 38.5", "in kg, 38.5 g is 0.0385")
+    refused(lambda: load_model_file("cfb-guards", ["mass=38.5"]), "parameters.mass = 38.5", "in kg, 38.5 g is 0.0385")
     refused(lambda: GUARDS.with_values("a table", motor_gain=22206.0), "22206 rpm is 2325.41")
     refused(lambda: PayloadSwing(mass=5.0, length=0.2), "in kg, 5 g is 0.005")
 

@@ -94,6 +94,14 @@ def _dispatch(arguments: list[str]) -> int:
         return 0
     if name not in SUMMARY:
         raise CfbError(f"there is no command {name!r}; the commands are {', '.join(SUMMARY)}.")
+    from importlib.util import find_spec
+
+    from cfb_mjx.commands import COMMANDS
+
+    if find_spec(f"cfb_mjx.commands.{COMMANDS[name].place.partition('.')[0]}") is not None:
+        from cfb_mjx.commands.line import run_line
+
+        return run_line(name, arguments[1:])
     from cfb_mjx.cli.commands import run
 
     try:

@@ -32,14 +32,13 @@ def run_close_loop(
     logs, judged = _read(fit, held_out)
     require_no_file(output)
     configure_jax(x64=True)
-    from cfb_mjx.cli.evaluating import changed_model
-    from cfb_mjx.parameters import save_model_file
+    from cfb_mjx.parameters import load_model_file, save_model_file
     from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
     from cfb_mjx.sysid.tracing.closing import close_loop
     from cfb_mjx.view.closing import write_report
     from cfb_mjx.view.closing_words import verdict
 
-    base = changed_model(model, changes)
+    base = load_model_file(model, changes)
     output_folder(output)
     checkpoint = Checkpoint.open(output / "search.json", fit, base, say)
     outcome = close_loop(logs, judged, base, say, checkpoint)

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, require_folder, require_no_file, together, write_json, write_text
+from cfb_mjx.parameters import load_model_file
 from cfb_mjx.runtime import Progress, configure_jax, environment
 from cfb_mjx.terminal import print_paths
 
@@ -87,7 +87,7 @@ def run_excite(
     from cfb_mjx.sysid.excitation.conditions import Conditions
     from cfb_mjx.sysid.excitation.manoeuvres import Limits
 
-    described = changed_model(model, changes)
+    described = load_model_file(model, changes)
     limits = Limits(rate=rate_limit, altitude_loss=altitude_loss)
     conditions = Conditions(measured_rotors=measured_rotors, disturbance=disturbance)
     trials = _trials(manoeuvre, described, parameters, repetitions, duration, limits, conditions)

@@ -7,11 +7,11 @@ from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
-from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.cli.fitted_model import provenance, require_model_path
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, together, write_json
 from cfb_mjx.logs import FlightLog, read_log
+from cfb_mjx.parameters import load_model_file
 from cfb_mjx.runtime import Progress, configure_jax, environment
 from cfb_mjx.terminal import print_paths
 
@@ -54,7 +54,7 @@ def run_fit(
     from cfb_mjx.sysid import evaluate
     from cfb_mjx.sysid.identification.fitting import fit
 
-    base, over = changed_model(model, changes), Devices.take(devices)
+    base, over = load_model_file(model, changes), Devices.take(devices)
     kept = [path.name for path in held_out] or f"last {HELD_OUT_SHARE:.0%} of each log"
     if mass_std is None and base.entries["mass"].std is not None:
         mass_std = float(base.entries["mass"].std)

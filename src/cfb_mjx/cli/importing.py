@@ -10,6 +10,7 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped, write_text
 from cfb_mjx.logs import estimate_command_shift, write_mcap
+from cfb_mjx.logs.alignment import describe_alignment
 from cfb_mjx.logs.proposal import UnknownNames
 from cfb_mjx.logs.reading import read_judged
 
@@ -63,17 +64,3 @@ def print_logging(kind: str) -> None:
     """Print what to log: ``sd`` for the micro SD card deck, ``radio`` for cfclient."""
     name = {"sd": "config.txt", "radio": "radio.json"}[kind]
     print(shipped("configs", "logs", name).read_text(encoding="utf-8"), end="")
-
-
-def describe_alignment(alignment: dict | None) -> str:
-    """One line about the shift between motor columns and gyro."""
-    if not alignment:
-        return "motor columns against gyro: not estimated"
-    if "shift_ms" not in alignment:
-        return f"motor columns delayed by {alignment.get('applied_ms', 0.0):.1f} ms as asked"
-    if not alignment.get("reliable", True):
-        return "motor columns against gyro: too little excitation to estimate their shift"
-    text = f"motor columns lead the gyro by {alignment['shift_ms']:.1f} +- {alignment['shift_std_ms']:.1f} ms"
-    if alignment.get("applied"):
-        return f"{text}; delayed by {alignment['applied_ms']:.1f} ms"
-    return text

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cfb_mjx.cli.evaluating import changed_model, print_table
 from cfb_mjx.cli.fitted_model import provenance, require_apart, require_model_path
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, together, write_json
 from cfb_mjx.logs import FlightLog, read_log, require_own_names
+from cfb_mjx.parameters import load_model_file
 from cfb_mjx.runtime import configure_jax, environment, say
 from cfb_mjx.terminal import print_paths
 
@@ -54,7 +54,7 @@ def run_refine(
     from cfb_mjx.sysid.refinement.numbers import PLANT
     from cfb_mjx.sysid.sensor_faults import SensorFaults
 
-    base = changed_model(model, changes)
+    base = load_model_file(model, changes)
     if as_logged:
         known = SensorFaults.from_mappings(base.effects, f"model {base.name}").as_logged.to_mappings()
         physics = (e for e in base.effects if e["name"] not in SENSOR_FAULTS)
@@ -83,7 +83,7 @@ def run_refine(
     _print(report)
     print(f"model: {output}" + (" (a predictor, not a plant)" if predictor else ""))
     for result in report.get("held_out", {}).values():
-        print_table(result)
+        print("\n" + errors_table(result))
     print_paths(results=json)
 
 

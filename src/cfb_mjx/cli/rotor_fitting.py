@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.cli.fitted_model import provenance, require_model_path
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, require_folder, together, write_json
@@ -20,6 +19,7 @@ from cfb_mjx.logs.bench_points import SteadyPoints, ThrustPoints, joined
 from cfb_mjx.logs.bench_tables import MapTable
 from cfb_mjx.logs.flown import flown_part
 from cfb_mjx.logs.tabular import read_table
+from cfb_mjx.parameters import load_model_file
 from cfb_mjx.runtime import Progress, configure_jax, environment
 from cfb_mjx.terminal import print_paths
 
@@ -65,7 +65,7 @@ def run_fit_rotors(
     configure_jax(x64=True)
     from cfb_mjx.parameters import save_model_file
 
-    base = changed_model(model, changes)
+    base = load_model_file(model, changes)
     _require_one_rotor(tables, base)
     motors = None
     extras = {"offset": offset, "asymmetric": asymmetric, "dead_time": dead_time}

@@ -6,9 +6,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cfb_mjx.cli.evaluating import changed_model
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, require_folder, require_no_file, together, write_json, write_text
+from cfb_mjx.parameters import load_model_file
 from cfb_mjx.runtime import Progress, configure_jax, environment
 from cfb_mjx.terminal import print_paths
 
@@ -47,7 +47,7 @@ def run_separate(
     from cfb_mjx.sysid.excitation.paths import PATHS
     from cfb_mjx.sysid.excitation.separation import separate
 
-    described = changed_model(model, changes)
+    described = load_model_file(model, changes)
     conditions = Conditions(measured_rotors=measured_rotors, disturbance=disturbance)
     told = separate(Quadrotor.from_file(described), names, conditions, progress=Progress("flying"))
     print(f"what one flight of each path tells about {' against '.join(names)}, in nats (10 settle it):\n")

@@ -41,13 +41,13 @@ def run_view(
     import jax.numpy as jnp
     import numpy as np
 
-    from cfb_mjx.cli.evaluating import changed_model
     from cfb_mjx.model import Quadrotor, rotors
+    from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid import evaluate
     from cfb_mjx.sysid.sensor_faults import SensorFaults
     from cfb_mjx.sysid.tracing.residuals import model_residuals
 
-    described = changed_model(model, changes)
+    described = load_model_file(model, changes)
     drone = Quadrotor.from_file(described)
     faults = SensorFaults.from_mappings(described.effects, model)
     bar = Progress("residuals")

@@ -255,3 +255,17 @@ def motor_spectra(log: FlightLog, source: str) -> tuple[np.ndarray, np.ndarray, 
     cross = np.einsum("lf,fij->lij", steer, np.einsum("bfi,bfj->fij", np.conj(x), y)).real
     power = np.einsum("bfi,bfk->ik", np.conj(x), x).real
     return cross, power, np.sum(np.abs(y) ** 2, axis=(0, 1))
+
+
+def describe_alignment(alignment: dict | None) -> str:
+    """One line about the shift between motor columns and gyro."""
+    if not alignment:
+        return "motor columns against gyro: not estimated"
+    if "shift_ms" not in alignment:
+        return f"motor columns delayed by {alignment.get('applied_ms', 0.0):.1f} ms as asked"
+    if not alignment.get("reliable", True):
+        return "motor columns against gyro: too little excitation to estimate their shift"
+    text = f"motor columns lead the gyro by {alignment['shift_ms']:.1f} +- {alignment['shift_std_ms']:.1f} ms"
+    if alignment.get("applied"):
+        return f"{text}; delayed by {alignment['applied_ms']:.1f} ms"
+    return text

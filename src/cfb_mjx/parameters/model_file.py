@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -99,16 +99,35 @@ def preset_names() -> list[str]:
     return shipped_names("parameters")
 
 
-def load_model_file(name_or_path: str | Path) -> ModelFile:
+def load_model_file(name_or_path: str | Path, changes: Iterable[str] = ()) -> ModelFile:
     """Read a shipped preset (by name) or a model YAML (by path).
 
+    Args:
+        name_or_path: which.
+        changes: of its parameters, each ``NAME=VALUE``; lists are written with commas.
+
     Raises:
-        CfbError: no such preset or file, broken YAML, unknown or missing keys, missing or wrong units,
-            impossible values (`SPECIFICATIONS`); the message names the file and the key.
+        CfbError: a change that is not NAME=VALUE; no such preset or file, broken YAML, unknown or missing keys, missing
+            or wrong units, impossible values (`SPECIFICATIONS`); the message names the file and the key.
 
     Warns:
         CfbWarning: values that are possible but unusual, named alike.
     """
+    values = dict(map(_change, changes))
+    described = _read(name_or_path)
+    return described.with_values("command line", **values) if values else described
+
+
+def _change(text: str) -> tuple[str, float | list[float]]:
+    name, _, value = text.partition("=")
+    try:
+        numbers = [float(part) for part in value.split(",")]
+    except ValueError:
+        raise CfbError(f"--set {text}: write NAME=VALUE with a number, or numbers separated by commas.") from None
+    return name, numbers if len(numbers) > 1 else numbers[0]
+
+
+def _read(name_or_path: str | Path) -> ModelFile:
     path, document = load_named(name_or_path, "model", FORMAT, "parameters")
     refuse_unknown(document, _TOP_LEVEL, path, "")
     kind = document.get("kind", "plant")

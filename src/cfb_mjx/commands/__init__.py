@@ -1,0 +1,188 @@
+"""The commands of ``cfb`` as objects::
+
+    from cfb_mjx.commands import Evaluate
+    evaluated = Evaluate("flight.mcap", model="cfb").run()
+    print(evaluated)
+
+A command is a frozen dataclass of its arguments; ``run()`` does it and returns what was found. The classes are imported
+on first use: help and typing errors answer without loading anything.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from cfb_mjx.commands.command import Command, Result
+    from cfb_mjx.commands.evaluate import Evaluate
+
+
+class Entry(NamedTuple):
+    """What is known of a command without loading it."""
+
+    place: str
+    """Module and class."""
+    summary: str
+    examples: tuple[str, ...]
+
+
+COMMANDS = {
+    "import": Entry(
+        "import_log.Import",
+        "convert a flight log to MCAP",
+        ("cfb import flight.csv -o flight.mcap", "cfb import rosbag2_folder -o flight.mcap --robot cf5 --cut :3"),
+    ),
+    "check": Entry(
+        "check.Check",
+        "say what recordings hold, whether their signals agree, what they are good for",
+        ("cfb check flight.mcap", "cfb check *.csv -o out/check --json check.json"),
+    ),
+    "evaluate": Entry(
+        "evaluate.Evaluate",
+        "measure how well a model predicts flights, open loop",
+        ("cfb evaluate flight.mcap", "cfb evaluate a.mcap b.mcap --model cfb --json errors.json --figure errors.png"),
+    ),
+    "benchmark-nanodrone": Entry(
+        "benchmark_nanodrone.BenchmarkNanodrone",
+        "judge a model by the rules of the IDSIA nano-drone benchmark",
+        (
+            "cfb benchmark-nanodrone data/real/processed --official",
+            "cfb benchmark-nanodrone flights --model my_drone.yaml --json nanodrone.json",
+        ),
+    ),
+    "fit": Entry(
+        "fit.Fit",
+        "refit the model to flights, with uncertainty",
+        (
+            "cfb fit flight.mcap -o my_drone.yaml --set mass=0.042",
+            "cfb fit a.mcap b.mcap -o my_drone.yaml --held-out c.mcap --parameters inertia,motor --figure fit.png",
+        ),
+    ),
+    "fit-rotors": Entry(
+        "fit_rotors.FitRotors",
+        "fit motors and rotor maps, from flights or a bench",
+        (
+            "cfb fit-rotors thrust_stand.csv -o my_rotors.yaml",
+            "cfb fit-rotors steps.csv flight.mcap -o my_rotors.yaml --per-motor --figure rotors.png",
+        ),
+    ),
+    "excite": Entry(
+        "excite.Excite",
+        "design a manoeuvre that identifies the drone, and predict what a fit will know",
+        (
+            "cfb excite roll-pitch -o out/roll-pitch",
+            "cfb excite separate -o out/separate --between payload,motor_lag --model out/loop/model.yaml",
+        ),
+    ),
+    "close-loop": Entry(
+        "close_loop.CloseLoop",
+        "find the physical effect a model lacks, and add it",
+        (
+            "cfb close-loop --fit a.mcap b.mcap --held-out c.mcap -o out/loop",
+            "cfb close-loop --fit a.mcap b.mcap --held-out c.mcap -o out/loop --model my_drone.yaml --set mass=0.042",
+        ),
+    ),
+    "refine": Entry(
+        "refine.Refine",
+        "fit the numbers of named effects, to innovations or to predictions",
+        (
+            "cfb refine a.mcap b.mcap -o refined.yaml --effects drag,wind",
+            "cfb refine a.mcap -o refined.yaml --effects plant --held-out b.mcap --json refined.json",
+        ),
+    ),
+    "train": Entry(
+        "train.Train",
+        "train a controller, by PPO or by back-propagation through the model",
+        (
+            "cfb train target -o out/target --config quick",
+            "cfb train target -o out/target --model my_drone.yaml --set randomisation.magnitude=0.5 --seed 1",
+        ),
+    ),
+    "fly": Entry(
+        "fly.Fly",
+        "fly a controller in simulation and measure it",
+        ("cfb fly target --task hover", "cfb fly out/target/policy.npz --plants 4096 --magnitude 1 --json flown.json"),
+    ),
+    "sweep": Entry(
+        "sweep.Sweep",
+        "run a command many times over, on this machine or a cluster",
+        ("cfb sweep firmware-pid -o out/sweep --dry-run", "cfb sweep my_sweep.yaml -o out/sweep --workers 4"),
+    ),
+    "export": Entry(
+        "export.Export",
+        "write a policy as C for the drone, and check that it does the same there",
+        ("cfb export target -o out/target_c", "cfb export out/target/policy.npz -o out/policy_c --check"),
+    ),
+    "view": Entry(
+        "view.View",
+        "show flights: a rerun recording with predictions and residuals, or a film",
+        ("cfb view flight.mcap -o flight.rrd", "cfb view flight.mcap -o flight.mp4"),
+    ),
+    "bench": Entry(
+        "bench.Bench",
+        "measure throughput, compile time and memory",
+        ("cfb bench --quick", "cfb bench --drones 64 4096 --json bench.json --markdown bench.md"),
+    ),
+    "reproduce": Entry(
+        "reproduce.Reproduce",
+        "make the paper's figures and tables, its numbers beside ours",
+        ("cfb reproduce all -o out/paper", "cfb reproduce table2 -o out/paper --real flights"),
+    ),
+    "demo-loop": Entry(
+        "demo_loop.DemoLoop",
+        "fly a drone the model does not know, diagnose it, retrain, and fly it again",
+        ("cfb demo-loop -o out/loop", "cfb demo-loop -o out/loop --effects payload --seeds 2"),
+    ),
+    "demo": Entry(
+        "demo.Demo",
+        "evaluate a flight, fly 4096 randomised drones, write a page",
+        ("cfb demo -o out/demo", "cfb demo -o out/demo --real flights"),
+    ),
+    "version": Entry("version.Version", "print versions", ("cfb version",)),
+}
+_CLASSES = {entry.place.rpartition(".")[2]: name for name, entry in COMMANDS.items()}
+__all__ = [
+    "COMMANDS",
+    "Bench",
+    "BenchmarkNanodrone",
+    "Check",
+    "CloseLoop",
+    "Command",
+    "Demo",
+    "DemoLoop",
+    "Entry",
+    "Evaluate",
+    "Excite",
+    "Export",
+    "Fit",
+    "FitRotors",
+    "Fly",
+    "Import",
+    "Refine",
+    "Reproduce",
+    "Result",
+    "Sweep",
+    "Train",
+    "Version",
+    "View",
+    "load",
+]
+
+
+def load(name: str) -> type[Command]:
+    """The class of a command."""
+    module, _, kind = COMMANDS[name].place.rpartition(".")
+    return getattr(importlib.import_module(f"cfb_mjx.commands.{module}"), kind)
+
+
+def __getattr__(name: str):
+    if name in _CLASSES:
+        return load(_CLASSES[name])
+    if name in ("Command", "Result"):
+        return getattr(importlib.import_module("cfb_mjx.commands.command"), name)
+    raise AttributeError(f"module 'cfb_mjx.commands' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,249 @@
+"""What a command is: a frozen dataclass of its arguments with ``run() -> Result``, and the kinds of its arguments.
+
+Light, as everything that ``cfb --help`` loads: what a command needs is imported when it runs.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, Field, dataclass, field, fields
+from itertools import chain
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import tyro
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.plugins import plugged
+
+
+@dataclass(frozen=True)
+class Within:
+    """The range of a number; other numbers are refused where the command is made."""
+
+    least: float
+    most: float = float("inf")
+
+    def __str__(self) -> str:
+        return f"at least {self.least:g}" if self.most == float("inf") else f"from {self.least:g} to {self.most:g}"
+
+
+Output = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")]
+OutputFolder = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
+File = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+Folder = Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
+Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
+Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")]
+OtherLogs = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG...")]
+Model = Annotated[str, tyro.conf.arg(metavar="MODEL")]
+Devices = Annotated[int, Within(1)]
+if TYPE_CHECKING:
+    Pairs = tuple[str, ...]
+    Spans = tuple[str, ...]
+else:  # As the parser sees them.
+    Pairs = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE...")]
+    Spans = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="A:B...")]
+"""``--set A=1 B=2`` and ``--set A=1 --set B=2`` mean the same, and so do ``set={"A": 1, "B": 2}`` and
+``set=("A=1", "B=2")``; the later of two of one name counts. A command holds the words, ``("A=1", "B=2")``. Likewise a
+path may be given as text, and one log alone in place of several."""
+
+_PLUGIN = "a Python file with effects of your own, known to this command; may be given several times."
+_METAVARS = {float: "NUMBER", int: "INT", str: "TEXT", Path: "PATH"}
+_Class = TypeVar("_Class", bound=type)
+
+
+class Result:
+    """What a command found. ``str(result)`` is what ``cfb`` prints; files are written when the command has run."""
+
+    @property
+    def complaint(self) -> str | None:
+        """Why ``cfb`` exits with an error although there is a result, in a sentence; None if it does not."""
+        return None
+
+
+@dataclass(frozen=True)
+class Written(Result):
+    """A result that is text, and the files it stands in.
+
+    Attributes:
+        text: what ``cfb`` prints.
+        files: what was written, by what it is; None: was not asked for.
+    """
+
+    text: str
+    files: Mapping[str, Path | None] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return "\n".join([*([self.text] if self.text else []), *lines_of(self.files)])
+
+
+def lines_of(files: Mapping[str, Path | None]) -> list[str]:
+    """A line for each file that was written (None: was not asked for), after what it is."""
+    return [f"{what}: {path}" for what, path in files.items() if path is not None]
+
+
+@dataclass(frozen=True)
+class Command:
+    """What every command has."""
+
+    plugin: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="FILE.py", help=_PLUGIN)] = (
+        field(default=(), kw_only=True)
+    )
+
+    def __post_init__(self) -> None:
+        hints = get_type_hints(type(self), include_extras=True)
+        for one in fields(self):
+            value = _taken(getattr(self, one.name), hints[one.name], f"--{one.name.replace('_', '-')}")
+            object.__setattr__(self, one.name, value)
+
+    def run(self) -> Result:
+        """Do it, write the files that were asked for, and return what was found.
+
+        Raises:
+            CfbError: bad input, in one sentence; nothing is written then.
+        """
+        raise NotImplementedError
+
+    def words(self) -> list[str]:
+        """The words of a command line that mean the same, without ``cfb`` and the command's name."""
+        hints = get_type_hints(type(self), include_extras=True)
+        first, rest = [], []
+        for one in sorted(fields(self), key=lambda one: one.name == "plugin"):
+            value, hint = getattr(self, one.name), hints[one.name]
+            if value == default_of(one):
+                continue
+            values = [str(v) for v in value] if isinstance(value, tuple) else [str(value)]
+            option = f"--{one.name.replace('_', '-')}"
+            if is_positional(hint):
+                first += values
+            elif isinstance(value, bool):
+                rest.append(option if value else f"--no-{option[2:]}")
+            elif _appended(hint) and not _nested(hint):
+                rest += [word for v in values for word in (option, v)]
+            elif value is not None:
+                rest += ["-o" if "-o" in _aliases(hint) else option, *values]
+        return first + rest
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=False, field_specifiers=(field,))
+def command(cls: _Class) -> _Class:
+    """Make a class of arguments a command: a frozen dataclass whose ``run`` knows the effects of its plugins."""
+    run = cls.run
+
+    @functools.wraps(run)
+    def plugged_run(self):
+        with plugged(*self.plugin):
+            return run(self)
+
+    cls.run = plugged_run
+    return dataclass(frozen=True)(cls)
+
+
+def default_of(one: Field) -> Any:
+    """What a field holds where nothing is said; `dataclasses.MISSING` where something must be."""
+    return one.default_factory() if one.default_factory is not MISSING else one.default
+
+
+def is_positional(hint: Any) -> bool:
+    """Whether an argument is given without its name."""
+    return tyro.conf.Positional in _marks(hint)
+
+
+def told(hint: Any) -> Any:
+    """An annotation as the parser gets it: with a word for the value, and no default where that is nothing."""
+    if get_origin(hint) is not Annotated:
+        hint = Annotated[hint, None]
+    kind, marks = get_args(hint)[0], _marks(hint)
+    optional = _plain(kind) is not kind
+    named = any(getattr(mark, "metavar", None) for mark in marks)
+    more = {}
+    if not named and get_origin(_plain(kind)) is Literal and optional:
+        more["metavar"] = "{" + ",".join(get_args(_plain(kind))) + "}"
+    elif not named and optional:
+        more["metavar"] = _METAVARS.get(_plain(kind), "TEXT")
+    if optional or get_origin(kind) is tuple:
+        more["help_behavior_hint"] = ""
+    within = next((mark for mark in marks if isinstance(mark, Within)), None)
+    if within is not None:
+        more["help_behavior_hint"] = lambda default: f"({within}; default: {default})"
+    kept = [mark for mark in marks if mark is not None and not isinstance(mark, Within)]
+    return functools.reduce(lambda so_far, mark: Annotated[so_far, mark], [*kept, tyro.conf.arg(**more)], kind)
+
+
+def _marks(hint: Any) -> tuple:
+    return getattr(hint, "__metadata__", ())
+
+
+def _aliases(hint: Any) -> tuple[str, ...]:
+    return tuple(chain.from_iterable(getattr(mark, "aliases", None) or () for mark in _marks(hint)))
+
+
+def _appended(hint: Any) -> bool:
+    return tyro.conf.UseAppendAction in _marks(hint)
+
+
+def _nested(hint: Any) -> bool:
+    kind = _bare(hint)
+    return get_origin(kind) is tuple and get_origin(get_args(kind)[0]) is tuple
+
+
+def _bare(hint: Any) -> Any:
+    return get_args(hint)[0] if get_origin(hint) is Annotated else hint
+
+
+def _plain(kind: Any) -> Any:
+    """What an optional argument is if it is given."""
+    if get_origin(kind) in (Union, UnionType):
+        left = [one for one in get_args(kind) if one is not NoneType]
+        return left[0] if len(left) == 1 else kind
+    return kind
+
+
+def _taken(value: Any, hint: Any, option: str) -> Any:
+    """A value as a command holds it: one path for a path's name, a tuple for one of several, words for pairs.
+
+    Raises:
+        CfbError: a number out of its range, or a choice that there is not.
+    """
+    kind = _plain(_bare(hint))
+    if _nested(hint):
+        return _words(value)
+    if get_origin(kind) is tuple:
+        several = (value,) if isinstance(value, str | Path) or not isinstance(value, Sequence) else tuple(value)
+        held = get_args(kind)[0]
+        return tuple(held(one) if isinstance(held, type) else one for one in several)
+    if value is None:
+        return None
+    if kind is Path:
+        return Path(value)
+    if get_origin(kind) is Literal and value not in get_args(kind):
+        raise CfbError(f"{option} {value}: choose from {', '.join(map(str, get_args(kind)))}.")
+    for mark in _marks(hint):
+        if isinstance(mark, Within) and not mark.least <= value <= mark.most:
+            raise CfbError(f"{option} {value:g}: must be {mark}.")
+    return value
+
+
+def _words(value: Any) -> tuple[str, ...]:
+    if isinstance(value, str):
+        return (value,)
+    if isinstance(value, Mapping):
+        return tuple(f"{name}={_text(one)}" for name, one in value.items())
+    return tuple(chain.from_iterable((one,) if isinstance(one, str) else one for one in value))
+
+
+def _text(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

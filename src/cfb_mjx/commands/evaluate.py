@@ -1,0 +1,139 @@
+"""``cfb evaluate``: how well a model predicts flights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from cfb_mjx.commands.command import Command, Devices, File, Logs, Model, Pairs, Result, command, lines_of
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import require_folder, write_json
+
+_LABELS = {
+    "commands_in": "commands in",
+    "commands_in_observer": "  with observer",
+    "rotor_speed_in": "rotor speed in",
+    "rotor_speed_in_observer": "  with observer",
+    "hold": "hold",
+}
+_ROWS = (("position", "m"), ("velocity", "mps"), ("attitude", "deg"), ("rate", "radps"))
+_UNITS = {"m": "m", "mps": "m/s", "deg": "deg", "radps": "rad/s"}
+
+
+@dataclass(frozen=True)
+class Evaluated(Result):
+    """Errors of a model's predictions.
+
+    Attributes:
+        numbers: as ``--json`` writes them: ``numbers["commands_in"]["position_rmse_m@0.5s"]`` and the like.
+        files: what was written, by what it is.
+    """
+
+    numbers: Mapping[str, Any]
+    files: Mapping[str, Path | None]
+
+    def __str__(self) -> str:
+        from cfb_mjx.logs.alignment import describe_alignment
+
+        logs, alignment = self.numbers["logs"], self.numbers["alignment"]
+        each = [f"{name}: {logs[name]['windows']} windows; {describe_alignment(alignment[name])}" for name in logs]
+        return "\n".join([*each, "", errors_table(self.numbers), *lines_of(self.files)])
+
+
+@command
+class Evaluate(Command):
+    """Measure how well a model predicts flights, open loop, at 50, 100, 200 and 500 ms.
+
+    Windows start from measured states; the logged commands (and, where measured, the rotor speeds) go in; errors are
+    compared with "hold", which assumes constant velocity and constant body rate.
+
+    Attributes:
+        logs: flight logs (MCAP, parquet, csv).
+        model: preset (cfb-guards, cfb, cfb-fleet, cfb-idsia, cf21b-500, cf2x) or model YAML.
+        set: parameters to change, for instance mass=0.045.
+        json: write the results here.
+        figure: draw prediction against measurement here (.png, .svg, .pdf).
+        observer: add predictions with disturbances estimated from the data before each window starts.
+        devices: of this machine that share the windows.
+    """
+
+    logs: Logs
+    model: Model = "cfb-guards"
+    set: Pairs = ()
+    json: File = None
+    figure: File = None
+    observer: bool = False
+    devices: Devices = 1
+
+    def run(self) -> Evaluated:
+        """Evaluate, and write what was asked for.
+
+        Raises:
+            CfbError: bad logs, a bad model, or outputs that cannot be written.
+        """
+        from cfb_mjx.logs import estimate_command_shift, read_log
+        from cfb_mjx.runtime import Progress, configure_jax, environment
+
+        if not self.logs:
+            raise CfbError("evaluate needs at least one log; see 'cfb evaluate --help'.")
+        require_folder(self.json, self.figure)
+        logs = [read_log(path) for path in self.logs]  # before jax loads: a bad log is refused at once
+        configure_jax(x64=True, devices=self.devices)
+        from cfb_mjx.devices import Devices
+        from cfb_mjx.model import Quadrotor
+        from cfb_mjx.parameters import load_model_file
+        from cfb_mjx.sysid import evaluate
+        from cfb_mjx.sysid.observer import usual_observer
+        from cfb_mjx.sysid.sensor_faults import SensorFaults
+
+        described = load_model_file(self.model, self.set)
+        settings = usual_observer(described.kind) if self.observer else None
+        evaluation = evaluate(
+            Quadrotor.from_file(described),
+            logs,
+            progress=Progress("evaluating"),
+            observer=settings,
+            faults=SensorFaults.from_mappings(described.effects, self.model),
+            over=Devices.take(self.devices),
+        )
+        alignment = {
+            log.name: log.metadata.get("alignment") or {**estimate_command_shift(log).report(), "applied": False}
+            for log in logs
+        }
+        numbers = evaluation.to_json()
+        numbers |= {"model": described.name, "changes": list(self.set), "alignment": alignment}
+        numbers |= {"environment": environment()}
+        if settings is not None:
+            numbers["observer"] = vars(settings)
+        if self.json is not None:
+            write_json(self.json, numbers)
+        if self.figure is not None:
+            from cfb_mjx.view import prediction_figure
+
+            prediction_figure(evaluation, self.figure)
+        return Evaluated(numbers, {"results": self.json, "figure": self.figure})
+
+
+def errors_table(numbers: Mapping[str, Any]) -> str:
+    """RMSE of every quantity and variant at every horizon, with 95 % intervals."""
+    horizons = [key.partition("@")[2] for key in numbers["hold"] if key.startswith("position_rmse")]
+    lines = [
+        f"RMS error of {numbers['windows']} open-loop predictions by {numbers['model']} [95 % interval]",
+        f"{'':31}" + "".join(f"{float(h[:-1]) * 1e3:.0f} ms".ljust(26) for h in horizons).rstrip(),
+    ]
+    for quantity, unit in _ROWS:
+        for variant, label in _LABELS.items():
+            if numbers.get(variant) is None:
+                continue
+            cells = []
+            for horizon in horizons:
+                key = f"{quantity}_rmse_{unit}@{horizon}"
+                low, high = numbers["intervals"][variant][key]
+                cells.append(f"{numbers[variant][key]:.3g} [{low:.3g}, {high:.3g}]".ljust(26))
+            head = f"{quantity}, {_UNITS[unit]}" if variant == "commands_in" else ""
+            lines.append(f"{head:<15}{label:<16}" + "".join(cells).rstrip())
+    if numbers["rotor_speed_in"] is not None and numbers["windows"] > numbers["rotor_speed_in_windows"]:
+        lines.append(f"rotor speed was measured in {numbers['rotor_speed_in_windows']} of the windows.")
+    return "\n".join(lines)

@@ -1,0 +1,102 @@
+"""A command's line: words to a command object, and its help."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import re
+from collections.abc import Sequence
+from contextlib import nullcontext, redirect_stderr, redirect_stdout
+from dataclasses import MISSING, fields
+from typing import get_type_hints
+
+import tyro
+
+from cfb_mjx.commands import COMMANDS, load
+from cfb_mjx.commands.command import Command, default_of, told
+from cfb_mjx.errors import CfbError
+from cfb_mjx.terminal import escaped, shown
+
+_DOCUMENTED = re.compile(r"\n\s*(Attributes|Examples):")
+
+
+def parse(name: str, words: Sequence[str]) -> Command:
+    """The command that a line asks for.
+
+    Args:
+        name: of the command.
+        words: of its line, after the name.
+
+    Raises:
+        CfbError: a number out of its range.
+        SystemExit: help was asked for, or the line cannot be read; the parser has explained itself.
+    """
+    kind = load(name)
+    # The parser's own words are coloured; it repeats what was typed, or what the shell put there.
+    harmless = all(shown(word) == word for word in words)
+    with nullcontext() if harmless else escaped():
+        values = tyro.cli(_arguments(kind), prog=f"cfb {name}", description=_description(name), args=list(words))
+    return kind(**values)
+
+
+def run_line(name: str, words: Sequence[str]) -> int:
+    """Do what a line asks for, print what was found, and return the status to exit with.
+
+    Raises:
+        CfbError: bad input, or a result with a `complaint`.
+    """
+    try:
+        asked = parse(name, words)
+    except SystemExit as stop:  # the parser has already explained itself
+        return stop.code if isinstance(stop.code, int) else 2
+    with escaped():
+        found = asked.run()
+        if text := str(found):
+            print(text)
+    if found.complaint is not None:
+        raise CfbError(found.complaint)
+    return 0
+
+
+def complaint_of(name: str, words: Sequence[str]) -> str | None:
+    """Why a command would refuse its line, in a sentence; None if it would not."""
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said), redirect_stdout(said):
+            parse(name, words)
+    except SystemExit:
+        lines = [re.sub(r"[─│╭╮╰╯]|-{4,}", " ", line).strip() for line in said.getvalue().splitlines()]
+        # A title, what is wrong, and after that the help.
+        body = [line for line in lines if line][1:]
+        helps = [n for n, line in enumerate(body) if "helptext" in line] or [len(body)]
+        return " ".join(body[: helps[0]]).rstrip(".") + f"; see 'cfb {name} --help'."
+    return None
+
+
+def _arguments(kind: type[Command]):
+    """A function that takes a command's arguments as the parser should see them, and returns them by name."""
+
+    def given(**values):
+        return values
+
+    hints = get_type_hints(kind, include_extras=True)
+    parameters = [
+        inspect.Parameter(
+            one.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if default_of(one) is MISSING else default_of(one),
+        )
+        for one in sorted(fields(kind), key=lambda one: one.name == "plugin")
+    ]
+    given.__name__ = kind.__name__
+    given.__doc__ = inspect.getdoc(kind).replace("\nAttributes:", "\nArgs:")
+    given.__signature__ = inspect.Signature(parameters)
+    given.__annotations__ = {one.name: told(hints[one.name]) for one in fields(kind)}
+    return given
+
+
+def _description(name: str) -> str:
+    """What stands above the arguments: two examples, and what the command does."""
+    examples = "\n".join(f"  {line}" for line in COMMANDS[name].examples)
+    text = _DOCUMENTED.split(inspect.getdoc(load(name)))[0].strip()
+    return f"Examples:\n{examples}\n\n{text}"
