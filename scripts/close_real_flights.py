@@ -24,7 +24,6 @@ from marked_block import write_block
 from real_flights_page import GROUPS, figure, page, summary
 from scipy.signal import butter, sosfiltfilt
 
-from cfb_mjx.cli.refining import by_predictions
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.logs.resample import interpolate
@@ -38,6 +37,7 @@ from cfb_mjx.sysid.flow_estimator import fit_flow_estimator
 from cfb_mjx.sysid.nanodrone import QUANTITIES, Contestant, benchmark
 from cfb_mjx.sysid.observer import Observer
 from cfb_mjx.sysid.observer_tuning import benchmark_score, score, tune_observer
+from cfb_mjx.sysid.refinement.model_files import by_predictions
 from cfb_mjx.sysid.repeatability import repeated
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.sensors import check_sensors

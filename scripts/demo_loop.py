@@ -37,15 +37,18 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, default=ROOT / "out" / "demo-loop")
     parser.add_argument("--page-only", action="store_true", help="write the page from the results that are there")
     arguments = parser.parse_args()
-    from cfb_mjx.cli.looping import carry_out
     from cfb_mjx.files import write_json, write_text
-    from cfb_mjx.loop.study import cells_of
+    from cfb_mjx.loop.cells import cells_of
+    from cfb_mjx.runtime import configure_jax
     from cfb_mjx.view.closed_loop import loop_figure
 
     cells = cells_of(arguments.effects, arguments.seeds, arguments.seed)
     if not arguments.page_only:
-        arguments.folder.mkdir(parents=True, exist_ok=True)
-        carry_out(cells, arguments.folder, lambda results: write_json(RESULTS, results))
+        configure_jax(x64=False)
+        from cfb_mjx.loop.study import study
+
+        for results in study(cells, arguments.folder):
+            write_json(RESULTS, results)
     results = json.loads(RESULTS.read_text())
     loop_figure(results, FIGURE)
     write_text(ROOT / "docs" / "closed-loop.md", page(results, len(cells)))

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from campaign import ROOT, facts_line
 
-from cfb_mjx.cli.exporting import run_export
-from cfb_mjx.deploy.export import RESULTS
+from cfb_mjx.commands import Export
+from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.runtime import environment, set_up_xla
 
@@ -25,8 +25,11 @@ def measure() -> dict:
     found = {}
     for name in POLICIES:
         with tempfile.TemporaryDirectory() as folder:
-            run_export(name, Path(folder) / name, None, None, True)
-            found[name] = json.loads((Path(folder) / name / RESULTS).read_text())
+            exported = Export(name, Path(folder) / name, check=True).run()
+        print(exported)
+        if exported.complaint is not None:
+            raise CfbError(exported.complaint)
+        found[name] = {**exported.check.numbers, "environment": environment()}
     return {"policies": found, "environment": environment()}
 
 

@@ -105,7 +105,7 @@ class Course:
     def __init__(self):
         import jax
 
-        from cfb_mjx.control.pilot import find_pilot
+        from cfb_mjx.control.controllers import find_controller
         from cfb_mjx.envs import TargetTask
         from cfb_mjx.model import Quadrotor
         from cfb_mjx.parameters import load_model_file, load_randomisation
@@ -114,7 +114,7 @@ class Course:
         described = load_model_file("cfb-guards")
         self.nominal = Quadrotor.from_file(described)
         self.plants = load_plants(described)
-        self.turner = find_pilot("flip", self.nominal)
+        self.turner = find_controller("flip", self.nominal)
         self.calm, self.wild = TargetTask(), TargetTask(randomisation=load_randomisation("paper"))
         self.few, self.many = (jax.random.split(jax.random.PRNGKey(SEED), n) for n in (NOMINAL, RANDOM))
 
@@ -122,7 +122,7 @@ class Course:
         """As it lies in configs."""
         from cfb_mjx.deploy.deployment import find_deployment
 
-        return find_deployment(name).pilot
+        return find_deployment(name).controller
 
     def search(self, name: str) -> None:
         """Find the knobs of one, from those it has if it has any."""
@@ -130,16 +130,16 @@ class Course:
 
         import jax
 
+        from cfb_mjx.control.controllers import find_controller
         from cfb_mjx.control.manoeuvre import Knobs, Manoeuvre
         from cfb_mjx.control.manoeuvre_file import ManoeuvreFile, save_manoeuvre
-        from cfb_mjx.control.pilot import find_pilot
         from cfb_mjx.train.flip_search import Goal, bounds, search
 
         wanted = FLIPS[name]
         there = (MANOEUVRES / f"{name}.yaml").exists()
         knobs = self.manoeuvre(name).knobs if there else bounds(wanted.rotations).low
         found = search(
-            Manoeuvre(find_pilot(wanted.holder, self.nominal), self.turner, knobs),
+            Manoeuvre(find_controller(wanted.holder, self.nominal), self.turner, knobs),
             replace(self.wild, magnitude=wanted.magnitude),
             self.nominal,
             Goal(wanted.rotations, wanted.aim, **wanted.goal),

@@ -74,8 +74,8 @@ def machine(found: list, keep) -> None:
 def open_loop(found: list, keep) -> None:
     """Rollouts with every tuning of the kernel, and without it."""
     from cfb_mjx.bench import workloads
-    from cfb_mjx.model.acceleration import using
-    from cfb_mjx.model.kernel import Tuning
+    from cfb_mjx.engine.gpu import using
+    from cfb_mjx.engine.gpu_kernel import Tuning
 
     over_batches(workloads.rollout, DRONES, found, keep)
     over_batches(lambda n: workloads.rollout(n, "rigid-plain"), DRONES[1::2], found, keep)
@@ -158,7 +158,7 @@ def hover(found: list, keep) -> None:
 def tests(found: list, keep) -> None:
     """What the GPU computes, beside doubles on the CPU."""
     done = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "tests/model/test_on_gpu.py"],
+        [sys.executable, "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "tests/engine/test_on_gpu.py"],
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -166,7 +166,7 @@ def tests(found: list, keep) -> None:
     )
     lines = done.stdout.strip().splitlines()
     print(done.stdout[-6000:], done.stderr[-500:], flush=True)
-    found.append({"what": "tests/model/test_on_gpu.py", "result": lines[-1] if lines else done.stderr[-200:]})
+    found.append({"what": "tests/engine/test_on_gpu.py", "result": lines[-1] if lines else done.stderr[-200:]})
 
 
 SECTIONS = {f.__name__: f for f in (machine, open_loop, policy, gradient, mjx, ppo, hover, tests)}
@@ -210,7 +210,7 @@ def page(result: dict) -> str:
     text += [
         "## Tests",
         "",
-        f"`tests/model/test_on_gpu.py`, beside doubles on the CPU of the same machine: {said}.",
+        f"`tests/engine/test_on_gpu.py`, beside doubles on the CPU of the same machine: {said}.",
         "",
     ]
     return "\n".join(text)

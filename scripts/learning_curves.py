@@ -91,7 +91,7 @@ def main() -> None:
 
 def judged(judge):
     """Controller to its score, with late and noisy sensors."""
-    return lambda pilot: judge(pilot) | {"sensors": judge.with_sensors(pilot)}
+    return lambda controller: judge(controller) | {"sensors": judge.with_sensors(controller)}
 
 
 def by_brax(name: str, seed: int, results) -> None:

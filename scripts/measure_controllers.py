@@ -39,9 +39,9 @@ def main() -> None:
     configure_jax(x64=False)
     import jax
     import numpy as np
-    from raptor import RaptorPilot
+    from raptor import RaptorController
 
-    from cfb_mjx.control.pilot import find_pilot, has_lumped_delay
+    from cfb_mjx.control.controllers import find_controller, has_lumped_delay
     from cfb_mjx.envs import reset
     from cfb_mjx.files import write_json, write_text
     from cfb_mjx.model import Quadrotor
@@ -56,15 +56,15 @@ def main() -> None:
     results = {name: r for name, r in results.items() if name in CONTROLLERS and r["drones"] == arguments.plants}
     for name in arguments.controllers:
         say(name)
-        pilot = RaptorPilot.published() if name == "raptor" else find_pilot(name, nominal)
+        controller = RaptorController.published() if name == "raptor" else find_controller(name, nominal)
         # RAPTOR reads the gyro on the drone, as the firmware's controllers do.
         lumped = name != "raptor" and has_lumped_delay(name)
         calm, wild = (replace(task, lumped_delay=lumped) for task in (judge.calm, judge.wild))
-        one, _ = hover(pilot, calm, nominal, few)
-        step, _ = six_metres(pilot, calm, nominal, few)
-        all_of_them, _ = hover(pilot, wild, nominal, many)
-        thrown, _ = recovery(pilot, wild, nominal, many)
-        thrown_nominal, _ = recovery(pilot, calm, nominal, many)
+        one, _ = hover(controller, calm, nominal, few)
+        step, _ = six_metres(controller, calm, nominal, few)
+        all_of_them, _ = hover(controller, wild, nominal, many)
+        thrown, _ = recovery(controller, wild, nominal, many)
+        thrown_nominal, _ = recovery(controller, calm, nominal, many)
         distance = 1e3 * np.asarray(all_of_them.mean_distance_m)
         well = ~np.asarray(all_of_them.failed)
         results[name] = {
@@ -80,14 +80,14 @@ def main() -> None:
             "random_failed": float(1 - well.mean()),
             "random_recovered": float(np.mean(thrown.recovered)),
             "recovered": float(np.mean(thrown_nominal.recovered)),
-            "sensors": judge.with_sensors(pilot, lumped),
-            IDSIA: summary(hover(pilot, wild, Quadrotor.from_file(IDSIA), many)[0], np.median),
+            "sensors": judge.with_sensors(controller, lumped),
+            IDSIA: summary(hover(controller, wild, Quadrotor.from_file(IDSIA), many)[0], np.median),
             "factors": _factors(drones, nominal.parameters, distance, well),
             "plants": {},
         }
         for plant, drone in plants.items():
             # A drone that was meant to be the paper's: the firmware's controllers are scaled for that one.
-            results[name]["plants"][plant] = summary(hover(pilot, calm, drone, few)[0], np.mean)
+            results[name]["plants"][plant] = summary(hover(controller, calm, drone, few)[0], np.mean)
         write_json(RESULTS, results)
         # Six controllers' compiled programs are more than LLVM may map.
         jax.clear_caches()

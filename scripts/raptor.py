@@ -1,4 +1,4 @@
-"""RAPTOR's published policy as a pilot, for comparison: it adapts to any quadrotor within its first second.
+"""RAPTOR's published policy as a controller, for comparison: it adapts to any quadrotor within its first second.
 
 J. Eschmann, D. Albani, G. Loianno, RAPTOR: A Foundation Policy for Quadrotor Control, 2025. Its weights are not part of
 this project: `pip install foundation-policy`. Observation, order of the motors and normalisation are those that package
@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.envs.observation import Estimate, rotation_matrix
 
 STEPS = 5
-"""Steps of the pilot from one command to the next: it is asked every 10 ms, as in its training."""
+"""Steps of the controller from one command to the next: it is asked every 10 ms, as in its training."""
 LARGEST_POSITION_ERROR_M, LARGEST_VELOCITY_ERROR_MPS = 0.5, 1.0
 
 
@@ -29,7 +29,7 @@ class Memory(eqx.Module):
     """Steps since it was asked."""
 
 
-class RaptorPilot(eqx.Module):
+class RaptorController(eqx.Module):
     """A layer of rectifiers, a gated recurrent unit and a linear layer."""
 
     first: tuple[Array, Array]
@@ -39,7 +39,7 @@ class RaptorPilot(eqx.Module):
     control_dt_s: float = eqx.field(static=True, default=0.002)
 
     @classmethod
-    def published(cls) -> RaptorPilot:
+    def published(cls) -> RaptorController:
         """From the installed package, which checks its weights against an example."""
         from foundation_policy import Raptor
 

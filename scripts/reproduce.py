@@ -9,8 +9,7 @@ import argparse
 import shutil
 from pathlib import Path
 
-from cfb_mjx.cli.reproducing import ALL, run_reproduce
-from cfb_mjx.runtime import set_up_xla
+from cfb_mjx.commands import Reproduce
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -21,15 +20,15 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "out" / "paper")
     parser.add_argument("--real", type=Path)
     arguments = parser.parse_args()
-    set_up_xla()
-    found = run_reproduce((ALL,), arguments.output, arguments.real)
+    found = Reproduce(output=arguments.output, real=arguments.real).run()
+    print(found)
     from cfb_mjx.files import output_folder, write_text
     from cfb_mjx.reproduce.document import markdown, names_of
 
     folder = output_folder(ROOT / "docs" / "paper")
-    for path in names_of(found["results"]):
+    for path in names_of(found.results):
         shutil.copyfile(path, folder / path.name)
-    text = markdown(found["results"], found["environment"], "python scripts/reproduce.py", "paper/")
+    text = markdown(found.results, found.environment, "python scripts/reproduce.py", "paper/")
     write_text(ROOT / "docs" / "paper.md", text)
     print("docs/paper.md")
 

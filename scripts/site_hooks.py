@@ -129,10 +129,10 @@ def lists(markdown: str) -> str:
 
 def commands() -> str:
     """The help of every command, as Markdown."""
-    from cfb_mjx.cli import SUMMARY
+    from cfb_mjx.commands import COMMANDS
 
-    parts = [f"| command | does |\n|---|---|\n{_rows(SUMMARY)}"]
-    parts += [f"## cfb {name}\n\n```text\n{help_of(name)}\n```" for name in SUMMARY]
+    parts = [f"| command | does |\n|---|---|\n{_rows({name: entry.summary for name, entry in COMMANDS.items()})}"]
+    parts += [f"## cfb {name}\n\n```text\n{help_of(name)}\n```" for name in COMMANDS]
     return "\n\n".join(parts)
 
 

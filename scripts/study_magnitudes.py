@@ -78,7 +78,7 @@ def judge():
     """Controller, or the name of one, to its score: nominal, randomised, off-nominal drones and one from elsewhere."""
     import numpy as np
 
-    from cfb_mjx.control.pilot import find_pilot
+    from cfb_mjx.control.controllers import find_controller
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.train.flying import hover
     from cfb_mjx.train.judge import Judge, summary
@@ -86,10 +86,10 @@ def judge():
     drones = Judge()
     elsewhere = Quadrotor.from_file(ELSEWHERE)
 
-    def score(pilot) -> dict:
-        pilot = find_pilot(pilot, drones.nominal) if isinstance(pilot, str | Path) else pilot
-        there = summary(hover(pilot, drones.calm, elsewhere, drones.few)[0], np.mean)
-        return drones(pilot) | {ELSEWHERE: there}
+    def score(of) -> dict:
+        controller = find_controller(of, drones.nominal) if isinstance(of, str | Path) else of
+        there = summary(hover(controller, drones.calm, elsewhere, drones.few)[0], np.mean)
+        return drones(controller) | {ELSEWHERE: there}
 
     return score
 

@@ -31,7 +31,8 @@ gc.set_threshold(50_000, 20, 10)
 # `Vec`, whose arithmetic of single numbers has no shapes to check: that took a fifth of the time of tests that trace.
 MODEL = Path(cfb_mjx.__file__).with_name("model")
 CHECKED = [f"cfb_mjx.model.{module.name}" for module in iter_modules([str(MODEL)]) if module.name != "vector"]
-install_import_hook([*CHECKED, "cfb_mjx.parameters", "cfb_mjx.envs", "cfb_mjx.control"], "beartype.beartype")
+CHECKED += ["cfb_mjx.engine", "cfb_mjx.parameters", "cfb_mjx.envs", "cfb_mjx.control"]
+install_import_hook(CHECKED, "beartype.beartype")
 
 
 def pytest_configure(config) -> None:

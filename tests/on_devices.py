@@ -50,17 +50,9 @@ def fitted(estimator):
 
 def flights():
     """What `cfb fly --plants 3` measures."""
-    import json
-    import tempfile
-    from pathlib import Path
+    from cfb_mjx.commands import Fly
 
-    from cfb_mjx.cli.flying import Outputs, Turn, run_fly
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "f.json"
-        outputs = Outputs(json=path)
-        run_fly("pid", "hover", "cfb-guards", 3, 1.0, "paper", None, True, 0, outputs, Turn(), devices=DEVICES)
-        said = json.loads(path.read_text())
+    said = Fly("pid", task="hover", plants=3, magnitude=1.0, devices=DEVICES).run().numbers
     return np.array([*said["quantiles"]["mean_distance_mm"].values(), said["command_std"]])
 
 

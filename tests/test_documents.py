@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfb_mjx import documents
-from cfb_mjx.cli.commands import COMMANDS
-from cfb_mjx.cli.flying import Outputs, Turn, run_fly
+from cfb_mjx.commands import Fly, load
 from cfb_mjx.control.manoeuvre_file import load_manoeuvre
 from cfb_mjx.documents import load_yaml, parse_yaml, told
 from cfb_mjx.errors import CfbError
@@ -53,7 +52,7 @@ PLANTS = written("plants", "off-nominal.yaml")
 READERS = {
     "training": (TrainingConfig().to_mapping(), load_config),
     "flip training": (FlipTrainingConfig().to_mapping(), load_config),
-    "sweep": (SWEEP, lambda path: tasks_of(load_sweep(path, COMMANDS))),
+    "sweep": (SWEEP, lambda path: tasks_of(load_sweep(path, load))),
     "manoeuvre": (written("manoeuvres", "double-flip.yaml"), load_manoeuvre),
     "randomisation": (written("randomisation", "paper.yaml"), load_randomisation),
     "model": (written("parameters", "cfb.yaml") | {"effects": DRAG}, Quadrotor.from_file),
@@ -216,4 +215,4 @@ def test_seeds_that_jax_would_cut_short_are_refused():
         with pytest.raises(CfbError, match=f"--seed {seed} must be from 0 to"):
             with_changes(load_config("target"), seed=seed)
         with pytest.raises(CfbError, match=f"--seed {seed} must be from 0 to"):
-            run_fly("pid", None, "cfb", 1, 0.0, "paper", None, True, seed, Outputs(), Turn())
+            Fly("pid", seed=seed).run()

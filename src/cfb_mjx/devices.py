@@ -7,7 +7,6 @@ whole batch is left to the compiler only where it is little more than matrix pro
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -22,13 +21,9 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.runtime import cores
 
 AXIS = "devices"
-
-
-def cores() -> int:
-    """CPU cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def over_cores(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:

@@ -217,6 +217,10 @@ def require_folder(*paths: str | os.PathLike | None) -> None:
             raise CfbError(f"{path}: the folder {Path(path).parent} does not exist; create it first.")
 
 
+FIGURES = (".svg", ".png", ".pdf")
+"""Formats that figures are written in."""
+
+
 def require_ending(path: str | os.PathLike, endings: tuple[str, ...], demand: str) -> Path:
     """The path, if it ends in one of ``endings``, in small or capital letters.
 

@@ -2,7 +2,7 @@
 
 Every process runs the same program; arrays are divided over the devices of all of them (`cfb_mjx.devices`). Files are
 read and written by the first alone, so that the others need no common folder. ``jax.distributed.initialize`` comes
-before anything else; ``cfb train --coordinator`` calls it.
+before anything else; for ``cfb train --coordinator`` `cfb_mjx.joining` calls it.
 """
 
 from __future__ import annotations

@@ -75,6 +75,11 @@ def differentiate_mjx() -> None:
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "").replace(XLA_CPU_FLAGS, "").strip()
 
 
+def cores() -> int:
+    """CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def say(text: str) -> None:
     """A line of progress."""
     print(f"... {text}", file=sys.stderr, flush=True)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cfb_mjx.cli.rotor_fitting import run_fit_rotors
+from cfb_mjx.commands import FitRotors
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters import load_model_file
 
@@ -26,7 +26,7 @@ def save(path, **columns):
 @pytest.fixture(autouse=True)
 def _keep_settings(monkeypatch):
     """The tests' own precision and compile cache stay."""
-    monkeypatch.setattr("cfb_mjx.cli.rotor_fitting.configure_jax", lambda x64: None)
+    monkeypatch.setattr("cfb_mjx.runtime.configure_jax", lambda x64: None)
 
 
 @pytest.fixture(scope="module")
@@ -44,11 +44,11 @@ def folder(tmp_path_factory):
     return folder
 
 
-def test_steps_and_maps_together_make_one_model(folder, tmp_path, capsys):
+def test_steps_and_maps_together_make_one_model(folder, tmp_path):
     paths = [folder / "steps.csv", folder / "map.csv"]
     out, figure = tmp_path / "rotors.yaml", tmp_path / "rotors.png"
     options = {"robust": True, "json": tmp_path / "r.json", "figure": figure}
-    run_fit_rotors(paths, out, "cfb-guards", ["mass=0.045"], **options)
+    fitted = FitRotors(paths, out, set="mass=0.045", **options).run()
     model = load_model_file(out)
     values = {key: entry.value for key, entry in model.entries.items()}
     assert values["motor_time_constant"] == pytest.approx(np.full(4, 0.045), rel=0.03)
@@ -58,6 +58,8 @@ def test_steps_and_maps_together_make_one_model(folder, tmp_path, capsys):
         np.testing.assert_allclose(np.polyval(values[name], s), np.polyval(truth, s), rtol=0.035)
         assert model.entries[name].std.shape == (3,)
     assert "fit-rotors on 2 file(s)" in model.entries["motor_gain"].source
+    command = "cfb fit-rotors steps.csv map.csv -o rotors.yaml --set mass=0.045 --robust --json r.json"
+    assert model.provenance["command"] == f"{command} --figure rotors.png"
     assert set(model.provenance["files_sha256"]) == {"steps.csv", "map.csv"}
     assert float(values["mass"]) == 0.045
     assert values["motor_speed_offset"] == pytest.approx(0)
@@ -69,20 +71,20 @@ def test_steps_and_maps_together_make_one_model(folder, tmp_path, capsys):
     assert result["maps"]["thrust"]["points"]["weight"][7] < 0.1
     assert result["motors"]["all"]["extras"]["dead_time"]["supported"] is False
     assert figure.read_bytes()[:4] == b"\x89PNG"
-    text = capsys.readouterr().out
+    text = str(fitted)
     assert "offset: not supported by the data" in text
     assert "thrust: 48 points" in text
 
 
 def test_motors_apart(folder, tmp_path):
-    run_fit_rotors([folder / "map.csv"], tmp_path / "m.yaml", "cfb", [], per_motor=True, robust=True)
+    FitRotors(folder / "map.csv", tmp_path / "m.yaml", model="cfb", per_motor=True, robust=True).run()
     scale = load_model_file(tmp_path / "m.yaml").entries["thrust_scale"]
     np.testing.assert_allclose(scale.value, [1.03, 0.99, 0.99, 0.99], atol=0.008)
     assert np.all(scale.std < 0.005)
 
 
 @pytest.mark.parametrize("follows", [True, False])
-def test_steps_under_a_supply_that_sags(tmp_path, capsys, follows):
+def test_steps_under_a_supply_that_sags(tmp_path, follows):
     """Speed follows command times voltage, unless the controller keeps it."""
     rng = np.random.default_rng(1)
     command = 0.8 * steps(rng, 6.0)
@@ -98,20 +100,20 @@ def test_steps_under_a_supply_that_sags(tmp_path, capsys, follows):
             "rpm": made.rotor_speed[:, 0] * 30 / np.pi,
         },
     )
-    run_fit_rotors([path], tmp_path / "m.yaml", "cfb-guards", [], json=tmp_path / "r.json")
+    fitted = FitRotors(path, tmp_path / "m.yaml", json=tmp_path / "r.json").run()
     told = json.loads((tmp_path / "r.json").read_text())["parameters"]
     for name, truth in (("motor_gain", 2300.0), ("motor_speed_offset", 300.0), ("motor_time_constant", 0.045)):
         assert abs(told[name]["value"] - truth) < 4 * told[name]["std"] + 0.01 * truth, name
     said = "speed follows command times voltage" if follows else "speed does not follow the voltage of the supply"
-    assert said in capsys.readouterr().out
+    assert said in str(fitted)
 
 
 def test_thrust_of_another_drone_names_its_model(tmp_path):
     speed = np.linspace(800, 2600, 20)
     path = save(tmp_path / "small.csv", omega=speed, force=1.5e-8 * speed**2)
     with pytest.raises(CfbError, match=r"of what a rotor of cfb-guards pulls and .* of one of cf2x; give --model cf2x"):
-        run_fit_rotors([path], tmp_path / "m.yaml", "cfb-guards", [])
-    run_fit_rotors([path], tmp_path / "m.yaml", "cf2x", [])
+        FitRotors(path, tmp_path / "m.yaml").run()
+    FitRotors(path, tmp_path / "m.yaml", model="cf2x").run()
 
 
 def test_refusals_leave_earlier_results(folder, tmp_path, files):
@@ -125,5 +127,5 @@ def test_refusals_leave_earlier_results(folder, tmp_path, files):
     ]
     for paths, output, message in cases:
         with pytest.raises(CfbError, match=message):
-            run_fit_rotors(paths, output, "cfb-guards", [])
+            FitRotors(paths, output).run()
     assert kept.read_text() == "mine"

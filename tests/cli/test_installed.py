@@ -30,9 +30,9 @@ assert shipped("data", "study", "ppo", "1-0.npz").exists()
 for policy in shipped_policies().values():
     load_policy(policy)
 load_config("target-adaptive")
-from cfb_mjx.cli.commands import COMMANDS
+from cfb_mjx.commands import load
 from cfb_mjx.sweep import load_sweep, tasks_of
-assert len(tasks_of(load_sweep("randomisation", COMMANDS))) == 12
+assert len(tasks_of(load_sweep("randomisation", load))) == 12
 load_plants(load_model_file("cfb-guards"))
 from cfb_mjx.deploy.deployment import find_deployment
 from cfb_mjx.deploy.export import export_policy

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cfb_mjx.cli.flying import summary
 from cfb_mjx.parameters import load_model_file, save_model_file
+from cfb_mjx.train.measuring import summary
 
 pytestmark = pytest.mark.xdist_group("training")
 

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from cfb_mjx.cli import main, refining
+from cfb_mjx.commands import Refine
 from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.logs import read_log
 from cfb_mjx.model.effects import Inertia, RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file
-from cfb_mjx.sysid.refinement import plausible_numbers
+from cfb_mjx.sysid.refinement import model_files, plausible_numbers
 from cfb_mjx.sysid.sensor_faults import HEALTHY
 from cfb_mjx.sysid.tracing.given import Given
 
@@ -43,8 +43,8 @@ def test_a_number_that_ends_at_its_bound_says_so(monkeypatch):
 
     def found(drag):
         given = Given((RotorDrag(coefficient=drag),), {"rotor_drag": {"coefficient": 1e-3}}, HEALTHY)
-        monkeypatch.setattr("cfb_mjx.sysid.tracing.given.fit_given", lambda *_: given)
-        _, report = refining.by_innovations(load_model_file("cfb-guards"), [read_log(LOG)], ["rotor_drag"])
+        monkeypatch.setattr("cfb_mjx.sysid.refinement.model_files.fit_given", lambda *_: given)
+        _, report = model_files.by_innovations(load_model_file("cfb-guards"), [read_log(LOG)], ["rotor_drag"])
         return report["numbers"]["rotor_drag.coefficient"]["at_bound"]
 
     assert found(0.0)
@@ -58,9 +58,10 @@ def test_all_that_a_drone_usually_lacks(monkeypatch, tmp_path):
         asked.extend(names)
         return base, {"numbers": {}, "loss": {"before": 2.0, "after": 1.0}}
 
-    monkeypatch.setattr("cfb_mjx.cli.refining.by_predictions", fit)
-    monkeypatch.setattr("cfb_mjx.cli.refining.configure_jax", lambda x64: None)
-    assert main(["refine", str(LOG), "--effects", "plant", "-o", str(tmp_path / "m.yaml")]) == 0
+    monkeypatch.setattr(model_files, "by_predictions", fit)
+    monkeypatch.setattr("cfb_mjx.runtime.configure_jax", lambda x64: None)
+    refined = Refine(LOG, tmp_path / "m.yaml", effects="plant").run()
+    assert "mean loss 2.0000 -> 1.0000" in str(refined)
     assert {"blade_flapping", "thrust_scale", "inertia", "battery_sag"} <= set(asked)
     assert not {"payload", "payload_swing", "wind", "gust"} & set(asked)
     assert plausible_numbers(load_model_file("cfb-guards").parameters(), asked)
@@ -72,10 +73,10 @@ def test_effects_that_are_not_fitted_anew_keep_what_is_known_of_them(monkeypatch
     inertia = {"name": "inertia", "parameters": {"relative": [0.2, -0.1, 0.4]}, "uncertainty": known}
     effects = (Inertia(relative=[0.2, -0.1, 0.4]), RotorDrag(coefficient=0.01))
     given = Given(effects, {"rotor_drag": {"coefficient": 1e-3}}, HEALTHY)
-    monkeypatch.setattr("cfb_mjx.sysid.tracing.given.fit_given", lambda *_: given)
+    monkeypatch.setattr("cfb_mjx.sysid.refinement.model_files.fit_given", lambda *_: given)
     base = replace(load_model_file("cfb-guards"), effects=(inertia,))
     with pytest.warns(CfbWarning, match="no rigid body"):
-        refined, report = refining.by_innovations(base, [read_log(LOG)], ["rotor_drag"])
+        refined, report = model_files.by_innovations(base, [read_log(LOG)], ["rotor_drag"])
     assert refined.effects[0]["uncertainty"] == known
     assert list(report["numbers"]) == ["rotor_drag.coefficient"]
 
@@ -120,7 +121,7 @@ def test_sensor_faults_of_the_model_stay_out_of_a_fit_as_logged_but_a_stretch_of
         seen.update(effects={e["name"]: e["parameters"] for e in base.effects}, as_logged=as_logged)
         return base, {"numbers": {}}
 
-    monkeypatch.setattr(refining, "by_innovations", fit)
+    monkeypatch.setattr(model_files, "by_innovations", fit)
     stretch = {"scale": 1.1}
     known = (
         {"name": "sensor_velocity_scale", "parameters": stretch},
@@ -132,6 +133,6 @@ def test_sensor_faults_of_the_model_stay_out_of_a_fit_as_logged_but_a_stretch_of
     everything = {item["name"]: item["parameters"] for item in known}
     leaning = {"rotor_drag": {}, "sensor_velocity_scale": stretch | {"with_attitude": 1.0}}
     for as_logged, kept in ((False, everything), (True, leaning)):
-        rest = (str(tmp_path / "faulty.yaml"), [], "rotor_drag", "innovations", False, [], as_logged, None)
-        refining.run_refine([LOG], [], tmp_path / "m.yaml", *rest)
+        how = {"effects": "rotor_drag", "estimator": "innovations", "as_logged": as_logged}
+        Refine(LOG, tmp_path / "m.yaml", model=str(tmp_path / "faulty.yaml"), **how).run()
         assert seen == {"effects": kept, "as_logged": as_logged}

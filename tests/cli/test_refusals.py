@@ -256,9 +256,9 @@ def _messages(source: Path):
 
 
 def test_flags_in_messages_are_flags_of_the_commands():
-    from cfb_mjx.cli.commands import COMMANDS
+    from cfb_mjx.commands import COMMANDS, load
 
-    options = {f"--{name.replace('_', '-')}" for command in COMMANDS.values() for name in signature(command).parameters}
+    options = {f"--{name.replace('_', '-')}" for command in COMMANDS for name in signature(load(command)).parameters}
     options |= {"--help", "--version", "--no", "--head"}  # every command's, cfb's, a switch's, ray's
     package = Path(cfb_mjx.__file__).parent
     named = {

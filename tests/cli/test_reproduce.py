@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cfb_mjx import cli, reproduce
-from cfb_mjx.cli import reproducing
+from cfb_mjx.commands import reproduce as command
 from cfb_mjx.files import replacing
 from cfb_mjx.reproduce.item import Item, Result, Row, write_csv
 
@@ -68,7 +68,7 @@ def items(monkeypatch):
         return Item(name, make, False)
 
     monkeypatch.setattr(reproduce, "ITEMS", {name: item(name) for name in ("one", "two", "three")})
-    monkeypatch.setattr(reproducing, "environment", lambda: {"date": "today"})
+    monkeypatch.setattr("cfb_mjx.runtime.environment", lambda: {"date": "today"})
     return made, stopped
 
 
@@ -103,7 +103,7 @@ def test_what_was_made_by_another_code_or_is_gone_is_made_anew(items, tmp_path, 
     stopped.clear()
     made.clear()
     if change == "code":
-        monkeypatch.setattr(reproducing, "code_identity", lambda: "another")
+        monkeypatch.setattr(command, "code_identity", lambda: "another")
     elif change == "figure":
         (tmp_path / "one.png").unlink()
     elif change == "page":

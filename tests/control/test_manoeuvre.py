@@ -27,9 +27,9 @@ def estimate(velocity=0.0, roll=0.0, position=0.0) -> Estimate:
 
 
 def phases(knobs: Knobs, estimates: list[Estimate]) -> list[int]:
-    pilot = Manoeuvre(HOLDER, TURNER, knobs)
-    memory, found = pilot.start(estimates[0], jnp.full(4, 0.55)), []
-    advance = jax.jit(lambda memory, seen: pilot.command(memory, seen))
+    controller = Manoeuvre(HOLDER, TURNER, knobs)
+    memory, found = controller.start(estimates[0], jnp.full(4, 0.55)), []
+    advance = jax.jit(lambda memory, seen: controller.command(memory, seen))
     for one in estimates:
         memory, command = advance(memory, one)
         assert np.all((command >= 0) & (command <= 1))
@@ -57,16 +57,16 @@ def test_the_turn_ends_with_its_angle_over_more_than_one_turn():
 
 
 def test_each_phase_flies_the_policy_it_should():
-    pilot = Manoeuvre(HOLDER, TURNER, KNOBS)
+    controller = Manoeuvre(HOLDER, TURNER, KNOBS)
     seen = estimate(0.2, 0.1, 0.3)
-    memory = pilot.start(seen, jnp.full(4, 0.55))
-    _, climbing = pilot.command(memory, seen)
+    memory = controller.start(seen, jnp.full(4, 0.55))
+    _, climbing = controller.command(memory, seen)
     raised = replace_position(seen, seen.position - jnp.array([0.0, 0.0, 2.0]))
     np.testing.assert_allclose(climbing, HOLDER.command(HOLDER.start(raised, 0.55), raised)[1], rtol=1e-6)
-    _, turning = pilot.command(memory._replace(phase=jnp.asarray(TURN)), seen)
+    _, turning = controller.command(memory._replace(phase=jnp.asarray(TURN)), seen)
     asked = jnp.array([KNOBS.speed_mps, KNOBS.rate_radps])
     np.testing.assert_allclose(turning, TURNER.command(TURNER.start(seen, 0.55), seen, asked)[1], rtol=1e-6)
-    _, catching = pilot.command(memory._replace(phase=jnp.asarray(CATCH)), seen)
+    _, catching = controller.command(memory._replace(phase=jnp.asarray(CATCH)), seen)
     np.testing.assert_allclose(catching, HOLDER.command(HOLDER.start(seen, 0.55), seen)[1], rtol=1e-6)
 
 
@@ -75,11 +75,11 @@ def replace_position(seen: Estimate, position) -> Estimate:
 
 
 def test_the_integral_of_the_catch_begins_with_the_catch():
-    pilot = Manoeuvre(HOLDER, TURNER, KNOBS)
+    controller = Manoeuvre(HOLDER, TURNER, KNOBS)
     seen = estimate(position=0.2)
-    memory = pilot.start(seen, jnp.full(4, 0.55))
+    memory = controller.start(seen, jnp.full(4, 0.55))
     for i in range(32):
-        memory, _ = pilot.command(memory, seen)
+        memory, _ = controller.command(memory, seen)
         assert bool(jnp.any(memory.catch.integral != 0)) == (i >= 30)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cfb_mjx.cli import SUMMARY
+from cfb_mjx.commands import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[2]
 # Built once.
@@ -54,7 +54,7 @@ def test_lists_within_lists_are_lists(site):
 
 def test_every_command_is_explained(site):
     text = (site / "cli.html").read_text()
-    for name in SUMMARY:
+    for name in COMMANDS:
         assert f'id="cfb-{name}"' in text
     assert "--held-out" in text
     assert "[1m" not in text  # no terminal colours

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfb_mjx.control.pilot import find_pilot, has_lumped_delay
+from cfb_mjx.control.controllers import find_controller, has_lumped_delay
 from cfb_mjx.envs import Starts, TargetTask, reset, step, with_room
 from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.envs.gym import TargetVectorEnv
@@ -147,7 +147,9 @@ def test_the_firmwares_pid_flies_on_a_late_pose_as_long_as_its_gyro_is_its_own()
 
     def swing(lumped):
         task = replace(TASK, lumped_delay=lumped)
-        flown = jax.jit(lambda key: fly(find_pilot("pid", drone), task, drone, key, 4.0, start))(jax.random.PRNGKey(0))
+        flown = jax.jit(lambda key: fly(find_controller("pid", drone), task, drone, key, 4.0, start))(
+            jax.random.PRNGKey(0)
+        )
         last = len(flown.command) * 3 // 4
         return float(jnp.abs(flown.body_rate[last:, :2]).max())
 

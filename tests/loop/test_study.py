@@ -8,9 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from cfb_mjx.commands import DemoLoop
 from cfb_mjx.errors import CfbError
 from cfb_mjx.labelled_plants import EFFECTS
-from cfb_mjx.loop.study import Cell, Steps, cells_of, run
+from cfb_mjx.loop import steps
+from cfb_mjx.loop.cells import Cell, cells_of
+from cfb_mjx.loop.study import study
 from cfb_mjx.loop.summary import summarise
 from cfb_mjx.view import html_page
 from cfb_mjx.view.closed_loop import TITLE, lead, loop_figure, sections
@@ -29,49 +32,24 @@ def trial(hover, track):
     return {"hover_mm": [hover, hover], "command_std": [0.01, 0.01], "track_m": [track], "crashed": 0}
 
 
-class Counted:
-    """Steps that only count, and stop where told."""
+def report(own):
+    effect = own.name.rpartition("-")[0]
+    after = {key: value / 10 for key, value in ERRORS.items()}
+    kept = {"unexplained": False, "unexplained_because": None, "unconfirmed": []}
+    return {"effects": [{"name": NAMED[effect]}], **kept, "held_out": {"before": ERRORS, "after": after}}
 
-    def __init__(self, stop_at=None):
-        self.done, self.stop_at = [], stop_at
 
-    def step(self, name, result):
-        def act(*arguments):
-            cell = next(a.name for a in arguments if isinstance(a, Cell | Path))
-            if (name, cell) == self.stop_at:
-                raise KeyboardInterrupt
-            self.done.append((name, cell))
-            return result(*arguments)
-
-        return act
-
-    def steps(self):
-        def report(own):
-            effect = own.name.rpartition("-")[0]
-            found = [{"name": NAMED[effect]}]
-            after = {key: value / 10 for key, value in ERRORS.items()}
-            kept = {"unexplained": False, "unexplained_because": None, "unconfirmed": []}
-            return {"effects": found, **kept, "held_out": {"before": ERRORS, "after": after}}
-
-        def judged(cell, shared, own):
-            good = cell.effect == "payload"
-            return {
-                "nominal": trial(40.0, 0.06) if good else trial(20.0, 0.05),
-                "longer": trial(38.0, 0.06),
-                "randomised": trial(20.0, 0.04),
-                "corrected": trial(5.0, 0.05) if good else trial(25.0, 0.06),
-                "both": trial(6.0, 0.03),
-                "without_effect": trial(4.0, 0.05) if good else trial(19.0, 0.05),
-                "environment": {"date": "2000-01-01", "processor": "none"},
-            }
-
-        return Steps(
-            self.step("common", lambda seed, folder: {}),
-            self.step("fly", lambda *_: {}),
-            self.step("close", report),
-            self.step("learn", lambda *_: {}),
-            self.step("judge", judged),
-        )
+def judged(cell, policies, own):
+    good = cell.effect == "payload"
+    return {
+        "nominal": trial(40.0, 0.06) if good else trial(20.0, 0.05),
+        "longer": trial(38.0, 0.06),
+        "randomised": trial(20.0, 0.04),
+        "corrected": trial(5.0, 0.05) if good else trial(25.0, 0.06),
+        "both": trial(6.0, 0.03),
+        "without_effect": trial(4.0, 0.05) if good else trial(19.0, 0.05),
+        "environment": {"date": "2000-01-01", "processor": "none"},
+    }
 
 
 SETTINGS = {
@@ -90,6 +68,30 @@ SETTINGS = {
     "trials": {"HOVERS": 2, "HOVER_S": 6.0, "SETTLING_S": 1.0, "TRACKS": 1, "TRACK_S": 9.0, "ENTRY_S": 3.0}
     | {"WIDTH_M": 1.0, "DEPTH_M": 0.5, "PERIOD_S": 6.0},
 }
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Steps that only count: what was done of which cell, and where to stop."""
+    done, stops = [], []
+
+    def step(name, result):
+        def act(*arguments):
+            cell = next(a.name for a in arguments if isinstance(a, Cell | Path))
+            if (name, cell) in stops:
+                raise KeyboardInterrupt
+            done.append((name, cell))
+            return result(*arguments)
+
+        monkeypatch.setattr(steps, name, act)
+
+    step("train_common", lambda seed, folder: {})
+    step("fly", lambda *_: {})
+    step("close", report)
+    step("learn", lambda *_: {})
+    step("judge", judged)
+    monkeypatch.setattr(steps, "settings", lambda: SETTINGS)
+    return done, stops
 
 
 def test_cells_go_seed_by_seed_and_share_no_draws():
@@ -111,37 +113,53 @@ def test_cells_go_seed_by_seed_and_share_no_draws():
         ((("wind",), 1, -1), "--seed -1"),
     ],
 )
-def test_what_cannot_be_flown_is_refused(arguments, says):
+def test_what_cannot_be_flown_is_refused(tmp_path, arguments, says):
     with pytest.raises(CfbError, match=says):
-        cells_of(*arguments)
+        DemoLoop(tmp_path, *arguments).run()
+    assert not any(tmp_path.iterdir())
 
 
-def test_an_interrupted_study_goes_on_where_it_was(tmp_path):
+def test_an_interrupted_study_goes_on_where_it_was(tmp_path, counted):
+    done, stops = counted
     cells = cells_of(("payload", "wind"), 1)
-    broken = Counted(stop_at=("learn", "wind-61000"))
+    stops.append(("learn", "wind-61000"))
     with pytest.raises(KeyboardInterrupt):
-        run(cells, tmp_path, broken.steps(), SETTINGS)
+        list(study(cells, tmp_path))
     assert (tmp_path / "cells" / "payload-61000" / "result.json").exists()
-    whole, seen = Counted(), []
-    results = run(cells, tmp_path, whole.steps(), SETTINGS, finished=lambda r: seen.append(list(r["cells"])))
-    assert [name for name, what in whole.done if what == "payload-61000"] == []
-    assert [name for name, what in whole.done if what == "wind-61000"] == ["fly", "close", "learn", "judge"]
-    assert seen == [["payload-61000"], ["payload-61000", "wind-61000"]]
-    nothing = Counted()
-    assert json.dumps(run(cells[:1], tmp_path, nothing.steps(), SETTINGS)) == json.dumps(results)
-    assert {name for name, _ in nothing.done} == {"common"}
+    stops.clear()
+    done.clear()
+    seen = [json.loads(json.dumps(results)) for results in study(cells, tmp_path)]
+    assert [name for name, what in done if what == "payload-61000"] == []
+    assert [name for name, what in done if what == "wind-61000"] == ["fly", "close", "learn", "judge"]
+    assert [list(results["cells"]) for results in seen] == [["payload-61000"], ["payload-61000", "wind-61000"]]
+    done.clear()
+    assert [json.loads(json.dumps(results)) for results in study(cells[:1], tmp_path)] == seen[1:]
+    assert {name for name, _ in done} == {"train_common"}
 
 
-def test_a_folder_is_for_one_kind_of_study(tmp_path):
+def test_a_folder_is_for_one_kind_of_study(tmp_path, counted, monkeypatch):
     cells = cells_of(("payload",), 1)
-    run(cells, tmp_path, Counted().steps(), SETTINGS)
+    list(study(cells, tmp_path))
+    monkeypatch.setattr(steps, "settings", lambda: SETTINGS | {"further": ("analytic.updates=3",)})
     with pytest.raises(CfbError, match="other settings"):
-        run(cells, tmp_path, Counted().steps(), SETTINGS | {"further": ("analytic.updates=3",)})
+        list(study(cells, tmp_path))
+
+
+def test_the_command_writes_what_was_found(tmp_path, counted, capsys):
+    found = DemoLoop(tmp_path / "loop", effects=("payload", "wind"), seeds=2).run()
+    assert json.loads((tmp_path / "loop" / "loop.json").read_text()) == json.loads(json.dumps(found.numbers))
+    assert "close-loop named the effect of 2 of 4" in str(found)
+    assert str(found).splitlines()[1:] == [f"{what}: {path}" for what, path in found.files.items()]
+    assert all(path.stat().st_size > 1000 for path in found.files.values())
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert "wind, seed 61100 (4 of 4)" in said.err
 
 
 @pytest.fixture
-def results(tmp_path):
-    return run(cells_of(("payload", "wind"), 3), tmp_path, Counted().steps(), SETTINGS)
+def results(tmp_path, counted):
+    *_, last = study(cells_of(("payload", "wind"), 3), tmp_path)
+    return last
 
 
 def test_a_summary_is_of_medians_and_says_what_did_not_help(results):

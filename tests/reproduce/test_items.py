@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from cfb_mjx.control.pilot import find_pilot
+from cfb_mjx.control.controllers import find_controller
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.files import shipped
@@ -120,14 +120,14 @@ def test_flights_of_a_brushed_drone_are_read_from_its_cards():
 
 def test_a_target_that_jumps_is_reached_every_time_and_the_first_time_as_in_a_single_step():
     nominal = Quadrotor.from_file("cfb-guards")
-    pilot, task, key = find_pilot("target", nominal), TargetTask(noise=QUIET), jax.random.PRNGKey(0)
-    flown = back_and_forth(pilot, task, nominal, key, legs=3, leg_s=2.5)
-    steps = round(2.5 / pilot.control_dt_s)
+    controller, task, key = find_controller("target", nominal), TargetTask(noise=QUIET), jax.random.PRNGKey(0)
+    flown = back_and_forth(controller, task, nominal, key, legs=3, leg_s=2.5)
+    steps = round(2.5 / controller.control_dt_s)
     for leg, target in enumerate((STEP_DISTANCE_M, 0.0, STEP_DISTANCE_M)):
         there = slice(leg * steps, (leg + 1) * steps)
         np.testing.assert_array_equal(flown.watched[there, 0], target)
         assert abs(float(flown.position[there][-1, 0]) - target) < 0.1
-    single = six_metres(pilot, task, nominal, key[None])[1].position[0, :steps]
+    single = six_metres(controller, task, nominal, key[None])[1].position[0, :steps]
     # A network that is told of the jump at once flies it as if it had begun far off; it remembers the time before.
     np.testing.assert_allclose(flown.position[:steps] - np.array([STEP_DISTANCE_M, 0, 0]), single, atol=0.3)
 

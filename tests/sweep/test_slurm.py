@@ -4,8 +4,7 @@ import os
 import subprocess
 from pathlib import Path
 
-from cfb_mjx.cli.commands import COMMANDS
-from cfb_mjx.cli.sweeping import complaint_of
+from cfb_mjx.commands.line import parse
 
 SCRIPT = Path(__file__).resolve().parents[2] / "scripts" / "slurm_sweep.sh"
 JOB = {"SLURM_JOB_NODELIST": "n[1-2]", "SLURM_JOB_ID": "70001", "SLURM_JOB_NUM_NODES": "2", "SLURM_CPUS_PER_TASK": "8"}
@@ -28,7 +27,7 @@ def test_ray_is_started_on_all_machines_and_the_sweep_on_the_first(tmp_path):
     assert outer[:3] == ["--nodes=2", "--ntasks=2", "--ntasks-per-node=1"]
     assert outer[3:10] == ["python", "-m", "ray.scripts.symmetric_run", "--address", "n1:30001", "--min-nodes", "2"]
     assert inner == ["cfb", "sweep", "a sweep.yaml", "-o", "out", "--address", "n1:30001", "--retries", "5"]
-    assert complaint_of(inner[1:], COMMANDS["sweep"]) is None
+    assert parse("sweep", inner[2:]).retries == 5
 
 
 def test_without_a_folder_it_says_how_it_is_called(tmp_path):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfb_mjx.cli import exciting
+from cfb_mjx.commands import Excite
 from cfb_mjx.control import FirmwarePid, PositionHold
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import read_log
@@ -27,6 +27,7 @@ from cfb_mjx.sysid.excitation.manoeuvres import (
     worst,
 )
 from cfb_mjx.sysid.excitation.safety import attained
+from cfb_mjx.sysid.excitation.trials import FLIGHTS
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.unknowns import choose
 
@@ -187,27 +188,18 @@ def test_what_the_flight_cannot_tell_is_named_and_gets_no_number(flights):
         predict([log], choose("inertia,pose_delay", MODEL.parameters))
 
 
+@pytest.fixture
+def compiled(monkeypatch):
+    """Leave jax as the other tests have it, with what they compiled."""
+    monkeypatch.setattr("cfb_mjx.runtime.configure_jax", lambda x64: None)
+
+
 def run(output, **changes):
-    arguments = {
-        "manoeuvre": "roll-pitch",
-        "output": output,
-        "parameters": NAMES,
-        "model": "cfb-guards",
-        "changes": [],
-        "repetitions": REPETITIONS,
-        "duration": 0.5,
-        "rate_limit": 12.0,
-        "altitude_loss": 0.5,
-        "measured_rotors": False,
-        "disturbance": 4.0,
-        "json": None,
-    }
-    exciting.run_excite(**arguments | changes)
+    return Excite("roll-pitch", output, **{"parameters": NAMES, "repetitions": REPETITIONS} | changes).run()
 
 
-def test_the_command_writes_what_to_fly_and_what_to_expect(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(exciting, "configure_jax", lambda x64: None)
-    run(tmp_path / "design", json=tmp_path / "copy.json")
+def test_the_command_writes_what_to_fly_and_what_to_expect(tmp_path, compiled):
+    found = run(tmp_path / "design", json=tmp_path / "copy.json")
     folder = tmp_path / "design"
     table = np.loadtxt(folder / "commands.csv", delimiter=",", skiprows=1)
     assert (folder / "commands.csv").read_text().startswith("t,u1,u2,u3,u4\n0.000,")
@@ -215,11 +207,16 @@ def test_the_command_writes_what_to_fly_and_what_to_expect(tmp_path, monkeypatch
     result = json.loads((folder / "excitation.json").read_text())
     assert result == json.loads((tmp_path / "copy.json").read_text())
     assert set(result["parameters"]) | set(result["unidentifiable"]) == set(UNKNOWNS.names)
-    assert result["with_disturbances"]["repetitions"] == exciting.FLIGHTS * REPETITIONS
+    assert result["with_disturbances"]["repetitions"] == FLIGHTS * REPETITIONS
     assert result["undisturbed"]["caught"]
     assert len(read_log(folder / "flight.mcap")) > 1000
     assert (folder / "excitation.png").stat().st_size > 10_000
-    assert "inertia_xx" in capsys.readouterr().out
+    assert found.numbers["parameters"]["inertia_xx"] == result["parameters"]["inertia_xx"]
+    assert set(found.parameters) == set(UNKNOWNS.names)
+    text = str(found).splitlines()
+    assert text[0] == "roll-pitch: 0.5 s, 2 repetitions in one flight, commands only, disturbance 4 rad/s^2"
+    assert any(line.startswith("inertia_xx") for line in text)
+    assert text[-2:] == [f"results: {folder / 'excitation.json'}", f"results: {tmp_path / 'copy.json'}"]
 
 
 @pytest.mark.parametrize(
@@ -233,8 +230,7 @@ def test_the_command_writes_what_to_fly_and_what_to_expect(tmp_path, monkeypatch
         ({"parameters": "colour"}, "colour"),
     ],
 )
-def test_impossible_requests_are_refused_in_one_sentence(tmp_path, monkeypatch, changes, said):
-    monkeypatch.setattr(exciting, "configure_jax", lambda x64: None)
+def test_impossible_requests_are_refused_in_one_sentence(tmp_path, compiled, changes, said):
     with pytest.raises(CfbError) as refused:
         run(tmp_path / "design", **changes)
     assert said in str(refused.value)

@@ -272,7 +272,7 @@ def folder(tmp_path) -> Path:
 
 def test_processed_files_count_row_by_row(folder, tmp_path, capsys, monkeypatch):
     """As the benchmark's own evaluation takes them: the ground too, copies that were held too."""
-    monkeypatch.setattr("cfb_mjx.cli.nanodrone.configure_jax", lambda x64: None)
+    monkeypatch.setattr("cfb_mjx.runtime.configure_jax", lambda x64: None)
     out = tmp_path / "result.json"
     assert main(["benchmark-nanodrone", str(folder), "--official"]) == 2
     assert "is a raw merge of the benchmark" in capsys.readouterr().err
@@ -294,7 +294,7 @@ def test_processed_files_count_row_by_row(folder, tmp_path, capsys, monkeypatch)
 
 def test_the_command_writes_its_table_and_json(folder, tmp_path, capsys, monkeypatch):
     # The session's own settings of jax stay: others would compile every program anew.
-    monkeypatch.setattr("cfb_mjx.cli.nanodrone.configure_jax", lambda x64: None)
+    monkeypatch.setattr("cfb_mjx.runtime.configure_jax", lambda x64: None)
     out = tmp_path / "result.json"
     assert main(["benchmark-nanodrone", str(folder), "--model", "cfb-guards", "--json", str(out)]) == 0
     printed = capsys.readouterr().out

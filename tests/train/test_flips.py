@@ -31,7 +31,7 @@ WILD = TargetTask(randomisation=load_randomisation("paper"))
 
 
 def shipped(name: str) -> Manoeuvre:
-    return find_deployment(name).pilot
+    return find_deployment(name).controller
 
 
 def keys(count: int):

@@ -14,9 +14,9 @@ import jax
 import numpy as np
 import pytest
 
-from cfb_mjx.cli.hosts import BOUND, Hosts, _arguments
 from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.errors import CfbError
+from cfb_mjx.joining import BOUND, Hosts, _arguments
 from cfb_mjx.train.checkpoint import read_about
 from cfb_mjx.train.run import CHECKPOINT, CURVE, POLICY
 
@@ -136,7 +136,7 @@ def test_two_processes_train_what_one_does(cache, alone, tmp_path):
 LISTENING = """
 import sys
 from pathlib import Path
-from cfb_mjx.cli.hosts import Hosts, _join
+from cfb_mjx.joining import Hosts, _join
 _join(Hosts(sys.argv[1], 1, 0))
 for table in ("tcp", "tcp6"):
     for line in Path(f"/proc/self/net/{table}").read_text().splitlines()[1:]:

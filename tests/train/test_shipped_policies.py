@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import yaml
 
+from cfb_mjx.control.controllers import find_controller
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.control.pilot import find_pilot
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.model import Quadrotor
@@ -63,7 +63,9 @@ def test_it_does_not_swing_where_sensors_are_later_or_noisier(name):
 
 def test_the_firmware_needs_its_gyro_on_the_drone_and_not_its_pose():
     """Its rate loop is fast and its position loop slow: of what the judge changes, late rates alone make it swing."""
-    late_pose, all_late, _ = Judge(plants=None, random_drones=0).with_sensors(find_pilot("pid", DRONE), False).values()
+    late_pose, all_late, _ = (
+        Judge(plants=None, random_drones=0).with_sensors(find_controller("pid", DRONE), False).values()
+    )
     assert late_pose["failed"] == 0
     assert late_pose["command_std"] < 0.05
     assert all_late["command_std"] > 0.15

@@ -1,4 +1,4 @@
-"""``cfb bench``: throughput beside the peers, from one run on one machine."""
+"""Throughput beside the peers, from one run on one machine."""
 
 from __future__ import annotations
 
@@ -7,20 +7,21 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 
 from cfb_mjx.bench import page, workloads
 from cfb_mjx.bench.first_call import first_call
+from cfb_mjx.bench.roofline import roofline as roofline_of_machine
 from cfb_mjx.bench.scaling import scaling
 from cfb_mjx.bench.timed_process import TimedProcess
-from cfb_mjx.devices import Devices, cores
+from cfb_mjx.devices import Devices
+from cfb_mjx.engine.gpu import kernel_is_chosen
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import require_folder, write_json, write_text
-from cfb_mjx.model.acceleration import kernel_is_chosen
-from cfb_mjx.runtime import configure_jax, environment
+from cfb_mjx.runtime import cores, environment, say
 
 TURN_S = 0.03
 """Runs shorter than this are repeated for as long within a turn: a single one of microseconds says little."""
@@ -73,28 +74,27 @@ def _bound_to(core: int | None) -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def run_bench(
-    drones: list[int],
-    json: Path | None,
-    markdown: Path | None,
-    peer_python: Path | None,
-    quick: bool,
-    roofline: bool = False,
-):
-    """Measure, print, write.
+def benchmark(
+    drones: Sequence[int], peer_python: Path | None = None, quick: bool = False, roofline: bool = False
+) -> dict[str, Any]:
+    """Measure, and say how far it is.
+
+    Args:
+        drones: batch sizes.
+        peer_python: a Python that has crazyflow installed, to measure it side by side.
+        quick: fewer rows and repetitions.
+        roofline: measure also how near this comes to what the machine can do.
+
+    Returns:
+        In JSON terms: ``rows``, ``environment``, ``first_call``; ``scaling`` unless ``quick``; ``roofline`` if asked
+        for.
 
     Raises:
-        CfbError: impossible batch sizes, no such peer, outputs that cannot be written.
+        CfbError: no such peer.
     """
-    if not drones or min(drones) < 1:
-        raise CfbError("--drones must be whole numbers from 1.")
-    require_folder(json, markdown)
-    # A CPU shows itself as one device per core, where the backend has not started yet.
-    configure_jax(x64=False, devices=cores())
     # A program from the cache would make compile time look like nothing.
     jax.config.update("jax_enable_compilation_cache", False)
     over, rows = Devices.take(jax.local_device_count()), []
-    print(f"{'what':<20}{'body':<18}{'drones':>7}{'devices':>8}{'steps/s':>12}{'compile s':>11}{'memory MB':>11}")
     for count in drones:
         several = over if over.several and count >= 64 and count % over.count == 0 else None
         with tempfile.TemporaryDirectory() as folder:
@@ -104,23 +104,20 @@ def run_bench(
             for group in groups:
                 best = _alternate(group, QUICK_TURNS) if quick else _alternate(group, TURNS, TURNS_S)
                 for item, seconds in zip(group, best, strict=True):
-                    rows.append(_row(item, count, seconds))
+                    row = _row(item, count, seconds)
+                    rows.append(row)
+                    say(f"{row['what']} of {count}, {page.body(row)}: {row['steps_per_s']:.3g} steps/s")
                     if isinstance(item, Peer):
                         item.close()
-    result = {"rows": rows, "environment": environment()}
-    result |= {"first_call": first_call()} | ({} if quick else {"scaling": scaling()})
+    say("measuring the first call")
+    result = {"rows": rows, "environment": environment(), "first_call": first_call()}
+    if not quick:
+        say("measuring one core and two")
+        result["scaling"] = scaling()
     if roofline:
-        from cfb_mjx.bench.roofline import roofline as measure
-        from cfb_mjx.bench.roofline import section
-
-        result["roofline"] = measure()
-        print(section(result["roofline"]))
-    for line in page.ratios(result):
-        print(line)
-    if json is not None:
-        write_json(json, result)
-    if markdown is not None:
-        write_text(markdown, page.page(result, os.environ.get("XLA_FLAGS", "")))
+        say("measuring what the machine can do")
+        result["roofline"] = roofline_of_machine()
+    return result
 
 
 def _open_loop(count: int, several: Devices | None, python: Path | None) -> list:
@@ -182,11 +179,4 @@ def _row(item: workloads.Workload | Peer, drones: int, seconds: float) -> dict:
         row |= {"version": item.version, "cores": item.cores}
     else:
         row["peak_mb"] = item.peak_mb
-    memory = f"{row['peak_mb']:.1f}" if "peak_mb" in row else ""
-    name = page.body(row)
-    print(
-        f"{row['what']:<20}{name:<18}{drones:>7}{row['devices']:>8}{row['steps_per_s']:>12.3g}"
-        f"{row['compile_s']:>11.2f}{memory:>11}",
-        flush=True,
-    )
     return row

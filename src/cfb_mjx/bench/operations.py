@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from cfb_mjx.model import fleet
+from cfb_mjx.engine import primitive
 
 PLAIN = {
     "add", "sub", "mul", "div", "max", "min", "neg", "abs", "sqrt", "rsqrt", "sign", "floor", "round", "clamp",
@@ -68,9 +68,9 @@ def _equation(equation) -> Operations:
         return (_of(body) + Operations(0.0, 0.0, crossing)).times(parameters["length"])
     if name == "cond":
         return max((_of(_plain(branch)) for branch in parameters["branches"]), key=lambda o: o.plain + o.transcendental)
-    if name in fleet.OPERATIONS:
+    if name in primitive.OPERATIONS:
         given = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in equation.invars]
-        return _of(fleet.meaning(name, given, parameters).jaxpr)
+        return _of(primitive.meaning(name, given, parameters).jaxpr)
     inner = [_plain(p) for p in parameters.values() if hasattr(_plain(p), "eqns")]
     if inner:
         return sum(map(_of, inner), NOTHING)

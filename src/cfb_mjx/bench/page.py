@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import jax
 
 from cfb_mjx.bench import workloads
+from cfb_mjx.bench.roofline import section
 
 
 def body(row: dict) -> str:
@@ -60,6 +64,26 @@ def _beside_peers(rows: list[dict], speed) -> list[str]:
     return lines
 
 
+def text(result: Mapping[str, Any]) -> str:
+    """All rows as a table, and what they say side by side."""
+    head = f"{'what':<20}{'body':<18}{'drones':>7}{'devices':>8}{'steps/s':>12}{'compile s':>11}{'memory MB':>11}"
+    lines = [head, *map(_line, result["rows"])]
+    if "roofline" in result:
+        lines.append(section(result["roofline"]))
+    return "\n".join([*lines, *ratios(result)])
+
+
+def _line(row: dict) -> str:
+    return (
+        f"{row['what']:<20}{body(row):<18}{row['drones']:>7}{row['devices']:>8}{row['steps_per_s']:>12.3g}"
+        f"{row['compile_s']:>11.2f}{_memory(row):>11}"
+    )
+
+
+def _memory(row: dict) -> str:
+    return f"{row['peak_mb']:.1f}" if "peak_mb" in row else ""
+
+
 def page(result: dict, flags: str) -> str:
     """The results as a Markdown page.
 
@@ -73,13 +97,10 @@ def page(result: dict, flags: str) -> str:
         "|---|---|---:|---:|---:|---:|---:|",
     ]
     for row in result["rows"]:
-        memory = f"{row['peak_mb']:.1f}" if "peak_mb" in row else ""
         table.append(
             f"| {row['what']} | {body(row)} | {row['drones']} | {row['devices']} | {row['steps_per_s']:.3g} "
-            f"| {row['compile_s']:.2f} | {memory} |"
+            f"| {row['compile_s']:.2f} | {_memory(row)} |"
         )
-    from cfb_mjx.bench.roofline import section
-
     gpu = "" if jax.default_backend() != "cpu" else "On a GPU: [performance-gpu.md](performance-gpu.md).\n"
     comparison = "\n".join(f"- {line}" for line in ratios(result))
     return f"""# Performance

@@ -18,10 +18,10 @@ from jaxtyping import Array
 from cfb_mjx.control.closed_loop import at_once, rollout_closed_loop
 from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.devices import Devices
+from cfb_mjx.engine.gpu import using
 from cfb_mjx.files import shipped
 from cfb_mjx.model import MjxBody, Quadrotor, rollout_final
 from cfb_mjx.model import rollout as every_state
-from cfb_mjx.model.acceleration import using
 from cfb_mjx.model.mjx_body import mjx
 from cfb_mjx.model.state import State
 from cfb_mjx.parameters import load_randomisation, sample_parameters

@@ -72,7 +72,7 @@ COMMANDS = {
         "design a manoeuvre that identifies the drone, and predict what a fit will know",
         (
             "cfb excite roll-pitch -o out/roll-pitch",
-            "cfb excite separate -o out/separate --between payload,motor_lag --model out/loop/model.yaml",
+            "cfb excite separate -o out/separate --between wind,cog_offset --model out/loop/model.yaml",
         ),
     ),
     "close-loop": Entry(
@@ -87,7 +87,7 @@ COMMANDS = {
         "refine.Refine",
         "fit the numbers of named effects, to innovations or to predictions",
         (
-            "cfb refine a.mcap b.mcap -o refined.yaml --effects drag,wind",
+            "cfb refine a.mcap b.mcap -o refined.yaml --effects rotor_drag,wind",
             "cfb refine a.mcap -o refined.yaml --effects plant --held-out b.mcap --json refined.json",
         ),
     ),
@@ -117,7 +117,7 @@ COMMANDS = {
     "view": Entry(
         "view.View",
         "show flights: a rerun recording with predictions and residuals, or a film",
-        ("cfb view flight.mcap -o flight.rrd", "cfb view flight.mcap -o flight.mp4"),
+        ("cfb view flight.mcap -o flight.rrd", "cfb view flight.mcap --video flight.mp4"),
     ),
     "bench": Entry(
         "bench.Bench",
@@ -127,7 +127,7 @@ COMMANDS = {
     "reproduce": Entry(
         "reproduce.Reproduce",
         "make the paper's figures and tables, its numbers beside ours",
-        ("cfb reproduce all -o out/paper", "cfb reproduce table2 -o out/paper --real flights"),
+        ("cfb reproduce all -o out/paper", "cfb reproduce rotor-curves -o out/paper --real flights"),
     ),
     "demo-loop": Entry(
         "demo_loop.DemoLoop",

@@ -27,6 +27,7 @@ from typing import (
 import tyro
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.files import FIGURES, require_ending
 from cfb_mjx.plugins import plugged
 
 
@@ -41,9 +42,25 @@ class Within:
         return f"at least {self.least:g}" if self.most == float("inf") else f"from {self.least:g} to {self.most:g}"
 
 
+@dataclass(frozen=True)
+class Ending:
+    """How a file's name must end; other names are refused where the command is made."""
+
+    endings: tuple[str, ...]
+    demand: str
+
+
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="PATH")]
 OutputFolder = Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
 File = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+Figure = Annotated[
+    Path | None, tyro.conf.arg(metavar="PATH"), Ending(FIGURES, f"a figure must end in {', '.join(FIGURES)}")
+]
+ModelOutput = Annotated[
+    Path,
+    tyro.conf.arg(aliases=["-o"], metavar="PATH"),
+    Ending((".yaml", ".yml"), "the output is a model and must end in .yaml"),
+]
 Folder = Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
 Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")]
@@ -162,6 +179,11 @@ def is_positional(hint: Any) -> bool:
     return tyro.conf.Positional in _marks(hint)
 
 
+def held(hint: Any) -> Any:
+    """What an argument holds if it is given, without what the parser is told of it."""
+    return _plain(_bare(hint))
+
+
 def told(hint: Any) -> Any:
     """An annotation as the parser gets it: with a word for the value, and no default where that is nothing."""
     if get_origin(hint) is not Annotated:
@@ -178,8 +200,8 @@ def told(hint: Any) -> Any:
         more["help_behavior_hint"] = ""
     within = next((mark for mark in marks if isinstance(mark, Within)), None)
     if within is not None:
-        more["help_behavior_hint"] = lambda default: f"({within}; default: {default})"
-    kept = [mark for mark in marks if mark is not None and not isinstance(mark, Within)]
+        more["help_behavior_hint"] = f"({within})" if optional else lambda default: f"({within}; default: {default})"
+    kept = [mark for mark in marks if mark is not None and not isinstance(mark, Within | Ending)]
     return functools.reduce(lambda so_far, mark: Annotated[so_far, mark], [*kept, tyro.conf.arg(**more)], kind)
 
 
@@ -218,16 +240,19 @@ def _taken(value: Any, hint: Any, option: str) -> Any:
     Raises:
         CfbError: a number out of its range, or a choice that there is not.
     """
-    kind = _plain(_bare(hint))
+    kind = held(hint)
     if _nested(hint):
         return _words(value)
     if get_origin(kind) is tuple:
         several = (value,) if isinstance(value, str | Path) or not isinstance(value, Sequence) else tuple(value)
-        held = get_args(kind)[0]
-        return tuple(held(one) if isinstance(held, type) else one for one in several)
+        one_of = get_args(kind)[0]
+        return tuple(one_of(one) if isinstance(one_of, type) else one for one in several)
     if value is None:
         return None
     if kind is Path:
+        for mark in _marks(hint):
+            if isinstance(mark, Ending):
+                require_ending(value, mark.endings, mark.demand)
         return Path(value)
     if get_origin(kind) is Literal and value not in get_args(kind):
         raise CfbError(f"{option} {value}: choose from {', '.join(map(str, get_args(kind)))}.")

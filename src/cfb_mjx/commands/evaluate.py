@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cfb_mjx.commands.command import Command, Devices, File, Logs, Model, Pairs, Result, command, lines_of
+from cfb_mjx.commands.command import Command, Devices, Figure, File, Logs, Model, Pairs, Result, command, lines_of
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json
 
@@ -63,7 +63,7 @@ class Evaluate(Command):
     model: Model = "cfb-guards"
     set: Pairs = ()
     json: File = None
-    figure: File = None
+    figure: Figure = None
     observer: bool = False
     devices: Devices = 1
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import inspect
-import io
 import re
 from collections.abc import Sequence
-from contextlib import nullcontext, redirect_stderr, redirect_stdout
+from contextlib import nullcontext
 from dataclasses import MISSING, fields
 from typing import get_type_hints
 
@@ -47,30 +46,15 @@ def run_line(name: str, words: Sequence[str]) -> int:
     """
     try:
         asked = parse(name, words)
-    except SystemExit as stop:  # the parser has already explained itself
+        with escaped():
+            found = asked.run()
+            if text := str(found):
+                print(text)
+    except SystemExit as stop:  # the parser, or a process above this one, has already explained itself
         return stop.code if isinstance(stop.code, int) else 2
-    with escaped():
-        found = asked.run()
-        if text := str(found):
-            print(text)
     if found.complaint is not None:
         raise CfbError(found.complaint)
     return 0
-
-
-def complaint_of(name: str, words: Sequence[str]) -> str | None:
-    """Why a command would refuse its line, in a sentence; None if it would not."""
-    said = io.StringIO()
-    try:
-        with redirect_stderr(said), redirect_stdout(said):
-            parse(name, words)
-    except SystemExit:
-        lines = [re.sub(r"[─│╭╮╰╯]|-{4,}", " ", line).strip() for line in said.getvalue().splitlines()]
-        # A title, what is wrong, and after that the help.
-        body = [line for line in lines if line][1:]
-        helps = [n for n, line in enumerate(body) if "helptext" in line] or [len(body)]
-        return " ".join(body[: helps[0]]).rstrip(".") + f"; see 'cfb {name} --help'."
-    return None
 
 
 def _arguments(kind: type[Command]):
@@ -86,10 +70,11 @@ def _arguments(kind: type[Command]):
             inspect.Parameter.KEYWORD_ONLY,
             default=inspect.Parameter.empty if default_of(one) is MISSING else default_of(one),
         )
-        for one in sorted(fields(kind), key=lambda one: one.name == "plugin")
+        for one in sorted(fields(kind), key=lambda one: (one.name == "plugin", one.name not in kind.__annotations__))
     ]
     given.__name__ = kind.__name__
-    given.__doc__ = inspect.getdoc(kind).replace("\nAttributes:", "\nArgs:")
+    shared = "".join(inspect.cleandoc(one.__doc__ or "").partition("\nAttributes:")[2] for one in kind.__mro__[1:])
+    given.__doc__ = inspect.getdoc(kind).replace("\nAttributes:", f"\nArgs:{shared}")
     given.__signature__ = inspect.Signature(parameters)
     given.__annotations__ = {one.name: told(hints[one.name]) for one in fields(kind)}
     return given

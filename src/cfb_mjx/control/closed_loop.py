@@ -16,17 +16,17 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from cfb_mjx.control.controllers import Controller
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.control.pilot import Pilot
-from cfb_mjx.devices import cores
+from cfb_mjx.engine.batching import axes, differentiated_as, examples, one_of_many
+from cfb_mjx.engine.cpu_kernel import one_kernel
+from cfb_mjx.engine.groups import LANES, PACKED_BYTES, grouped
 from cfb_mjx.envs.observation import Estimate, observation, remember
-from cfb_mjx.model.grouped import LANES, PACKED_BYTES, grouped
-from cfb_mjx.model.one_kernel import one_kernel
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.rollout import fits_one_kernel, fly_rows, in_components
 from cfb_mjx.model.state import State, stack
-from cfb_mjx.model.transformable import axes, differentiated_as, examples, one_of_many
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.runtime import cores
 
 FEW = 8
 """Up to so many drones are flown in one compiled function on a CPU, written-out products included: calling one for
@@ -57,7 +57,7 @@ class ClosedLoop(NamedTuple):
 
 def rollout_closed_loop(
     model: Quadrotor,
-    pilot: Pilot,
+    controller: Controller,
     state: State,
     commands: int,
     *,
@@ -72,24 +72,25 @@ def rollout_closed_loop(
     Derivatives in all arrays, in both modes.
 
     Args:
-        model: the drone; its step must divide the pilot's.
-        pilot: a `NeuralController` without set-points, a `PidPilot`, a `MellingerPilot` or one of your own.
+        model: the drone; its step must divide the controller's.
+        controller: a `NeuralController` without set-points, a `PidController`, a `MellingerController` or one of
+            your own.
         state: initial state, without batch axes.
-        commands: how many; each is held for ``pilot.control_dt_s``.
+        commands: how many; each is held for ``controller.control_dt_s``.
         target: position to hold, world, m.
-        memory: of the pilot; by default it takes over a drone that has hovered in ``state`` for long.
+        memory: of the controller; by default it takes over a drone that has hovered in ``state`` for long.
         every: commands per kept state; must divide ``commands``.
 
     Raises:
         CfbError: the control step is no multiple of the model's.
         ValueError: ``every`` does not divide ``commands``, or the policy wants set-points.
     """
-    hold = model.steps_per_command(pilot.control_dt_s)
+    hold = model.steps_per_command(controller.control_dt_s)
     if commands < 1 or every < 1 or commands % every:
         raise ValueError(f"{commands} commands cannot be kept every {every}")
-    if isinstance(pilot, NeuralController) and pilot.layout.setpoint_scales:
+    if isinstance(controller, NeuralController) and controller.layout.setpoint_scales:
         raise ValueError("a policy with set-points cannot be flown to a target alone")
-    given = (model, pilot, state, jnp.asarray(target, model.parameters.mass.dtype), memory)
+    given = (model, controller, state, jnp.asarray(target, model.parameters.mass.dtype), memory)
     leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, given))
     results: list[Any] = []
 
@@ -108,8 +109,8 @@ def rollout_closed_loop(
             alone = jax.tree.map(lambda x, mine: x[0] if mine else x, parts[:2], own_parts[:2])
             parts, own_parts = (*alone, *parts[2:]), (*jax.tree.map(lambda _: False, own_parts[:2]), *own_parts[2:])
             leaves, own = jax.tree.leaves(parts), tuple(jax.tree.leaves(own_parts))
-        own_models, own_pilots = (any(jax.tree.leaves(x)) for x in own_parts[:2])
-        if not isinstance(pilot, NeuralController) or own_pilots:
+        own_models, own_controllers = (any(jax.tree.leaves(x)) for x in own_parts[:2])
+        if not isinstance(controller, NeuralController) or own_controllers:
             return jax.vmap(plainly, in_axes=axes(own))(*leaves)
         if size > at_once() and jax.default_backend() == "cpu":
             return in_groups(own, leaves)
@@ -118,11 +119,11 @@ def rollout_closed_loop(
         drones = _Drones(size, own_models, few, between=fits and FEW < size <= LANES)
 
         def flown(*leaves):
-            model, pilot, *rest = jax.tree.unflatten(structure, leaves)
+            model, controller, *rest = jax.tree.unflatten(structure, leaves)
             if own_models:
                 model = jax.tree.map(drones.given, model, own_parts[0])
             rest = (jax.tree.map(drones.given, x, mine) for x, mine in zip(rest, own_parts[2:], strict=True))
-            return loop(drones, (model, pilot.written_out() if few else pilot, *rest))
+            return loop(drones, (model, controller.written_out() if few else controller, *rest))
 
         leaves = [jnp.moveaxis(x, 0, -1) if mine else x for x, mine in zip(leaves, own, strict=True)]
         found = grouped(flown, leaves, own, size) if few else flown(*leaves)
@@ -168,7 +169,9 @@ class _Drones(NamedTuple):
         return x if own else jnp.broadcast_to(x[..., None], (*x.shape, self.count))
 
 
-def _loop(drones: _Drones, model, pilot, state, target, memory, hold: int, commands: int, every: int) -> ClosedLoop:
+def _loop(
+    drones: _Drones, model, controller, state, target, memory, hold: int, commands: int, every: int
+) -> ClosedLoop:
     prepared = drones.each(prepare, model) if drones.own_models else prepare(model)
 
     def begin(prepared, state):
@@ -187,27 +190,29 @@ def _loop(drones: _Drones, model, pilot, state, target, memory, hold: int, comma
 
     at, command = drones.each(begin, prepared, state)
     if memory is None:
-        memory = pilot.start(drones.each(seen, prepared, at, target), command)
+        memory = controller.start(drones.each(seen, prepared, at, target), command)
 
     def kept_of(at, command):
         return drones.each(whole, prepared, at), command
 
     def one(carry, _):
         at, memory, before = carry
-        memory, command = pilot.command(memory, drones.each(seen, prepared, at, target))
+        memory, command = controller.command(memory, drones.each(seen, prepared, at, target))
         command = command.astype(before.dtype)
         return (drones.each(moved, prepared, at, command), memory, command), None
 
     def after(prepared, target, at, memory, command):
         """What a network's ``command`` leads to: state, memory and the next observation."""
-        memory = remember(pilot.layout, memory, drones.each(seen, prepared, at, target), command)
+        memory = remember(controller.layout, memory, drones.each(seen, prepared, at, target), command)
         at = drones.each(moved, prepared, at, command)
-        return at, memory, observation(pilot.layout, memory, drones.each(seen, prepared, at, target))
+        return at, memory, observation(controller.layout, memory, drones.each(seen, prepared, at, target))
 
     if drones.between:
-        shown = observation(pilot.layout, memory, drones.each(seen, prepared, at, target))
+        shown = observation(controller.layout, memory, drones.each(seen, prepared, at, target))
         if sum(x.nbytes for x in jax.tree.leaves((at, memory, shown))) <= PACKED_BYTES:
-            return _by_kernel(drones, pilot, after, kept_of, prepared, target, (at, memory, shown), commands, every)
+            return _by_kernel(
+                drones, controller, after, kept_of, prepared, target, (at, memory, shown), commands, every
+            )
     pack, unpack = _packing(jax.eval_shape(kept_of, at, command)) if drones.few else (lambda x: x, lambda x: x)
 
     # What every turn moves on by one place, the memory, is then copied in every second only.
@@ -222,7 +227,7 @@ def _loop(drones: _Drones, model, pilot, state, target, memory, hold: int, comma
     return ClosedLoop(*unpack(kept), memory)
 
 
-def _by_kernel(drones, pilot, after, kept_of, prepared, target, first, commands: int, every: int) -> ClosedLoop:
+def _by_kernel(drones, controller, after, kept_of, prepared, target, first, commands: int, every: int) -> ClosedLoop:
     """The loop of a network with one kernel per command: one array of all that changes, one of what each drone has of
     its own, one of what they share."""
     leaves, static = eqx.partition(prepared, eqx.is_array)
@@ -240,7 +245,7 @@ def _by_kernel(drones, pilot, after, kept_of, prepared, target, first, commands:
 
     def one(carry, _):
         packed, before = carry
-        command = pilot.act(packed[-pilot.layout.size :]).astype(before.dtype)
+        command = controller.act(packed[-controller.layout.size :]).astype(before.dtype)
         return (one_kernel(kernel, packed, command, own, *shared)[:-1], command), None
 
     def some(carry, _):

@@ -1,7 +1,7 @@
 """Flips as one manoeuvre: climb towards a raised target, turn, and be caught at the start (paper section VI).
 
-The same target controller climbs and catches; between the two a flip policy holds rate and speed. All is a pilot, so it
-flies wherever other controllers do.
+The same target controller climbs and catches; between the two a flip policy holds rate and speed. The
+whole is a controller and flies wherever others do.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class ManoeuvreMemory(NamedTuple):
 
 
 class Manoeuvre(eqx.Module):
-    """A pilot that flips and returns to where it began, which is the target.
+    """A controller that flips and returns to where it began, which is the target.
 
     Attributes:
         holder: flies to targets.

@@ -43,7 +43,7 @@ class Deployment:
         return self.turner is not None
 
     @property
-    def pilot(self) -> NeuralController | Manoeuvre:
+    def controller(self) -> NeuralController | Manoeuvre:
         """The same in JAX. A flip begins with its first command."""
         if self.turner is None:
             return self.holder.controller
@@ -123,5 +123,5 @@ def _policy(name: str | Path) -> PolicyFile:
 def _flip(name: str, turner: PolicyFile, manoeuvre: ManoeuvreFile, holder: str | Path | None) -> Deployment:
     held = _policy(holder or manoeuvre.holder)
     found = Deployment(name, held, turner, manoeuvre)
-    _ = found.pilot  # says so where they do not go together
+    _ = found.controller  # says so where they do not go together
     return found

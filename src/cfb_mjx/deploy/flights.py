@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from cfb_mjx.control.pilot import Pilot
+from cfb_mjx.control.controllers import Controller
 from cfb_mjx.deploy.compiled import CompiledPolicy
 from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.deploy.parity import begin
@@ -59,7 +59,7 @@ def fly_beside(
         seed: of the noise, the same for both.
     """
     plant = deployment.plant()
-    pilot, dt = deployment.pilot, deployment.pilot.control_dt_s
+    controller, dt = deployment.controller, deployment.controller.control_dt_s
     if dt < plant.dt:
         plant = replace(plant, dt=dt)
     task = TargetTask(layout=deployment.holder.controller.layout, lumped_delay=deployment.holder.lumped_delay)
@@ -69,14 +69,14 @@ def fly_beside(
     position, command = np.empty((2, steps, 3)), np.empty((2, steps, 4), np.float32)
 
     for which in range(2):
-        episode, memory = _first(task, plant, pilot, start, hover, jax.random.PRNGKey(seed))
+        episode, memory = _first(task, plant, controller, start, hover, jax.random.PRNGKey(seed))
         begin(deployment, compiled)
         for i in range(steps):
             if which == 0:
                 seen = episode.estimate
                 u = compiled.step(seen.position, seen.velocity, seen.quaternion, seen.body_rate)
             else:
-                memory, u = _commanded(pilot, memory, episode.estimate)
+                memory, u = _commanded(controller, memory, episode.estimate)
             command[which, i] = u
             episode = _flown(task, episode, jnp.asarray(u, jnp.float32))
             position[which, i] = episode.state.position
@@ -85,14 +85,14 @@ def fly_beside(
 
 # Compiled once for all flights of a policy.
 @eqx.filter_jit
-def _first(task: TargetTask, plant: Quadrotor, pilot: Pilot, start: State, hover: Array, key: Array):
+def _first(task: TargetTask, plant: Quadrotor, controller: Controller, start: State, hover: Array, key: Array):
     episode = reset(task, plant, key, start)
-    return episode, pilot.start(episode.estimate, hover)
+    return episode, controller.start(episode.estimate, hover)
 
 
 @eqx.filter_jit
-def _commanded(pilot: Pilot, memory: Any, estimate: Estimate):
-    return pilot.command(memory, estimate)
+def _commanded(controller: Controller, memory: Any, estimate: Estimate):
+    return controller.command(memory, estimate)
 
 
 @eqx.filter_jit

@@ -41,7 +41,9 @@ def compare(
         seed: of the estimates.
     """
     inputs = random_inputs(np.random.default_rng(seed), sequences, steps)
-    expected = np.asarray(_commands(deployment.pilot, jnp.float32(deployment.hover_command()), jnp.asarray(inputs)))
+    expected = np.asarray(
+        _commands(deployment.controller, jnp.float32(deployment.hover_command()), jnp.asarray(inputs))
+    )
     found = np.empty_like(expected)
     for i in range(sequences):
         begin(deployment, compiled)
@@ -74,15 +76,15 @@ def random_inputs(generator: np.random.Generator, sequences: int, steps: int) ->
 
 
 @eqx.filter_jit
-def _commands(pilot, hover, inputs):
+def _commands(controller, hover, inputs):
     def one(rows):
         def estimate(row):
             return Estimate(row[:3] - row[13:], row[3:6], row[6:10], row[10:13])
 
         def step(memory, row):
-            return pilot.command(memory, estimate(row))
+            return controller.command(memory, estimate(row))
 
-        first = pilot.start(estimate(rows[0]), jnp.full(4, hover))
+        first = controller.start(estimate(rows[0]), jnp.full(4, hover))
         return jax.lax.scan(step, first, rows)[1]
 
     return jax.vmap(one)(inputs)

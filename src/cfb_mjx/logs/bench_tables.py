@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.gaps import longest_step, stretches
 from cfb_mjx.logs.tabular import Table, read_table, require_numbers
 
@@ -61,6 +62,13 @@ class MapTable:
     force: np.ndarray | None
     torque: np.ndarray | None
     motor: np.ndarray
+
+
+def record_of(log: FlightLog) -> MotorRecord | None:
+    """The motors of a flight; None where its rotor speeds were not measured."""
+    if log.rotor_speed is None:
+        return None
+    return MotorRecord(log.name, log.time, np.clip(log.command, 0, 1), log.rotor_speed, (1, 2, 3, 4))
 
 
 def recognises(table: Table) -> bool:

@@ -117,6 +117,11 @@ class FlightLog:
         """The rows with ``start <= time <= stop`` (s). Times keep their values."""
         return self.rows((self.time >= start) & (self.time <= stop))
 
+    def split(self, share: float) -> tuple[FlightLog, FlightLog]:
+        """The first ``share`` of the log's time, and the rest; a row on the border belongs to both."""
+        border = self.time[0] + share * self.duration
+        return self.slice(self.time[0], border), self.slice(border, self.time[-1])
+
     def rows(self, index: np.ndarray) -> FlightLog:
         """The rows that ``index`` (a mask, indices or a slice) selects."""
         arrays = {f: getattr(self, f) for f in (*REQUIRED, *OPTIONAL)}

@@ -94,7 +94,7 @@ def summarise(cells: Iterable[dict[str, Any]]) -> list[Row]:
     """One row per effect, in the order in which they first appear.
 
     Args:
-        cells: results as `cfb_mjx.loop.study.run` gives them.
+        cells: results as `cfb_mjx.loop.study.study` gives them.
     """
     groups: dict[str, list[dict[str, Any]]] = {}
     for cell in cells:

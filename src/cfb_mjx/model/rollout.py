@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -13,15 +14,16 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.devices import Devices
-from cfb_mjx.model import acceleration, fleet, numberwise
+from cfb_mjx.engine import gpu, primitive, scalars
+from cfb_mjx.engine.cpu_kernel import HELD
+from cfb_mjx.engine.lanes import System
 from cfb_mjx.model.bodies import RigidBody
-from cfb_mjx.model.one_kernel import HELD
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec
 
 _MANY = 10
-"""Steps from which it pays to fly drones in groups (`cfb_mjx.model.fleet`)."""
+"""Steps from which it pays to fly drones in groups (`cfb_mjx.engine.primitive`)."""
 _MOST_NUMBERS = 200
 """Of a model flown in groups, where each is computed on its own: with the 231 of a `ResidualFormula` that takes twice
 as long to compile, and flies no faster."""
@@ -51,18 +53,18 @@ def rollout(
     prepared = prepare(model)
 
     def plain(prepared, state, commands):
-        start, rows = in_components(prepared, state, commands), Vec.unstack(commands)
+        start = in_components(prepared, state, commands)
         if hold * steps >= _MANY and fits_one_kernel(model):
-            return fleet.fly(prepared.model, start, rows, hold, every)
+            return primitive.fly(SYSTEM, prepared.model, start, commands, hold, every)
 
         def some(components, rows):
             components = fly_rows(prepared, components, rows, hold)
             return components, components
 
-        rows = jax.tree.map(lambda x: x.reshape(steps // every, every), rows)
+        rows = jax.tree.map(lambda x: x.reshape(steps // every, every), Vec.unstack(commands))
         return jax.lax.scan(some, start, rows)[1]
 
-    kept = acceleration.fly(plain, in_components, prepared, state, commands, hold=hold, every=every)
+    kept = gpu.fly(SYSTEM, plain, in_components, prepared, state, commands, hold=hold, every=every)
     return stack(kept, prepared.parameters.center_of_gravity)
 
 
@@ -71,17 +73,30 @@ def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 
     prepared = prepare(model)
 
     def plain(prepared, state, commands):
-        start, rows = in_components(prepared, state, commands), Vec.unstack(commands)
+        start = in_components(prepared, state, commands)
         if hold * commands.shape[0] >= _MANY and fits_one_kernel(model):
-            return fleet.fly(prepared.model, start, rows, hold)
-        return fly_rows(prepared, start, rows, hold)
+            return primitive.fly(SYSTEM, prepared.model, start, commands, hold)
+        return fly_rows(prepared, start, Vec.unstack(commands), hold)
 
-    final = acceleration.fly(plain, in_components, prepared, state, commands, hold=hold)
+    final = gpu.fly(SYSTEM, plain, in_components, prepared, state, commands, hold=hold)
     return stack(final, prepared.parameters.center_of_gravity)
 
 
+def _prepared(model: Quadrotor) -> Prepared:
+    # What steps need of the parameters has been prepared; effects bring their own.
+    return eqx.tree_at(lambda p: p.model.parameters, prepare(model), None)
+
+
+def _stepped(prepared: Prepared, state: Components, row: Array, plain: bool) -> Components:
+    return advance(dataclasses.replace(prepared, wrench_once=plain), state, Vec.unstack(row))
+
+
+SYSTEM = System(_prepared, _stepped)
+"""The drone, as `cfb_mjx.engine` advances it."""
+
+
 def fits_one_kernel(model: Quadrotor) -> bool:
-    """Whether this backend computes many steps of the model in one function (`cfb_mjx.model.one_kernel`)."""
+    """Whether this backend computes many steps of the model in one function (`cfb_mjx.engine.cpu_kernel`)."""
     if jax.default_backend() != "cpu" or not isinstance(model.body, RigidBody):
         return False
     if not model.effects:
@@ -119,7 +134,7 @@ def _fits(structure, given: tuple) -> bool:
     if any(x.shape for x in jax.tree.leaves(state)):
         return False
     command = jax.ShapeDtypeStruct((4,), jax.tree.leaves(state)[0].dtype)
-    return numberwise.consists_of(jax.make_jaxpr(step)(command, state, *examples).jaxpr, HELD)
+    return scalars.consists_of(jax.make_jaxpr(step)(command, state, *examples).jaxpr, HELD)
 
 
 def fly_rows(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Components:

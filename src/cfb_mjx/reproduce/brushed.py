@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cfb_mjx.reproduce.flights import GENERATED, REAL_MASS_KG, SOURCE, Given, generated, real_flights
+from cfb_mjx.reproduce.flights import GENERATED, REAL_MASS_KG, SKIPPED, SOURCE, Given, generated, real_flights
 from cfb_mjx.reproduce.item import Result, Row, write_csv
 
 DRONES = {"brushless": "cfb-guards", "brushed": "cf2x"}
@@ -37,6 +37,8 @@ def brushed(folder: Path, real: Path | None, given: Given | None = None) -> Resu
         heavy = files | {"brushless": files["brushless"].with_values("weighed, with two decks", mass=REAL_MASS_KG)}
         flights["real"] = (real_logs, heavy)
         text.append(f"Real: {len(real_logs)} flights, {SOURCE}; the brushless model with the mass as weighed.")
+    else:
+        text.append(SKIPPED)
     if given is not None:
         flights["brushed flights"] = (list(given.logs), {"brushed": given.drone(DRONES["brushed"])})
         text.append(

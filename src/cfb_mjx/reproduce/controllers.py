@@ -18,7 +18,7 @@ SEEDS = 3
 
 def controllers(folder: Path, real: Path | None) -> Result:
     """Hover error and command std of the network and of the firmware's controllers."""
-    from cfb_mjx.control.pilot import find_pilot
+    from cfb_mjx.control.controllers import find_controller
     from cfb_mjx.train.flying import hover
     from cfb_mjx.train.judge import Judge, away
 
@@ -26,10 +26,10 @@ def controllers(folder: Path, real: Path | None) -> Result:
     paper = {"target": PAPER_HOVER[1.0], **PAPER_FIRMWARE}
     rows, numbers, distances = [], [], {}
     for name, (mm, std) in paper.items():
-        pilot = find_pilot(name, judge.nominal)
-        score = judge(pilot)
-        _, flown = hover(pilot, judge.calm, judge.nominal, judge.few)
-        distances[name] = pilot.control_dt_s, 1e3 * np.linalg.norm(flown.position, axis=-1)
+        controller = find_controller(name, judge.nominal)
+        score = judge(controller)
+        _, flown = hover(controller, judge.calm, judge.nominal, judge.few)
+        distances[name] = controller.control_dt_s, 1e3 * np.linalg.norm(flown.position, axis=-1)
         label = "network" if name == "target" else name
         spread, off_std = away(score, "hover_mm"), away(score, "command_std")
         rows.append(
@@ -89,16 +89,16 @@ def back_and_forth(folder: Path, real: Path | None) -> Result:
     """Six metres to and fro with the network."""
     import jax
 
-    from cfb_mjx.control.pilot import find_pilot
+    from cfb_mjx.control.controllers import find_controller
     from cfb_mjx.envs import TargetTask
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.train.flying import STEP_DISTANCE_M, back_and_forth, six_metres
 
     nominal = Quadrotor.from_file("cfb-guards")
-    pilot = find_pilot("target", nominal)
-    flown = back_and_forth(pilot, TargetTask(), nominal, jax.random.PRNGKey(0), LEGS, LEG_S)
-    step, _ = six_metres(pilot, TargetTask(), nominal, jax.random.split(jax.random.PRNGKey(1), 64))
-    dt = pilot.control_dt_s
+    controller = find_controller("target", nominal)
+    flown = back_and_forth(controller, TargetTask(), nominal, jax.random.PRNGKey(0), LEGS, LEG_S)
+    step, _ = six_metres(controller, TargetTask(), nominal, jax.random.split(jax.random.PRNGKey(1), 64))
+    dt = controller.control_dt_s
     time, position = dt * (1 + np.arange(len(flown.position))), np.asarray(flown.position)
     speed, target = np.linalg.norm(flown.velocity, axis=-1), np.asarray(flown.watched)
     arrival, peak = float(np.median(step.arrival_s)), float(np.median(step.peak_speed_mps))
@@ -144,7 +144,7 @@ def _draw_back_and_forth(time, target, position, speed, path: Path) -> None:
 
 def randomisation(folder: Path, real: Path | None) -> Result:
     """Networks trained with more and less randomisation, flown again."""
-    from cfb_mjx.control.pilot import find_pilot
+    from cfb_mjx.control.controllers import find_controller
     from cfb_mjx.train.judge import Judge, away
     from cfb_mjx.view.magnitudes import magnitudes_figure
 
@@ -153,7 +153,7 @@ def randomisation(folder: Path, real: Path | None) -> Result:
         found[title] = {}
         for magnitude, (mm, std) in PAPER_HOVER.items():
             files = [shipped("data", "study", algorithm, f"{magnitude:g}-{seed}.npz") for seed in range(SEEDS)]
-            scores = [judge(find_pilot(file, judge.nominal)) for file in files]
+            scores = [judge(find_controller(file, judge.nominal)) for file in files]
             of = found[title][magnitude] = {
                 "nominal": [s["nominal"]["hover_mm"] for s in scores],
                 "nominal_std": [s["nominal"]["command_std"] for s in scores],

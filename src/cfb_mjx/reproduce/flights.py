@@ -21,6 +21,7 @@ SOURCE = (
     "the public IDSIA nano-drone system-identification benchmark (Busetto et al., Control Engineering Practice 172, "
     "2026)"
 )
+SKIPPED = "Real flights. Skipped: give --real FOLDER to see them beside these."
 GENERATED = "a flight that comes with the project, made by another program (`data/flight_logs`)"
 
 
@@ -64,8 +65,20 @@ class Given:
         return f"{len(self.logs)} flights given with --flights ({', '.join(log.name for log in self.logs)}), {mass}"
 
 
+def require_real(folder: Path | None) -> None:
+    """Refuse a folder without real flights.
+
+    Raises:
+        CfbError: it has none.
+    """
+    if folder is not None and not _paths(folder):
+        raise CfbError(f"{folder}: has no fit/*.parquet or validation/*.parquet; leave --real out to do without.")
+
+
 def real_flights(folder: Path | None) -> list[FlightLog]:
     """All flights of a folder with ``fit`` and ``validation``; none where there is no folder."""
-    if folder is None:
-        return []
-    return [read_log(path) for part in ("fit", "validation") for path in sorted((folder / part).glob("*.parquet"))]
+    return [] if folder is None else [read_log(path) for path in _paths(folder)]
+
+
+def _paths(folder: Path) -> list[Path]:
+    return [path for part in ("fit", "validation") for path in sorted((folder / part).glob("*.parquet"))]

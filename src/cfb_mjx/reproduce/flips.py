@@ -23,8 +23,8 @@ def _flown(name: str, count: int):
 
     nominal = Quadrotor.from_file("cfb-guards")
     of = find_deployment(name)
-    measured, flown = flips(of.pilot, TargetTask(), nominal, jax.random.split(jax.random.PRNGKey(11), count))
-    return of.manoeuvre, measured, flown, of.pilot.control_dt_s
+    measured, flown = flips(of.controller, TargetTask(), nominal, jax.random.split(jax.random.PRNGKey(11), count))
+    return of.manoeuvre, measured, flown, of.controller.control_dt_s
 
 
 def four_flips(folder: Path, real: Path | None) -> Result:

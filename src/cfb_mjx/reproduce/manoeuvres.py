@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.reproduce.flights import GENERATED, REAL_MASS_KG, SOURCE, Given, generated, real_flights
+from cfb_mjx.reproduce.flights import GENERATED, REAL_MASS_KG, SKIPPED, SOURCE, Given, generated, real_flights
 from cfb_mjx.reproduce.item import Result, Row, write_csv
 
 SIMULATIONS, FEWER, NOISE = 4096, 512, 1e-3
@@ -125,6 +125,8 @@ def _manoeuvre(
             "drone: without refitting, these commands lead the simulations elsewhere (docs/real-flights.md), and no "
             "spread of 2 % covers that."
         )
+    else:
+        text.append(SKIPPED)
     if given is not None:
         flown["given"] = given.drone("cfb-guards"), _pieces(given.logs, size)
         text.append(f"Given: {given.said()}; every other constant the paper's.")

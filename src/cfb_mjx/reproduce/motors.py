@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.files import shipped
-from cfb_mjx.reproduce.flights import REAL_MASS_KG, SOURCE, real_flights
+from cfb_mjx.reproduce.flights import REAL_MASS_KG, SKIPPED, SOURCE, real_flights
 from cfb_mjx.reproduce.item import Result, Row, with_std, write_csv
 
 BENCH = (
@@ -25,10 +25,9 @@ LOW_PASS_HZ = 8.0
 
 def motor_step(folder: Path, real: Path | None) -> Result:
     """Rotor speed after steps of the command, with T and K fitted."""
-    from cfb_mjx.logs.bench_tables import read_bench
+    from cfb_mjx.logs.bench_tables import read_bench, record_of
     from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid.rotors.motor_replay import replay
-    from cfb_mjx.sysid.rotors.motor_tracks import record_of
     from cfb_mjx.sysid.rotors.motors import fit_motors
 
     nominal = load_model_file("cfb-guards").parameters()
@@ -43,6 +42,8 @@ def motor_step(folder: Path, real: Path | None) -> Result:
             "command is not compensated for the battery, whose voltage is lower than full, and the steady speed is "
             "affine in it: K and the offset belong together."
         )
+    else:
+        text.append(SKIPPED)
     shown = {name: replay(fit)[0] for name, fit in fits.items()}
     rows = []
     for name, fit in fits.items():
@@ -130,6 +131,8 @@ def rotor_curves(folder: Path, real: Path | None) -> Result:
         p = load_model_file(preset).parameters()
         curves[label] = np.array([[float(f(p, jnp.full(4, s))[0]) for s in speed] for f in (thrust, torque)])
     flights = real_flights(real)
+    if not flights:
+        text.append(SKIPPED)
     found = _thrust_in_flight(flights) if flights else None
     if found is not None:
         coefficients, low, high, rms = found

@@ -9,6 +9,7 @@ from glob import glob
 from pathlib import Path
 from typing import Any
 
+from cfb_mjx.commands.command import Command
 from cfb_mjx.documents import load_named, refuse_unknown, told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.sweep.kinds import KINDS
@@ -50,12 +51,12 @@ class Sweep:
     gpus: float = 0.0
 
 
-def load_sweep(name_or_path: str | Path, functions: Mapping[str, Callable], files: Sequence[Path] = ()) -> Sweep:
+def load_sweep(name_or_path: str | Path, load: Callable[[str], type[Command]], files: Sequence[Path] = ()) -> Sweep:
     """Read a sweep of a YAML file, or a shipped one by its name.
 
     Args:
         name_or_path: of the sweep; its patterns are looked up from the current folder.
-        functions: of the commands, by name; their signatures say what a task may be given.
+        load: name of a command to its class, whose fields say what a task may be given.
         files: plugins for every task, before those the sweep names.
 
     Raises:
@@ -66,7 +67,7 @@ def load_sweep(name_or_path: str | Path, functions: Mapping[str, Callable], file
     command = raw.get("command")
     if not isinstance(command, str) or command not in KINDS:
         raise CfbError(f"{path}: 'command' must be one of {', '.join(KINDS)}, found {told(command)}.")
-    parameters = Parameters.of(command, functions[command], KINDS[command])
+    parameters = Parameters.of(command, load(command), KINDS[command])
     arguments = _flat(_mapping(raw, "arguments", path), parameters, f"{path}: arguments")
     if files:
         own = arguments.get("plugin", [])

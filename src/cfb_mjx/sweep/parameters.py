@@ -1,21 +1,23 @@
-"""What a command takes, read off its function, and values written as words of a command line."""
+"""What a command takes, read off its class, and values written as words of a command line."""
 
 from __future__ import annotations
 
 import typing
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from inspect import signature
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 
+from cfb_mjx.commands.command import Command, default_of, held
 from cfb_mjx.documents import told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.sweep.kinds import CHOSEN_HERE, REPEATED, Kind
 
-Shape = Literal["flag", "pairs", "files", "file", "texts", "text"]
+Shape = Literal["flag", "pairs", "files", "file", "texts", "text", "whole", "number"]
+_NUMBERS = {"whole": int, "number": float}
+_SHAPES = {bool: "flag", Path: "file", int: "whole", float: "number"}
 
 
 @dataclass(frozen=True)
@@ -24,23 +26,47 @@ class Parameters:
 
     Attributes:
         command: its name.
+        made: its class.
         shapes: what every parameter holds.
         defaults: of all parameters that have one.
         kind: the command as a task.
     """
 
     command: str
+    made: type[Command]
     shapes: Mapping[str, Shape]
     defaults: Mapping[str, Any]
     kind: Kind
 
     @classmethod
-    def of(cls, command: str, function: Callable, kind: Kind) -> Parameters:
-        """Those of the function behind a command."""
-        hints = typing.get_type_hints(function)
-        names = signature(function).parameters
-        defaults = {name: p.default for name, p in names.items() if p.default is not p.empty}
-        return cls(command, {name: _shape(hints[name]) for name in names}, defaults, kind)
+    def of(cls, command: str, made: type[Command], kind: Kind) -> Parameters:
+        """Those of a command, given its class."""
+        hints = typing.get_type_hints(made, include_extras=True)
+        # Plugins are named last on a line.
+        known = sorted(fields(made), key=lambda one: one.name == "plugin")
+        defaults = {one.name: default_of(one) for one in known if default_of(one) is not MISSING}
+        return cls(command, made, {one.name: _shape(held(hints[one.name])) for one in known}, defaults, kind)
+
+    def require_fitting(self, values: Mapping[str, Any], where: str) -> None:
+        """Refuse values that the command would refuse.
+
+        Raises:
+            CfbError: a value of another kind or out of its range, or one that is missing.
+        """
+        given: dict[str, Any] = {"output": "."} if "output" in self.shapes else {}
+        for name, shape in self.shapes.items():
+            if shape == "pairs" or values.get(name) is None:
+                continue
+            value = values[name]
+            if shape in _NUMBERS:
+                value = _number(value, _NUMBERS[shape], f"{where}: {name}")
+            given[name] = text(value) if shape == "text" else value
+        if absent := [name for name in self.shapes if name not in self.defaults and name not in given]:
+            raise CfbError(f"{where}: cfb {self.command} needs {', '.join(absent)}; give it under 'arguments'.")
+        try:
+            self.made(**given)
+        except CfbError as error:
+            raise CfbError(f"{where}: {error}") from None
 
     def has(self, key: str) -> bool:
         """Whether ``key`` (``seed``, ``set.mass``) is an argument that a sweep may give."""
@@ -109,18 +135,24 @@ def _texts(value: Any, where: str) -> list[str]:
     return [text(v) for v in values]
 
 
+def _number(value: Any, kind: type, where: str) -> float:
+    # Text too: what stands in braces is text, and YAML takes 1e-3 for one.
+    try:
+        if isinstance(value, bool | list | dict) or (kind is int and isinstance(value, float)):
+            raise TypeError
+        return kind(value)
+    except (TypeError, ValueError):
+        raise CfbError(f"{where} must be a {'whole ' * (kind is int)}number, found {told(value)}.") from None
+
+
 def _dashed(name: str) -> str:
     return name.replace("_", "-")
 
 
-def _shape(hint: Any) -> Shape:
-    if hint is bool:
-        return "flag"
-    if hint in (Path, Path | None):
-        return "file"
-    if typing.get_origin(hint) is tuple:
-        held = typing.get_args(hint)[0]
-        if held is Path:
+def _shape(kind: Any) -> Shape:
+    if typing.get_origin(kind) is tuple:
+        one = typing.get_args(kind)[0]
+        if one is Path:
             return "files"
-        return "pairs" if typing.get_origin(held) is tuple else "texts"
-    return "text"
+        return "pairs" if typing.get_origin(one) is tuple else "texts"
+    return _SHAPES.get(kind, "text")

@@ -119,6 +119,7 @@ def _task(sweep: Sweep, label: str | None, varied: dict[str, Any], used: set[str
     given = {key: _checked(key, value, parameters, where) for key, value in filled.items()}
     files = [(f"--{key}", value) for key, value in given.items() if key in EXTRA_FILES and value is not None]
     words = parameters.words({key: value for key, value in given.items() if key not in EXTRA_FILES}, where)
+    parameters.require_fitting(given, where)
     return Task(name, parameters.command, tuple(words), (*kind.outputs(), *sorted(files)), varied)
 
 

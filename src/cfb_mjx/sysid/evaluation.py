@@ -126,6 +126,17 @@ def evaluate(
     return Evaluation(tuple(results), tuple(horizons), variants)
 
 
+def before_and_after(before: Evaluation, after: Evaluation) -> dict:
+    """Metrics of two models on the same flights, in JSON terms: what each predicts, and `hold`."""
+    return {
+        "hold": before.metrics("hold"),
+        "before": before.metrics("commands_in"),
+        "after": after.metrics("commands_in"),
+        "before_rotor_speed_in": before.metrics("rotor_speed_in"),
+        "after_rotor_speed_in": after.metrics("rotor_speed_in"),
+    }
+
+
 def _refuse_diverged(result: LogEvaluation) -> None:
     for variant, errors in result.errors.items():
         lost = [] if errors is None else ~np.isfinite(list(errors.values())).all(axis=(0, 2))

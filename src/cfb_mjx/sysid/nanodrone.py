@@ -23,11 +23,11 @@ from cfb_mjx.logs.rotation import exponential, multiply, to_world
 from cfb_mjx.model.quadrotor import Quadrotor, integrate_measured, prepare
 from cfb_mjx.model.state import State, stack, unstack
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters import ModelFile
+from cfb_mjx.parameters import ModelFile, load_model_file
 from cfb_mjx.sysid.disturbance import observed_model
 from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.metrics import geodesic_deg
-from cfb_mjx.sysid.observer import Observer, causal_rotor_speed, observe
+from cfb_mjx.sysid.observer import Observer, causal_rotor_speed, observe, usual_observer
 from cfb_mjx.sysid.replay import remembered_along
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 
@@ -49,6 +49,9 @@ PUBLISHED: dict[str, tuple[float, float, float, float]] = {
 }
 """Sums over h of the errors of position [m], velocity [m/s], attitude [rad] and body rate [rad/s] in the paper, on its
 own test flights: another trajectory."""
+DECLARED = "cfb-guards"
+PLANT = "cfb-idsia"
+"""Fitted to flights of the benchmark's drone, none of them its test flights."""
 
 
 @dataclass(frozen=True)
@@ -158,6 +161,32 @@ class Contestant:
         """
         faults = SensorFaults.from_mappings(described.effects, where or f"model {described.name}")
         return cls(Quadrotor.from_file(described), observer, faults)
+
+
+def usual_contestants(model: str) -> dict[str, Contestant]:
+    """Who stands beside a model: the library's own drone with the benchmark's mass, and the fitted plant.
+
+    Args:
+        model: preset or model YAML; like the plant it is judged alone and with an observer.
+
+    Raises:
+        CfbError: a bad model.
+    """
+    declared = load_model_file(DECLARED).with_values("the benchmark's description", mass=VEHICLE_MASS)
+    found = {"declared": Contestant.of(declared)}
+    for name, where in {"plant": PLANT, "model": model}.items():
+        described = load_model_file(where)
+        found[name] = Contestant.of(described, where=where)
+        found[f"{name}_observer"] = Contestant.of(described, usual_observer(described.kind), where=where)
+    return found
+
+
+def published_rows() -> dict[str, dict[str, float]]:
+    """What was `PUBLISHED`, named as `metrics` are."""
+    return {
+        name: {f"{quantity}_sum_{unit}": x for (quantity, unit), x in zip(QUANTITIES.items(), sums, strict=True)}
+        for name, sums in PUBLISHED.items()
+    }
 
 
 def predict(contestant: Contestant, log: FlightLog, starts: Starts):

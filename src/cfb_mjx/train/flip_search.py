@@ -5,7 +5,7 @@ Each round draws candidates from a Gaussian, flies them all, and moves the Gauss
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -42,6 +42,10 @@ class Goal:
     """How fast the nominal drone has to fall at least: the paper's does 3.5 m/s, and falling less is easy."""
     floor_m: float = FLOOR_M
     """How far below the start the floor is."""
+
+
+_OF_SEARCH = 2**32 - 1
+"""Derives the key of a search: the flights that judge what it finds have the keys 0, 1, 2 ... of the same seed."""
 
 
 class Bounds(NamedTuple):
@@ -137,6 +141,34 @@ def search(
         history.append(least)
         report(i + 1, float(least))
     return Found(Knobs(*(low + (high - low) * best)), least, jnp.stack(history))
+
+
+def improved(
+    manoeuvre: Manoeuvre,
+    task: TargetTask,
+    nominal: Quadrotor,
+    goal: Goal,
+    seed: int,
+    fixed: Sequence[str] = (),
+    rounds: int = 20,
+    report: Callable[[int, float], None] = lambda round, cost: None,
+) -> Manoeuvre:
+    """The manoeuvre with the knobs that serve ``goal`` best, to four decimals as a file has them.
+
+    Args:
+        manoeuvre: as for `search`, and so are task, nominal, goal, rounds and report.
+        task: see there.
+        nominal: see there.
+        goal: see there.
+        seed: of the search; flights of the same seed have other keys.
+        fixed: names of knobs that stay as they are.
+        rounds: see there.
+        report: see there.
+    """
+    key = jax.random.fold_in(jax.random.PRNGKey(seed), _OF_SEARCH)
+    within = bounds(goal.rotations, **{name: getattr(manoeuvre.knobs, name) for name in fixed})
+    found = search(manoeuvre, task, nominal, goal, key, within, rounds, report=report)
+    return Manoeuvre(manoeuvre.holder, manoeuvre.turner, Knobs(*(round(float(x), 4) for x in found.knobs)))
 
 
 @eqx.filter_jit

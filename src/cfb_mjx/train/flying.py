@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cfb_mjx.control.pilot import Pilot
+from cfb_mjx.control.controllers import Controller
 from cfb_mjx.envs.episode import reset, settled_command, step, with_room
 from cfb_mjx.envs.observation import Layout
 from cfb_mjx.envs.target import TargetTask
@@ -36,7 +36,7 @@ class Flight(NamedTuple):
     failed: Bool[Array, "*drones steps"]
     """Whether limits of speed or rate have been passed up to here."""
     watched: Any = None
-    """What was asked to be seen of the pilot's memory."""
+    """What was asked to be seen of the controller's memory."""
     rotor_speed: Any = None
     """(*drones, steps, 4), rad/s."""
 
@@ -54,7 +54,7 @@ def steps_flown(flown: Flight, drone: int = 0) -> int:
 
 
 def fly(
-    pilot: Pilot,
+    controller: Controller,
     task: TargetTask,
     nominal: Quadrotor,
     key: PRNGKeyArray,
@@ -65,17 +65,17 @@ def fly(
 ) -> Flight:
     """One flight to the origin on a drone drawn as the task says; ``vmap`` over ``key`` (and ``state``) for many.
 
-    The simulation takes steps of the pilot's control step where that is shorter than the model's. ``watch`` says what
-    of the pilot's memory to keep. With ``targets``, the target of every command, positions are the world's and the
+    The simulation takes steps of the controller's control step where that is shorter than the model's. ``watch`` says
+    what of the controller's memory to keep. With ``targets``, the target of every command, positions are the world's and the
     targets are what is watched.
     """
-    dt = pilot.control_dt_s
+    dt = controller.control_dt_s
     if dt < nominal.dt:
         nominal = replace(nominal, dt=dt)
-    # What the episode remembers for a network is of no use to other pilots; keep it small.
+    # What the episode remembers for a network is of no use to other controllers; keep it small.
     task = replace(task, layout=Layout(control_dt_s=dt, past_estimates=0, past_commands=0))
     episode = reset(task, nominal, key, state)
-    memory = pilot.start(episode.estimate, settled_command(episode.model, episode.state))
+    memory = controller.start(episode.estimate, settled_command(episode.model, episode.state))
 
     def one(carry, target):
         episode, memory, failed = carry
@@ -83,7 +83,7 @@ def fly(
             # What was estimated for the last target is told for this one.
             seen = replace(episode.estimate, position=episode.estimate.position + episode.target - target)
             episode = replace(episode, target=target, estimate=seen)
-        memory, command = pilot.command(memory, episode.estimate)
+        memory, command = controller.command(memory, episode.estimate)
         episode, outcome = step(task, episode, command)
         failed = failed | outcome.failed
         at = episode.state
@@ -108,23 +108,23 @@ class Hover(NamedTuple):
     failed: Bool[Array, "*drones"]
 
 
-def hover(pilot: Pilot, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray) -> tuple[Hover, Flight]:
+def hover(controller: Controller, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray) -> tuple[Hover, Flight]:
     """Start level at the target, hold it `HOVER_S` seconds, count all but the first `SETTLING_S` (paper section VI).
 
     Args:
-        pilot: the controller.
+        controller: what flies.
         task: says which drones and how much noise.
         nominal: the drone.
         keys: one per flight.
     """
-    return _hover(pilot, with_room(task, nominal), nominal, keys)
+    return _hover(controller, with_room(task, nominal), nominal, keys)
 
 
 @eqx.filter_jit
-def _hover(pilot, task, nominal, keys):
+def _hover(controller, task, nominal, keys):
     start = nominal.hover_state((0.0, 0.0, 0.0))
-    flown = jax.vmap(lambda key: fly(pilot, task, nominal, key, HOVER_S, start))(keys)
-    counted = round(SETTLING_S / pilot.control_dt_s)
+    flown = jax.vmap(lambda key: fly(controller, task, nominal, key, HOVER_S, start))(keys)
+    counted = round(SETTLING_S / controller.control_dt_s)
     position = flown.position[:, counted:]
     distance, horizontal = (jnp.linalg.norm(position[..., :axes], axis=-1).mean(axis=1) for axes in (3, 2))
     vertical = jnp.abs(position[..., 2]).mean(axis=1)
@@ -143,29 +143,29 @@ class Step(NamedTuple):
     failed: Bool[Array, "*drones"]
 
 
-def six_metres(pilot: Pilot, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray) -> tuple[Step, Flight]:
+def six_metres(controller: Controller, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray) -> tuple[Step, Flight]:
     """From hover, `STEP_DISTANCE_M` away along x; the flights too."""
-    return _six_metres(pilot, with_room(task, nominal), nominal, keys)
+    return _six_metres(controller, with_room(task, nominal), nominal, keys)
 
 
 @eqx.filter_jit
-def _six_metres(pilot, task, nominal, keys):
+def _six_metres(controller, task, nominal, keys):
     start = nominal.hover_state((-STEP_DISTANCE_M, 0.0, 0.0))
-    flown = jax.vmap(lambda key: fly(pilot, task, nominal, key, STEP_S, start))(keys)
+    flown = jax.vmap(lambda key: fly(controller, task, nominal, key, STEP_S, start))(keys)
     distance = jnp.linalg.norm(flown.position, axis=-1)
-    times = pilot.control_dt_s * (1 + jnp.arange(distance.shape[1]))
+    times = controller.control_dt_s * (1 + jnp.arange(distance.shape[1]))
     arrival = jnp.min(jnp.where(distance < ARRIVED_M, times, jnp.inf), axis=1)
     speed = jnp.linalg.norm(flown.velocity, axis=-1).max(axis=1)
     return Step(arrival, speed, jnp.maximum(0.0, flown.position[..., 0].max(axis=1)), flown.failed[:, -1]), flown
 
 
 def back_and_forth(
-    pilot: Pilot, task: TargetTask, nominal: Quadrotor, key: PRNGKeyArray, legs: int = 4, leg_s: float = 3.0
+    controller: Controller, task: TargetTask, nominal: Quadrotor, key: PRNGKeyArray, legs: int = 4, leg_s: float = 3.0
 ) -> Flight:
     """From hover at the origin, to a target that jumps between `STEP_DISTANCE_M` along x and the origin.
 
     Args:
-        pilot: the controller.
+        controller: what flies.
         task: says which drone and how much noise.
         nominal: the drone.
         key: of drone and noise.
@@ -175,16 +175,16 @@ def back_and_forth(
     Returns:
         One flight, its ``position`` in the world; ``watched`` is the target (steps, 3).
     """
-    return _back_and_forth(pilot, with_room(task, nominal), nominal, key, legs, leg_s)
+    return _back_and_forth(controller, with_room(task, nominal), nominal, key, legs, leg_s)
 
 
 @eqx.filter_jit
-def _back_and_forth(pilot, task, nominal, key, legs, leg_s):
+def _back_and_forth(controller, task, nominal, key, legs, leg_s):
     far = jnp.array([STEP_DISTANCE_M, 0.0, 0.0])
     targets = jnp.repeat(
-        jnp.stack([far * ((leg + 1) % 2) for leg in range(legs)]), round(leg_s / pilot.control_dt_s), 0
+        jnp.stack([far * ((leg + 1) % 2) for leg in range(legs)]), round(leg_s / controller.control_dt_s), 0
     )
-    return fly(pilot, task, nominal, key, legs * leg_s, nominal.hover_state((0.0, 0.0, 0.0)), targets=targets)
+    return fly(controller, task, nominal, key, legs * leg_s, nominal.hover_state((0.0, 0.0, 0.0)), targets=targets)
 
 
 class Recovery(NamedTuple):
@@ -203,18 +203,23 @@ need that long to climb back."""
 
 
 def recovery(
-    pilot: Pilot, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray, tilt_deg: float = 60.0, speed: float = 3.0
+    controller: Controller,
+    task: TargetTask,
+    nominal: Quadrotor,
+    keys: PRNGKeyArray,
+    tilt_deg: float = 60.0,
+    speed: float = 3.0,
 ) -> tuple[Recovery, Flight]:
     """Thrown at ``speed`` [m/s] in a random direction with ``tilt_deg`` of tilt about a random level axis.
 
     Recovered is who is below 0.5 m/s, tilted less than 30 deg and within `CAUGHT_M` after `RECOVERY_S` without having
     passed a limit on the way.
     """
-    return _recovery(pilot, with_room(task, nominal), nominal, keys, jnp.asarray(tilt_deg), jnp.asarray(speed))
+    return _recovery(controller, with_room(task, nominal), nominal, keys, jnp.asarray(tilt_deg), jnp.asarray(speed))
 
 
 @eqx.filter_jit
-def _recovery(pilot, task, nominal, keys, tilt_deg, speed):
+def _recovery(controller, task, nominal, keys, tilt_deg, speed):
     hovering = nominal.hover_state((0.0, 0.0, 0.0))
 
     def thrown(key):
@@ -233,7 +238,7 @@ def _recovery(pilot, task, nominal, keys, tilt_deg, speed):
             hovering.rotor_speed,
             hovering.memory,
         )
-        return fly(pilot, task, nominal, of_flight, RECOVERY_S, state)
+        return fly(controller, task, nominal, of_flight, RECOVERY_S, state)
 
     flown = jax.vmap(thrown)(keys)
     distance = jnp.linalg.norm(flown.position[:, -1], axis=-1)
@@ -251,4 +256,4 @@ def nominal_task(task: TargetTask) -> TargetTask:
 
 
 TESTS = {"hover": hover, "step": six_metres, "recover": recovery}
-"""Each takes pilot, task, nominal drone and keys, and returns what it measured and the flights."""
+"""Each takes controller, task, nominal drone and keys, and returns what it measured and the flights."""

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.control.pilot import Pilot
+from cfb_mjx.control.controllers import Controller
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file, load_randomisation
@@ -47,11 +47,11 @@ class Judge:
         self.few = jax.random.split(jax.random.PRNGKey(0), FLIGHTS)
         self.many = jax.random.split(jax.random.PRNGKey(1), random_drones)
 
-    def __call__(self, pilot: Pilot) -> dict:
+    def __call__(self, controller: Controller) -> dict:
         """Hover error and command std, JSON-like; over randomised drones medians of those that did not fail."""
 
         def measure(task, drone, keys, middle):
-            return summary(hover(pilot, task, drone, keys)[0], middle)
+            return summary(hover(controller, task, drone, keys)[0], middle)
 
         score = {"nominal": measure(self.calm, self.nominal, self.few, np.mean)}
         if len(self.many):
@@ -60,11 +60,11 @@ class Judge:
             "plants": {name: measure(self.calm, drone, self.few, np.mean) for name, drone in self.plants.items()}
         }
 
-    def with_sensors(self, pilot: Pilot, lumped_delay: bool = True) -> dict[str, dict]:
+    def with_sensors(self, controller: Controller, lumped_delay: bool = True) -> dict[str, dict]:
         """The hover test on the nominal drone, its sensors later and noisier than the model says: `SENSORS`.
 
         Args:
-            pilot: the controller.
+            controller: the controller.
             lumped_delay: whether it is meant for a gyro as late as the pose.
         """
         found = {}
@@ -73,7 +73,7 @@ class Judge:
             drone = replace(self.nominal, parameters=replace(self.nominal.parameters, **changed))
             lumped = lumped_delay if lumped is None else lumped
             task = replace(self.calm, lumped_delay=lumped, noise=replace(self.calm.noise, **noise))
-            found[name] = summary(hover(pilot, task, drone, self.few)[0], np.mean)
+            found[name] = summary(hover(controller, task, drone, self.few)[0], np.mean)
         return found
 
 

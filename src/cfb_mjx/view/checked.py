@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from cfb_mjx.logs.consistency import Comparison, Relation
+from cfb_mjx.files import scratch, write_text
+from cfb_mjx.logs.consistency import Comparison, Relation, comparisons
+from cfb_mjx.logs.gate import Verdict
+from cfb_mjx.logs.uses import Recording
+from cfb_mjx.runtime import environment
 from cfb_mjx.view import style
+from cfb_mjx.view.page import Section, html_page
 
+_HEADER = ("comparison", "slope", "lag, ms", "correlation", "unexplained", "verdict")
 _WORDS = {
     "displacement": ("moved", "velocity added up", "m"),
     "attitude": ("attitude turned", "gyro added up", "rad"),
@@ -65,3 +72,53 @@ def checked_figure(
         if title:
             figure.suptitle(title, fontsize=11)
         style.save(figure, path)
+
+
+def checked_page(recordings: Sequence[Recording], path: str | os.PathLike) -> None:
+    """Write a page on recordings: what is known of each, its comparisons as a table and a figure.
+
+    Args:
+        recordings: refused ones too.
+        path: file to write, ``.html``.
+
+    Raises:
+        CfbError: the file cannot be written.
+    """
+    refused = sum(one.refusal is not None for one in recordings)
+    lead = (
+        f"{len(recordings)} recordings, {refused} refused. Each pair of signals that should be one another's "
+        "derivative is compared over short windows."
+    )
+    with scratch() as folder:
+        sections = [_section(one, Path(folder) / f"{number}.png") for number, one in enumerate(recordings)]
+        write_text(path, html_page("Recordings, checked", lead, sections, environment()))
+
+
+def _section(one: Recording, figure: Path) -> Section:
+    said, tables, figures = [line.strip() for line in one.lines()], [], []
+    if one.log is not None and one.verdict is not None:
+        if compared := comparisons(one.log):
+            checked_figure(compared, one.verdict.relations, figure)
+            figures = [(figure, f"measured and integrated signals of {one.path.name}")]
+        caption = "What the signals say about each other; unexplained from 0.2 on contradicts."
+        tables = [(caption, _HEADER, _rows(one.verdict))]
+    return Section(one.path.name, said, tables, figures)
+
+
+def _rows(verdict: Verdict) -> list[list[str]]:
+    """Of the table: a comparison each, and the motors."""
+    rows = [
+        [
+            f"{r.name} {r.axis}".strip(),
+            f"{r.slope:.3f}",
+            f"{r.lag * 1e3:.0f}",
+            f"{r.correlation:.3f}",
+            f"{r.unexplained:.3f}",
+            "contradicts" if r.contradicts else "agrees" if r.moves else "too gentle to tell",
+        ]
+        for r in verdict.relations
+    ]
+    for source, value in verdict.agreement.items():
+        said = "agrees" if value > 0.6 else "weak"
+        rows.append([f"motors by {source.replace('_', ' ')}", "", "", f"{value:.3f}", "", said])
+    return rows

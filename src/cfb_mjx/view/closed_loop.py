@@ -53,7 +53,7 @@ def sections(results: dict[str, Any], figure: Path) -> list[Section]:
     """Everything below the first paragraph.
 
     Args:
-        results: of `cfb_mjx.loop.study.run`.
+        results: of `cfb_mjx.loop.study.study`.
         figure: drawn by `loop_figure`.
     """
     rows = summarise(results["cells"].values())

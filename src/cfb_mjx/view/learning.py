@@ -1,7 +1,10 @@
-"""The learning curve of a training."""
+"""The learning curve of a training, as a figure and for TensorBoard."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from math import isfinite
 from pathlib import Path
 
 from cfb_mjx.view.style import COLOURS, check_path, context, new_figure, save
@@ -41,3 +44,22 @@ def learning_figure(rows: list[dict[str, float]], path: str | Path, title: str =
         figure.suptitle(f"{title}: {rows[-1]['seconds']:.0f} s of training" if title else "", fontsize=10)
         figure.subplots_adjust(left=0.26 / len(panels), right=0.98, bottom=0.18, top=0.86, wspace=0.38)
         save(figure, check_path(path))
+
+
+@contextmanager
+def learning_events(folder: Path | None) -> Iterator[Callable[[int, Mapping[str, float]], None]]:
+    """What writes numbers over commands flown for TensorBoard; without a folder nothing is written."""
+    if folder is None:
+        yield lambda commands, numbers: None
+        return
+    from tensorboardX import SummaryWriter
+
+    with SummaryWriter(str(folder)) as writer:
+
+        def log(commands: int, numbers: Mapping[str, float]) -> None:
+            for name, number in numbers.items():
+                # Where most drones are lost their median error is infinite: nothing to draw.
+                if isfinite(number):
+                    writer.add_scalar(name, number, commands)
+
+        yield log

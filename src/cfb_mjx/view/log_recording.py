@@ -1,4 +1,4 @@
-"""Flight logs as a rerun recording: what was measured, with thrust, predictions and residuals of a model."""
+"""Flight logs as a film, and as a rerun recording: with thrust, predictions and residuals of a model."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from cfb_mjx.model import Quadrotor, rotors
 from cfb_mjx.sysid.evaluation import Evaluation, LogEvaluation
 from cfb_mjx.sysid.tracing.residuals import Residuals
 from cfb_mjx.view.closing_recording import record_flight, record_predictions, record_residuals, tab
+from cfb_mjx.view.film import Path3D, write_film
 from cfb_mjx.view.recorder import AXES, Plot, Recorder, part, recording
 from cfb_mjx.view.style import COLOURS
 
@@ -49,11 +50,34 @@ def write_log_recording(
     ]
     with recording("cfb_view", tabs, path) as recorder:
         for one, root, (missed, driven) in zip(evaluation.logs, roots, residuals, strict=True):
-            thrust = np.asarray(rotors.thrust(model.changed_parameters(), jnp.asarray(driven)))
+            thrust = _thrust(model, driven)
             record_flight(recorder, root, one, RATE, thrust)
             record_predictions(recorder, f"{root}/world/prediction", one, COLOURS["commands_in"])
             record_residuals(recorder, root, {"missed": (missed, None)}, RATE)
             _signals(recorder, root, one, driven)
+
+
+def write_log_film(path: str | Path, model: Quadrotor, log: FlightLog, driven: np.ndarray, slow: float = 1.0) -> None:
+    """Film a flight.
+
+    Args:
+        path: file to write, ``.mp4`` or ``.gif``.
+        model: whose thrust the arrows are.
+        log: the flight.
+        driven: rotor speeds (rows, 4) [rad/s] that drove the model.
+        slow: how many times slower the film is than the flight.
+
+    Raises:
+        CfbError: what films need is not there, or the file cannot be written.
+    """
+    # Where the log's zero is not the floor, the floor is below all of the flight.
+    lift = np.array([0.0, 0.0, max(0.0, 0.1 - float(log.position[:, 2].min()))])
+    flight = Path3D(log.time, log.position + lift, log.quaternion, _thrust(model, driven))
+    write_film(path, flight, speed=1 / slow)
+
+
+def _thrust(model: Quadrotor, driven: np.ndarray) -> np.ndarray:
+    return np.asarray(rotors.thrust(model.changed_parameters(), jnp.asarray(driven)))
 
 
 def _signals(recorder: Recorder, root: str, evaluated: LogEvaluation, driven: np.ndarray) -> None:

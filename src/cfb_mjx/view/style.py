@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from cfb_mjx.files import replacing, require_ending
+from cfb_mjx.files import FIGURES, replacing, require_ending
 
 MEASURED = "#222222"
 # Okabe and Ito's palette.
@@ -17,7 +17,6 @@ LABELS = {
     "hold": "hold (constant velocity and rate)",
 }
 AXES = "xyz"
-SUFFIXES = (".svg", ".png", ".pdf")
 
 _RC = {
     "font.size": 9.0,
@@ -62,7 +61,7 @@ def check_path(path: str | os.PathLike) -> Path:
     Raises:
         CfbError: another ending.
     """
-    return require_ending(path, SUFFIXES, f"a figure must end in {', '.join(SUFFIXES)}")
+    return require_ending(path, FIGURES, f"a figure must end in {', '.join(FIGURES)}")
 
 
 def save(figure, path: Path) -> None:

@@ -68,3 +68,10 @@ PATHS: dict[str, tuple[str, Callable[[np.ndarray], Path]]] = {
 def path(name: str, tick: float) -> Path:
     """Set-points of a path, one per ``tick`` seconds."""
     return PATHS[name][1](np.arange(round(SECONDS / tick)) * tick)
+
+
+def setpoints_csv(name: str, tick: float = 0.02) -> str:
+    """A path as a table to fly: time, position and heading, a row every ``tick`` seconds."""
+    rows = enumerate(path(name, tick))
+    lines = ["t,x,y,z,yaw", *(f"{tick * i:.2f}," + ",".join(f"{v:.4f}" for v in row) for i, row in rows)]
+    return "\n".join(lines) + "\n"

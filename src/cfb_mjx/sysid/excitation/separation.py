@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -59,6 +60,11 @@ class Told:
     def flights(self) -> int | None:
         """Flights that settle every pair; None if no number of them would."""
         return max(1, int(np.ceil(ENOUGH / self.worst))) if self.worst > ENOUGH / 100 else None
+
+    def to_json(self) -> dict[str, Any]:
+        """All but the flight."""
+        nats = {f"{true} against {other}": value for (true, other), value in self.nats.items()}
+        return {"nats": nats, "flights": self.flights, "followed": self.followed}
 
 
 def assumed(name: str, present: Sequence[Effect]) -> Effect:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -67,6 +68,28 @@ class Fit:
             CfbWarning: an unusual one.
         """
         return _describe(base, self, source)
+
+    def to_json(self) -> dict:
+        """What was found and how well it describes the flights, in JSON terms."""
+        return {
+            "parameters": numbers_of(self.estimates),
+            "unidentifiable": list(self.unidentifiable),
+            "unidentifiable_because": self.unidentifiable,
+            "combinations": numbers_of(self.combinations),
+            "held_fixed_contradicted": list(self.contradicted),
+            "command_hold_s": self.hold,
+            "correlation": {"names": self.uncertainty.order, "matrix": self.uncertainty.correlation},
+            "estimator": self.estimator,
+            "feedback": self.feedback and {"correlation": self.feedback.correlation, "p_value": self.feedback.p_value},
+            "innovation_lag_one_correlation": self.whiteness,
+            "noise": None if self.noise is None else vars(self.noise),
+            "rows": self.rows,
+        }
+
+
+def numbers_of(estimates: Mapping[str, Estimate]) -> dict[str, dict]:
+    """Estimates in JSON terms."""
+    return {name: asdict(estimate) for name, estimate in estimates.items()}
 
 
 def summarise(

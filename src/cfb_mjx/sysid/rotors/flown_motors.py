@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.logs.bench_tables import MotorRecord
+from cfb_mjx.logs.bench_tables import MotorRecord, record_of
 from cfb_mjx.model.effects import BatterySag, CommandDelay, Effect
 from cfb_mjx.parameters import Entry, Parameters
-from cfb_mjx.sysid.rotors.motor_tracks import record_of
 from cfb_mjx.sysid.rotors.motors import ENTRIES
 from cfb_mjx.sysid.rotors.supply import SURE, fit_with_sag
 

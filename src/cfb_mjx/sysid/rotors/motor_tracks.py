@@ -9,7 +9,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.bench_tables import MotorRecord
 from cfb_mjx.sysid.identification.flight_data import white_noise
 
@@ -19,13 +18,6 @@ FEWEST_PIECES = 32
 WARM_UP = 0.2
 """At most this long, s, and at most a quarter of a piece: the rows in which a filter finds its state are not judged."""
 FEWEST_ROWS = 24
-
-
-def record_of(log: FlightLog) -> MotorRecord | None:
-    """The motors of a flight; None where its rotor speeds were not measured."""
-    if log.rotor_speed is None:
-        return None
-    return MotorRecord(log.name, log.time, np.clip(log.command, 0, 1), log.rotor_speed, (1, 2, 3, 4))
 
 
 class Tracks(eqx.Module):

@@ -18,7 +18,7 @@ from jax.scipy.special import gammaincc
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.bench_tables import MotorRecord
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.identification.result import Estimate
+from cfb_mjx.sysid.identification.result import Estimate, numbers_of
 from cfb_mjx.sysid.rotors.common_lag import common_lag
 from cfb_mjx.sysid.rotors.motor_filter import DEAD_TIME_UNIT, Motor
 from cfb_mjx.sysid.rotors.motor_likelihood import Optimum, first_guess, maximise
@@ -98,6 +98,26 @@ class GroupFit:
     def motor(self) -> Motor:
         """Constants and noise levels, with the extras."""
         return self.optimum.motor
+
+    def to_json(self) -> dict:
+        """Constants, tests, noise levels and how well they describe the rows, in JSON terms."""
+        tests = {t.name: {"p_value": t.p_value, "bic_gain": t.bic_gain, "supported": t.supported} for t in self.tests}
+        noise = self.motor
+        return {
+            "parameters": numbers_of(self.estimates),
+            "fitted_with": sorted(self.extras),
+            "unidentifiable": list(self.unidentifiable),
+            "unidentifiable_because": self.unidentifiable,
+            "extras": tests,
+            "noise": {
+                "reading_radps": noise.reading,
+                "walk_radps_per_sqrt_s": noise.walk,
+                "wander_radps": noise.wander,
+            },
+            "innovation_lag_one_correlation": self.optimum.whiteness,
+            "share_of_rows_beyond_5_std": self.optimum.outliers,
+            "rows": self.optimum.rows,
+        }
 
 
 @dataclass(frozen=True)

@@ -84,6 +84,27 @@ class MapFit:
         design = powers(rotor_speed, self.sigma)
         return np.sqrt(np.einsum("ni,ij,nj->n", design, self.covariance, design))
 
+    def to_json(self) -> dict:
+        """The curve and its points, in JSON terms."""
+        return {
+            "coefficients": self.coefficients,
+            "covariance": self.covariance,
+            "reference_rotor_speed_radps": self.sigma,
+            "noise": self.noise[0],
+            "offset": self.offset,
+            "offset_std": self.offset_std,
+            "increasing_where_measured": self.shape.increasing_where_measured,
+            "notes": self.shape.notes(),
+            "scales_equal_p_value": self.scale_p_value,
+            "points": {
+                "motor": self.motor,
+                "rotor_speed_radps": self.rotor_speed,
+                "measured": self.value,
+                "residual": self.residual,
+                "weight": self.weight,
+            },
+        }
+
 
 def powers(rotor_speed: np.ndarray, sigma: float = SIGMA) -> np.ndarray:
     """(n, 3) columns s^3, s^2, s."""

@@ -49,6 +49,17 @@ class SteadyFit:
         """Relative change of speed per relative change of voltage in hover: the slope of `battery_sag`."""
         return None if self.per_volt is None else 1.0 - self.offset / HOVER_SPEED
 
+    def to_json(self) -> dict:
+        """What the line tells besides gain and offset, in JSON terms."""
+        return {
+            "gain_per_volt": self.per_volt,
+            "battery_sag_slope": self.sag_slope,
+            "spread_radps": self.spread,
+            "spread_without_voltage_radps": self.spread_without_voltage,
+            "share_of_outliers": self.outliers,
+            "points": self.points,
+        }
+
 
 def fit_steady(tables: list[SteadyPoints]) -> SteadyFit:
     """Fit the line through all points, all motors as one.

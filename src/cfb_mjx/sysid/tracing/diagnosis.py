@@ -22,7 +22,7 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import SENSOR_FAULTS, effect_to_mapping
 from cfb_mjx.parameters import Entry, ModelFile
-from cfb_mjx.sysid.evaluation import Evaluation
+from cfb_mjx.sysid.evaluation import Evaluation, before_and_after
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 from cfb_mjx.sysid.tracing.fits import Verdict
 from cfb_mjx.sysid.tracing.formula import Proposal, Term
@@ -279,12 +279,7 @@ class Diagnosis:
 
     def to_json(self) -> dict:
         """The part of ``report.json`` that comes from the flights (DESIGN 6)."""
-        held_out = {
-            "before": self.before.metrics("commands_in"),
-            "after": self.after.metrics("commands_in"),
-            "hold": self.before.metrics("hold"),
-            "before_rotor_speed_in": self.before.metrics("rotor_speed_in"),
-            "after_rotor_speed_in": self.after.metrics("rotor_speed_in"),
+        held_out = before_and_after(self.before, self.after) | {
             "intervals": {"before": self.before.intervals("commands_in"), "after": self.after.intervals("commands_in")},
             "logs": {
                 old.log.name: {"before": old_error, "after": new_error}

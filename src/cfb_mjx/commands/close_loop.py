@@ -1,0 +1,147 @@
+"""``cfb close-loop``: which physical effect a model lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from cfb_mjx.commands.command import Command, Model, OtherLogs, OutputFolder, Pairs, Result, command
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import output_folder, require_no_file, together, write_json
+
+if TYPE_CHECKING:
+    from cfb_mjx.logs import FlightLog
+
+LEAST_SECONDS = 10.0
+"""Of flight to fit: below this nothing could be told from chance."""
+
+
+@dataclass(frozen=True)
+class Closed(Result):
+    """What a model lacks.
+
+    Attributes:
+        numbers: as report.json has them: ``numbers["effects"]`` were found, ``numbers["held_out"]["after"]`` are the
+            errors of the corrected model.
+        report: page to read.
+        model: the corrected model.
+        to_fly: for an effect that these flights hardly tell from others, the command that finds a flight that does.
+    """
+
+    numbers: Mapping[str, Any]
+    report: Path
+    model: Path
+    to_fly: Mapping[str, str]
+
+    def __str__(self) -> str:
+        numbers, lines = self.numbers, []
+        if not numbers["effects"]:
+            lack = "no effect of the catalogue stands" if numbers["unexplained"] else "nothing is missing beyond chance"
+            lines.append(lack)
+        for effect in numbers["effects"]:
+            lines.append(f"{effect['name']}: {_values(effect)} (p = {effect['p_value']:.1g})")
+            if effect.get("confusable_with"):
+                lines.append(f"  these flights hardly tell it from {', '.join(effect['confusable_with'])}")
+            if effect["name"] in self.to_fly:
+                lines.append(f"  what to fly: {self.to_fly[effect['name']]}")
+        if numbers["unexplained"]:
+            lines.append(f"unexplained: {numbers['unexplained_because']}")
+        held = numbers["held_out"]
+        lines.append(f"\n{'held-out RMS error':<28}{'before':>10}{'after':>10}{'hold':>10}")
+        for key, before in held["before"].items():
+            if "_rmse_" in key and key.endswith(("@0.2s", "@0.5s")):
+                lines.append(f"{key:<28}{before:>10.4g}{held['after'][key]:>10.4g}{held['hold'][key]:>10.4g}")
+        return "\n".join([*lines, f"report: {self.report}", f"model: {self.model}"])
+
+
+@command
+class CloseLoop(Command):
+    """Find which physical effect a model lacks, add it, and report the error before and after on other flights.
+
+    The sensors are compared with each other first; then effects of the catalogue are proposed, fitted together, and
+    accepted only if they improve data they were not fitted on beyond chance. Writes report.html, report.json,
+    residual.rrd and model.yaml. An interrupted run goes on where it was when started again.
+
+    Attributes:
+        output: folder to write to.
+        fit: flights to learn from, of one drone, with different manoeuvres.
+        held_out: other flights of it, to be judged on; nothing is fitted to them.
+        model: preset or model YAML the flights are compared with.
+        set: parameters to change, for instance mass=0.045.
+    """
+
+    output: OutputFolder
+    fit: OtherLogs = ()
+    held_out: OtherLogs = ()
+    model: Model = "cfb-guards"
+    set: Pairs = ()
+
+    def run(self) -> Closed:
+        """Trace, judge, and write the report and the corrected model.
+
+        Raises:
+            CfbError: bad logs, a log on both sides, a bad model, or a folder that cannot be written.
+        """
+        logs, judged = self._read()
+        require_no_file(self.output)
+        from cfb_mjx.runtime import configure_jax, environment, say
+
+        configure_jax(x64=True)
+        from cfb_mjx.commands.fitted import provenance
+        from cfb_mjx.parameters import load_model_file, save_model_file
+        from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
+        from cfb_mjx.sysid.tracing.closing import close_loop
+        from cfb_mjx.view.closing import write_report
+        from cfb_mjx.view.closing_words import separating, verdict
+
+        base = load_model_file(self.model, self.set)
+        folder = output_folder(self.output)
+        checkpoint = Checkpoint.open(folder / "search.json", self.fit, base, say)
+        outcome = close_loop(logs, judged, base, say, checkpoint)
+        words, judged_on = ["close-loop", *self.words()], [path.name for path in self.held_out]
+        story = provenance(words, base.name, "fit_logs_sha256", self.fit, held_out=judged_on)
+        corrected = outcome.model_file(f"{base.name}-closed", story)
+        facts = environment()
+        numbers = {"case": folder.resolve().name, "summary": verdict(outcome)} | outcome.to_json()
+        numbers |= {"model": base.name, "environment": facts}
+        say("writing the report")
+        model = folder / "model.yaml"
+        with together():
+            save_model_file(corrected, model)
+            write_report(outcome, folder, facts, logs, judged)
+            write_json(folder / "report.json", numbers)
+            checkpoint.discard()
+        unsure = {e["name"]: e["confusable_with"] for e in numbers["effects"] if e.get("confusable_with")}
+        to_fly = {name: separating([name, *others], str(model)) for name, others in unsure.items()}
+        known = {name: line for name, line in to_fly.items() if line is not None}
+        return Closed(numbers, folder / "report.html", model, known)
+
+    def _read(self) -> tuple[list[FlightLog], list[FlightLog]]:
+        from cfb_mjx.commands.fitted import require_apart
+        from cfb_mjx.logs import read_log, require_own_names
+
+        if not self.fit or not self.held_out:
+            raise CfbError("close-loop needs --fit LOG... to learn from and --held-out LOG... to be judged on.")
+        require_apart(self.fit, self.held_out)
+        logs, judged = [read_log(path) for path in self.fit], [read_log(path) for path in self.held_out]
+        for group in (logs, judged):
+            require_own_names(group)
+        if sum(log.duration for log in logs) < LEAST_SECONDS:
+            raise CfbError(f"--fit: less than {LEAST_SECONDS:g} s of flight; give longer or more logs.")
+        return logs, judged
+
+
+def _values(effect: Mapping[str, Any]) -> str:
+    """An effect's numbers with their standard deviations."""
+    values = []
+    for key, value in effect["parameters"].items():
+        std = effect["uncertainty"].get(key)
+        pairs = zip(value, std, strict=True) if isinstance(value, list) else [(value, std)]
+        values.append(f"{key} " + ", ".join(_with_error(v, s) for v, s in pairs))
+    return "; ".join(values)
+
+
+def _with_error(value: float, std: float | None) -> str:
+    return f"{value:.4g} (at its bound)" if std is None else f"{value:.4g} +- {std:.2g}"

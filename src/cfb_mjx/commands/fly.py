@@ -1,0 +1,314 @@
+"""``cfb fly``: how a controller flies in simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from cfb_mjx.commands.command import Command, Devices, File, Model, Pairs, Result, Within, command, lines_of
+from cfb_mjx.documents import require_seed
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import require_folder, together, write_json
+
+if TYPE_CHECKING:
+    from cfb_mjx.control.controllers import Controller
+    from cfb_mjx.control.manoeuvre import Manoeuvre
+    from cfb_mjx.envs import TargetTask
+    from cfb_mjx.model import Quadrotor
+    from cfb_mjx.parameters import ModelFile
+    from cfb_mjx.train.flying import Flight
+
+_UNITS = {"mm": "mm", "s": "s", "mps": "m/s", "m": "m", "radps": "rad/s"}
+_FLOWN = ("controller", "task", "model", "plants", "magnitude", "gyro", "knobs", "environment")
+"""Of the numbers: what was flown."""
+_ROUNDS = 20
+
+
+@dataclass(frozen=True)
+class Flown(Result):
+    """How a controller flew.
+
+    Attributes:
+        numbers: as ``--json`` writes them: ``numbers["mean_distance_mm"]``, ``numbers["success_rate"]`` and the like;
+            for a set of drones in ``numbers["on"]`` by its names.
+        files: what was written, by what it is.
+        searched: whether the knobs of a flip (``numbers["knobs"]``) were looked for.
+    """
+
+    numbers: Mapping[str, Any]
+    files: Mapping[str, Path | None]
+    searched: bool = False
+
+    def __str__(self) -> str:
+        lines = []
+        if self.searched:
+            lines.append("knobs: " + ", ".join(f"{name} {x:.4g}" for name, x in self.numbers["knobs"].items()))
+        lines += lines_of({"knobs": self.files["knobs"]})
+        if "on" in self.numbers:
+            width = max(map(len, self.numbers["on"]))
+            lines += [_row(name, measured, width) for name, measured in self.numbers["on"].items()]
+        else:
+            lines += _table(self.numbers)
+        return "\n".join([*lines, *lines_of({what: path for what, path in self.files.items() if what != "knobs"})])
+
+
+@command
+class Fly(Command):
+    """Fly a controller in simulation and measure it.
+
+    hover: 6 s at the target, the first second not counted. step: 6 m to one side. recover: thrown at 3 m/s, tilted 60
+    deg. flip, double-flip, triple-flip: climb, turn about the x axis, return to the start; `cfb fly double-flip` is
+    short for `cfb fly flip --task double-flip`.
+
+    Attributes:
+        controller: pid or mellinger (the firmware's), a shipped policy, a policy file of `cfb train`, or the name of a
+            flip.
+        task: what to fly; hover by default, and flip with a flip policy.
+        model: preset or model YAML of the drone, with its effects.
+        plants: number of flights, each on a drone drawn anew.
+        magnitude: factor on the randomisation of the drones; 0 flies the model itself.
+        randomisation: which ranges: a shipped name, a YAML file, or a model whose numbers have a spread (cfb-fleet).
+        on: fly the model with each list of effects of a set in turn: off-nominal (shipped) or a YAML file.
+        noise: with the noise of state and estimates that policies are trained with.
+        seed: of everything random.
+        json: write the results here.
+        figure: draw the flights here.
+        recording: write the flights here, for rerun (.rrd).
+        video: film the first flight here (.mp4 or .gif).
+        log: write the first flight here as a flight log (.mcap), for cfb view, evaluate, fit.
+        knobs: of a flip: when it switches and what it asks for, a shipped manoeuvre (flip-wide, double-flip-low ...) or
+            a YAML file; the task's own by default.
+        set: changes to the knobs of a flip, for instance rate_radps=18 climb_s=0.4; a search leaves these alone.
+        holder: the target policy that climbs and catches in a flip; by default the one its knobs were found with.
+        search: look for the knobs of a flip first: least height on the model, or largest margin on drones of the
+            randomisation.
+        keep: write the knobs that were flown here, for --knobs.
+        devices: of this machine that share the flights of many plants.
+        gyro: late: as late as the pose, the model's pose_delay, as in the paper; local: on the drone, gyro_delay late.
+            By default a policy flies as it was trained, and pid and mellinger with a local one, as in the firmware.
+    """
+
+    controller: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONTROLLER")]
+    task: Literal["hover", "step", "recover", "flip", "double-flip", "triple-flip"] | None = None
+    model: Model = "cfb-guards"
+    plants: int = 1
+    magnitude: Annotated[float, Within(0)] = 0.0
+    randomisation: Annotated[str, tyro.conf.arg(metavar="NAME", aliases=["--randomise"])] = "paper"
+    on: Annotated[str | None, tyro.conf.arg(metavar="SET")] = None
+    noise: bool = True
+    seed: int = 0
+    json: File = None
+    figure: File = None
+    recording: File = None
+    video: File = None
+    log: File = None
+    knobs: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
+    set: Pairs = ()
+    holder: Annotated[str | None, tyro.conf.arg(metavar="CONTROLLER")] = None
+    search: Literal["height", "margin"] | None = None
+    keep: File = None
+    devices: Devices = 1
+    gyro: Literal["late", "local"] | None = None
+
+    def run(self) -> Flown:
+        """Fly, measure, and write what was asked for.
+
+        Raises:
+            CfbError: an unknown controller, model or randomisation, impossible numbers, options that do nothing, or
+                outputs that cannot be written.
+        """
+        from cfb_mjx.runtime import configure_jax, environment
+
+        self._check()
+        configure_jax(x64=False, devices=self.devices)
+        import jax
+        import numpy as np
+
+        from cfb_mjx.control.controllers import find_controller, has_lumped_delay, is_flip_policy
+        from cfb_mjx.devices import Devices
+        from cfb_mjx.envs import Noise, TargetTask
+        from cfb_mjx.envs.episode import QUIET, with_room
+        from cfb_mjx.model import Quadrotor, require_possible
+        from cfb_mjx.parameters import load_model_file, load_randomisation
+        from cfb_mjx.train.flips import FLIPS
+        from cfb_mjx.train.measuring import measured
+
+        name, task = self.controller, self.task
+        if task is None and name in FLIPS:
+            name, task = "flip", name
+        described = load_model_file(self.model)
+        nominal = Quadrotor.from_file(described)
+        spread = load_randomisation(self.randomisation)
+        require_possible(nominal, spread, self.magnitude, "--magnitude")
+        # Scaled for the model that was named, whatever it is flown on.
+        controller = find_controller(name, nominal)
+        course = TargetTask(
+            noise=Noise() if self.noise else QUIET,
+            randomisation=spread if self.magnitude else None,
+            magnitude=self.magnitude,
+            lumped_delay=has_lumped_delay(name) if self.gyro is None else self.gyro == "late",
+        )
+        if task is None:
+            task = "flip" if is_flip_policy(controller) else "hover"
+        flips = task in FLIPS
+        if flips:
+            wild = replace(course, randomisation=spread, magnitude=self.magnitude or 1.0)
+            controller = self._manoeuvre(controller, name, task, wild, nominal)
+        else:
+            if is_flip_policy(controller):
+                raise CfbError(f"{name}: is a flip policy and cannot fly --task {task}; fly flip or double-flip.")
+            if any((self.knobs, self.set, self.holder, self.search, self.keep)):
+                raise CfbError(f"--knobs, --set, --holder, --search and --keep are for flips, not for --task {task}.")
+        keys = jax.random.split(jax.random.PRNGKey(self.seed), self.plants)
+        fly = measured(task, controller, with_room(course, nominal), keys, Devices.take(self.devices))
+        numbers = {"controller": name, "task": task, "model": self.model, "plants": self.plants}
+        numbers |= {"magnitude": self.magnitude, "gyro": "late" if course.lumped_delay else "local"}
+        if flips:
+            numbers["knobs"] = {name: float(x) for name, x in controller.knobs._asdict().items() if np.isfinite(x)}
+        found, flown = self._measured(fly, described, nominal)
+        numbers |= found
+        numbers |= {"environment": environment()}
+        with together():
+            if self.json is not None:
+                write_json(self.json, numbers)
+            if any(self._shown.values()):
+                from cfb_mjx.view.flown import write_flights
+
+                title = f"{name}, {task}, {self.model}"
+                write_flights(flown, controller.control_dt_s, nominal, title, flips, **self._shown)
+        return Flown(numbers, {"knobs": self.keep, "results": self.json, **self._shown}, self.search is not None)
+
+    @property
+    def _shown(self) -> dict[str, Path | None]:
+        """Files that show the flights of one model."""
+        return {"figure": self.figure, "recording": self.recording, "video": self.video, "log": self.log}
+
+    def _check(self) -> None:
+        require_folder(self.json, *self._shown.values(), self.keep)
+        if self.on is not None and any(self._shown.values()):
+            raise CfbError(
+                "--figure, --recording, --video and --log show the flights of one model; leave out --on, or give the "
+                "drone with --model."
+            )
+        if self.video is not None:
+            from cfb_mjx.view.film import check_film
+
+            check_film(self.video)
+        if self.plants < 1:
+            raise CfbError(f"--plants {self.plants}: at least one drone must fly.")
+        require_seed(self.seed, "--seed")
+
+    def _measured(
+        self, fly: Callable[[Quadrotor], tuple[dict[str, Any], Flight]], described: ModelFile, nominal: Quadrotor
+    ) -> tuple[dict[str, Any], Flight | None]:
+        """What was measured on the model, and its flights; or on each of a set of drones."""
+        if self.on is None:
+            return fly(nominal)
+        from cfb_mjx.runtime import Progress
+        from cfb_mjx.train.plants import load_plants
+
+        drones, bar, found = load_plants(described, self.on), Progress("flying"), {}
+        for name, drone in drones.items():
+            found[name], _ = fly(drone)
+            bar(len(found), len(drones), name)
+        return {"set": self.on, "on": found}, None
+
+    def _manoeuvre(
+        self, turner: Controller, controller: str, task: str, wild: TargetTask, nominal: Quadrotor
+    ) -> Manoeuvre:
+        """What flies a flip, searched for if that is asked, and kept.
+
+        Args:
+            turner: the flip policy.
+            controller: its name.
+            task: which flip.
+            wild: with the randomisation that a search for margin is about.
+            nominal: the drone.
+
+        Raises:
+            CfbError: no flip policy, no target policy, or bad knobs.
+        """
+        from cfb_mjx.control.controllers import find_controller, is_flip_policy
+        from cfb_mjx.control.manoeuvre import Manoeuvre
+        from cfb_mjx.control.manoeuvre_file import load_manoeuvre, save_manoeuvre
+        from cfb_mjx.control.neural import NeuralController
+        from cfb_mjx.runtime import Progress
+        from cfb_mjx.train.flip_search import Goal, improved
+        from cfb_mjx.train.flips import FLIPS
+
+        if not is_flip_policy(turner):
+            raise CfbError(
+                f"{controller}: is no flip policy and cannot fly --task {task}; give flip, or one of cfb train flip."
+            )
+        described = load_manoeuvre(self.knobs or task, self.set)
+        described = replace(described, holder=self.holder or described.holder)
+        holder = find_controller(described.holder, nominal)
+        if not isinstance(holder, NeuralController) or is_flip_policy(holder):
+            raise CfbError(
+                f"holder {described.holder}: must be a target policy, for instance target or target-adaptive."
+            )
+        if described.rotations != FLIPS[task]:
+            raise CfbError(
+                f"--knobs {self.knobs}: turn {described.rotations} times, --task {task} {FLIPS[task]} times."
+            )
+        manoeuvre = Manoeuvre(holder, turner, described.knobs)
+        if self.search is not None:
+            goal, bar = Goal(described.rotations, self.search), Progress("searching")
+            fixed = [change.partition("=")[0] for change in self.set]
+            manoeuvre = improved(
+                manoeuvre,
+                wild,
+                nominal,
+                goal,
+                self.seed,
+                fixed,
+                _ROUNDS,
+                report=lambda done, cost: bar(done, _ROUNDS, f"cost {cost:.4f}"),
+            )
+        if self.keep is not None:
+            save_manoeuvre(replace(described, knobs=manoeuvre.knobs), self.keep)
+        return manoeuvre
+
+
+def _table(numbers: Mapping[str, Any]) -> list[str]:
+    """What was measured on one model, a line for each number."""
+    drones = "drone" if numbers["plants"] == 1 else "drones"
+    gyro = "the gyro as late as the pose" if numbers["gyro"] == "late" else "the gyro on the drone"
+    lines = [f"{numbers['controller']}, {numbers['task']}: {numbers['plants']} {drones}, {numbers['model']}, {gyro}"]
+    for key, value in numbers.items():
+        if key in (*_FLOWN, "quantiles", "diverged"):
+            continue
+        shown = value if isinstance(value, bool) else "never" if value is None else f"{value:.4g}"
+        spread = numbers.get("quantiles", {}).get(key)
+        more = (
+            "" if not spread or spread["0.5"] is None else f"   median {spread['0.5']:.4g}, 95 % {spread['0.95']:.4g}"
+        )
+        lines.append(f"  {_label(key):<24}{shown}{more}")
+    return lines + ([f"  {_diverged(numbers)}"] if "diverged" in numbers else [])
+
+
+def _row(name: str, measured: Mapping[str, Any], width: int) -> str:
+    """What was measured on one of a set of drones."""
+    shown = [
+        f"{_label(key)} {value:.4g}"
+        for key, value in measured.items()
+        if isinstance(value, float) and key not in ("failure_rate", "success_rate")
+    ]
+    lost = "   failed" if measured["failed"] and "failure_rate" not in measured else ""
+    if measured.get("failure_rate"):
+        lost = f"   {measured['failure_rate']:.0%} failed"
+    lost += f"   {_diverged(measured)}" if "diverged" in measured else ""
+    return f"  {name:<{width}}  {'   '.join(shown)}{lost}"
+
+
+def _diverged(measured: Mapping[str, Any]) -> str:
+    return f"{measured['diverged']} diverged: their states are no numbers, they failed and are in no mean"
+
+
+def _label(key: str) -> str:
+    name, _, unit = key.rpartition("_")
+    return (f"{name} [{_UNITS[unit]}]" if unit in _UNITS else key).replace("_", " ")

@@ -1,0 +1,179 @@
+"""``cfb refine``: numbers of named effects from flights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from cfb_mjx.commands.command import (
+    Command,
+    File,
+    Logs,
+    Model,
+    ModelOutput,
+    OtherLogs,
+    Pairs,
+    Result,
+    command,
+    lines_of,
+)
+from cfb_mjx.commands.evaluate import errors_table
+from cfb_mjx.commands.fitted import provenance, require_apart
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import require_folder, together, write_json
+
+if TYPE_CHECKING:
+    from cfb_mjx.logs import FlightLog
+    from cfb_mjx.parameters import ModelFile
+
+
+@dataclass(frozen=True)
+class Refined(Result):
+    """A model with effects fitted to flights.
+
+    Attributes:
+        numbers: as ``--json`` writes them: ``numbers["numbers"]["rotor_drag.coefficient"]["value"]`` and the like.
+        model: the model, as written.
+        files: what was written, by what it is.
+    """
+
+    numbers: Mapping[str, Any]
+    model: ModelFile
+    files: Mapping[str, Path | None]
+
+    def __str__(self) -> str:
+        lines = [f"{'number':<36}{'value':>12}{'std':>11}"]
+        for name, row in self.numbers["numbers"].items():
+            std = "" if row["std"] is None else f"{row['std']:.2g}"
+            lines.append(f"{name:<36}{row['value']:>12.4g}{std:>11}" + ("  at its bound" if row["at_bound"] else ""))
+        if "loss" in self.numbers:
+            loss = self.numbers["loss"]
+            lines.append(f"mean loss {loss['before']:.4f} -> {loss['after']:.4f}")
+        marked = " (a predictor, not a plant)" if self.model.kind == "predictor" else ""
+        lines.append(f"model: {self.files['model']}{marked}")
+        lines += [f"\n{errors_table(result)}" for result in self.numbers.get("held_out", {}).values()]
+        return "\n".join([*lines, *lines_of({"results": self.files["results"]})])
+
+
+@command
+class Refine(Command):
+    """Fit the numbers of effects you name, where close-loop would search for them.
+
+    Innovations are not biased by feedback. Predictions over half a second are what a model is used for, and feedback
+    biases them: every number stays within what is plausible, inertia within 25 %.
+
+    Attributes:
+        logs: flight logs to fit.
+        output: model YAML to write.
+        effects: names, comma separated (docs/effects.md), or plant: all that a drone in one piece usually lacks. By
+            default those the model has.
+        held_out: other flights, to be judged on.
+        model: preset or model YAML to start from.
+        set: parameters to change, for instance mass=0.045.
+        estimator: what is fitted.
+        predictor: leave inertia and inflow free; the result predicts better, is a wrong plant, and is marked so.
+        weight: what flights whose names begin with NAME count against the others (predictions only).
+        as_logged: take no sensor fault out, even where sensors disagree or the model lists one. A stretched velocity is
+            then said to be an attitude's too, and only the position predicted is put right.
+        json: write the results here.
+    """
+
+    logs: Logs
+    output: ModelOutput
+    effects: str | None = None
+    held_out: OtherLogs = ()
+    model: Model = "cfb-guards"
+    set: Pairs = ()
+    estimator: Literal["predictions", "innovations"] = "predictions"
+    predictor: bool = False
+    weight: Pairs = ()
+    as_logged: bool = False
+    json: File = None
+
+    def run(self) -> Refined:
+        """Fit, judge, and write the model and what else was asked for.
+
+        Raises:
+            CfbError: bad logs, model, effects, weights or outputs.
+        """
+        from cfb_mjx.runtime import configure_jax, environment, say
+
+        logs, judged = self._flights()
+        weights = self._weights(logs)
+        configure_jax(x64=True)
+        from cfb_mjx.parameters import load_model_file, save_model_file
+        from cfb_mjx.sysid.refinement import model_files
+
+        base = load_model_file(self.model, self.set)
+        if self.as_logged:
+            base = model_files.as_logged(base)
+        names = self._names(base)
+        if self.estimator == "innovations":
+            model, numbers = model_files.by_innovations(base, logs, names, as_logged=self.as_logged, progress=say)
+        else:
+            extra = {"predictor": self.predictor, "weights": weights}
+            model, numbers = model_files.by_predictions(base, logs, names, progress=say, **extra)
+        held_out, words = [path.name for path in self.held_out], ["refine", *self.words()]
+        origin = provenance(words, base.name, "fit_logs_sha256", self.logs, held_out=held_out)
+        model = replace(model, name=self.output.stem, provenance=origin)
+        if judged:
+            before, after = (model_files.judge(one, judged) for one in (base, model))
+            numbers |= {"held_out": {"before": before, "after": after}}
+        numbers |= {"model": model.name, "estimator": self.estimator, "environment": environment()}
+        with together():
+            save_model_file(model, self.output)
+            if self.json is not None:
+                write_json(self.json, numbers)
+        return Refined(numbers, model, {"model": self.output, "results": self.json})
+
+    def _flights(self) -> tuple[list[FlightLog], list[FlightLog]]:
+        """Flights to fit and flights to judge on; the arguments are checked first."""
+        from cfb_mjx.logs import read_log, require_own_names
+
+        if not self.logs:
+            raise CfbError("refine needs at least one log; see 'cfb refine --help'.")
+        require_folder(self.output, self.json)
+        require_apart(self.logs, self.held_out)
+        if self.estimator == "innovations" and (self.predictor or self.weight):
+            raise CfbError(
+                "--predictor and --weight are for --estimator predictions; leave them out, or the estimator."
+            )
+        logs, judged = ([read_log(path) for path in paths] for paths in (self.logs, self.held_out))
+        for group in (logs, judged):
+            require_own_names(group)
+        return logs, judged
+
+    def _weights(self, logs: list[FlightLog]) -> dict[str, float]:
+        """What flights count, by their names."""
+        found = {}
+        for text in self.weight:
+            name, _, value = text.partition("=")
+            chosen = [log.name for log in logs if log.name.startswith(name)] if name else []
+            try:
+                number = float(value)
+            except ValueError:
+                number = math.nan
+            if not 0 < number < math.inf:
+                raise CfbError(f"--weight {text}: write NAME=VALUE with a positive number.")
+            if not chosen:
+                raise CfbError(f"--weight {text}: no flight's name begins with '{name}'.")
+            found |= dict.fromkeys(chosen, number)
+        return found
+
+    def _names(self, base: ModelFile) -> list[str]:
+        """Of the effects to fit."""
+        from cfb_mjx.model.effects import CATALOGUE
+        from cfb_mjx.sysid.refinement.numbers import PLANT
+
+        if self.effects == "plant":
+            return list(PLANT)
+        names = self.effects.split(",") if self.effects else [e["name"] for e in base.effects if e["name"] in CATALOGUE]
+        if not names:
+            raise CfbError(
+                f"model {base.name} has no effects; name some to fit, for instance --effects rotor_drag, or all a "
+                "drone usually lacks with --effects plant."
+            )
+        return names

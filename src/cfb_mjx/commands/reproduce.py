@@ -1,0 +1,145 @@
+"""``cfb reproduce``: the paper's figures and tables."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import tyro
+
+from cfb_mjx.commands.command import Command, OutputFolder, Result, command
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import code_identity, output_folder, together
+
+if TYPE_CHECKING:
+    from cfb_mjx import reproduce
+
+ALL = "all"
+_KINDS = {"result": "", "input": "   [input]", "own": "   [own flight]"}
+
+
+@dataclass(frozen=True)
+class Reproduced(Result):
+    """The paper's numbers beside ours.
+
+    Attributes:
+        results: by name of the item: ``results["motor-step"].rows`` hold the paper's numbers and ours.
+        environment: date, machine and versions.
+        seconds: that it took.
+        page: to open in a browser.
+        files: the rows as Markdown and as JSON.
+    """
+
+    results: Mapping[str, reproduce.Result]
+    environment: Mapping[str, str]
+    seconds: float
+    page: Path
+    files: tuple[Path, ...]
+
+    def __str__(self) -> str:
+        lines = []
+        for name, result in self.results.items():
+            lines.append(f"\n{result.title} ({name})")
+            for row in result.rows:
+                paper = f"   paper {row.paper}" if row.paper else ""
+                lines.append(f"  {row.what}: {row.ours}{paper}{_KINDS[row.kind]}")
+        lines.append(f"\ndone in {self.seconds:.0f} s. Open {self.page}")
+        return "\n".join([*lines, f"numbers: {', '.join(map(str, self.files))}"])
+
+
+@command
+class Reproduce(Command):
+    """Make the paper's figures and tables, its numbers beside ours.
+
+    For each a figure (PNG), the numbers behind it (CSV) and rows of "paper, ours, how it differs and why"; index.html
+    shows all of it, paper.md and paper.json hold the rows. They are written after each; interrupted, the same command
+    goes on with what is left. Rows that repeat a constant of the paper, and predictions by the model of its own
+    flights, are marked.
+
+    parameters, motor-step, rotor-curves, hover-to-forward, yaw-disturbance, brushed, back-and-forth, controllers,
+    randomisation, flips, double-flip; all of them by default, which takes minutes.
+
+    Attributes:
+        names: what to reproduce.
+        output: folder to write to.
+        real: folder with real flights in the IDSIA layout (fit/*.parquet, validation/*.parquet), to stand beside the
+            shipped ones.
+        flights: folder with flight logs of your drone: brushless for hover-to-forward and yaw-disturbance, whose useful
+            horizon is then measured on them; brushed for brushed.
+        mass: of the drone of --flights as weighed, kg; that of the preset by default.
+    """
+
+    names: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="NAME...")] = (ALL,)
+    output: OutputFolder = Path("out/paper")
+    real: Path | None = None
+    flights: Path | None = None
+    mass: float | None = None
+
+    def run(self) -> Reproduced:
+        """Make the items, each in turn, and after each the pages about those that are made.
+
+        Raises:
+            CfbError: an unknown name, no flights in ``real`` or ``flights``, flights that no item takes, an impossible
+                mass, or an output that cannot be written.
+        """
+        from cfb_mjx.runtime import configure_jax, environment, say
+
+        configure_jax(x64=False)
+        from cfb_mjx.reproduce import ITEMS
+        from cfb_mjx.reproduce.flights import Given, require_real
+        from cfb_mjx.reproduce.kept import NUMBERS, PAGE, TEXT, keep, kept_in
+
+        chosen = self._chosen(ITEMS)
+        self._require_fitting(chosen, ITEMS)
+        require_real(self.real)
+        given = None if self.flights is None else Given.read(self.flights, self.mass)
+        folder, facts = output_folder(self.output), environment()
+        told = f"cfb reproduce {ALL if len(chosen) == len(ITEMS) else ' '.join(chosen)}"
+        real, flights = str(self.real), str(self.flights)
+        of = {"names": chosen, "code": code_identity(), "real": real, "flights": flights, "mass": self.mass}
+        results = kept_in(folder, of)
+        if results:
+            say(f"{len(results)} of {len(chosen)} were made before the interruption; going on with the rest")
+        begin = time.perf_counter()
+        for name in [name for name in chosen if name not in results]:
+            started = time.perf_counter()
+            configure_jax(x64=ITEMS[name].x64)
+            more = {"given": given} if ITEMS[name].given else {}
+            with together():
+                results[name] = ITEMS[name].make(folder, self.real, **more)
+                results = {item: results[item] for item in chosen if item in results}
+                keep(folder, results, of, facts, told)
+            say(f"{len(results)}/{len(chosen)} {name}: {time.perf_counter() - started:.0f} s")
+        files = (folder / TEXT, folder / NUMBERS)
+        return Reproduced(results, facts, time.perf_counter() - begin, folder / PAGE, files)
+
+    def _chosen(self, items: Mapping[str, Any]) -> list[str]:
+        """Names of what is asked for, in the paper's order.
+
+        Raises:
+            CfbError: an unknown name, or none.
+        """
+        unknown = [name for name in self.names if name not in (*items, ALL)]
+        if unknown or not self.names:
+            raise CfbError(
+                f"{', '.join(unknown) or 'nothing'}: cannot be reproduced; choose from {ALL}, {', '.join(items)}."
+            )
+        return [name for name in items if ALL in self.names or name in self.names]
+
+    def _require_fitting(self, chosen: list[str], items: Mapping[str, reproduce.Item]) -> None:
+        """Refuse flights that would be taken for those of another drone, or not at all."""
+        if self.flights is None:
+            if self.mass is not None:
+                raise CfbError("--mass is of the drone of --flights; give those, or leave it out.")
+            return
+        if self.mass is not None and not 0.005 <= self.mass <= 0.5:
+            raise CfbError(f"--mass {self.mass:g}: must be in kg, from 0.005 to 0.5.")
+        takers = {name for name, item in items.items() if item.given}
+        if not set(chosen) <= takers or ("brushed" in chosen and len(chosen) > 1):
+            raise CfbError(
+                f"--flights: name what they are for, of {', '.join(sorted(takers))}; brushed alone, for it takes "
+                "flights of a brushed drone and the others of a brushless one."
+            )

@@ -1,0 +1,33 @@
+"""``cfb version``: what is installed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from cfb_mjx.commands.command import Command, Result, command
+
+
+@dataclass(frozen=True)
+class Versions(Result):
+    """What computes here.
+
+    Attributes:
+        environment: date, machine and versions, by name.
+    """
+
+    environment: Mapping[str, str]
+
+    def __str__(self) -> str:
+        return "\n".join(f"{name}: {value}" for name, value in self.environment.items())
+
+
+@command
+class Version(Command):
+    """Print the versions of the library and of what it computes with."""
+
+    def run(self) -> Versions:
+        """Look them up."""
+        from cfb_mjx.runtime import environment
+
+        return Versions(environment())

@@ -1,0 +1,129 @@
+"""``cfb view``: flights, to look at."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from cfb_mjx.commands.command import Command, File, Logs, Model, Pairs, Result, command, lines_of
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import require_folder
+
+
+@dataclass(frozen=True)
+class Viewed(Result):
+    """What there is to look at.
+
+    Attributes:
+        recording: that was written.
+        shown: whether rerun's viewer was opened.
+        video: that was written.
+    """
+
+    recording: Path | None = None
+    shown: bool = False
+    video: Path | None = None
+
+    def __str__(self) -> str:
+        shown = ["shown in rerun's viewer"] if self.shown else []
+        return "\n".join([*lines_of({"recording": self.recording}), *shown, *lines_of({"video": self.video})])
+
+
+@command
+class View(Command):
+    """Show flights: a rerun recording, rerun's viewer, or a film.
+
+    The recording has the drone in 3D with the thrust of its rotors, the way it went, where the model thought it would
+    go (half a second from every window), the commands, and what the model misses (force and torque per mass and
+    inertia). Flights of `cfb fly --log` are shown like any other.
+
+    Attributes:
+        logs: flight logs (MCAP, parquet, csv), or one recording (.rrd) with --spawn.
+        output: recording to write (.rrd); the first log's name in this folder by default.
+        model: preset or model YAML, for thrust, predictions and residuals.
+        set: parameters to change, for instance mass=0.045.
+        spawn: open rerun's viewer.
+        video: film the first flight here (.mp4 or .gif).
+        slow: how many times slower the film is than the flight.
+    """
+
+    logs: Logs
+    output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FILE")] = None
+    model: Model = "cfb-guards"
+    set: Pairs = ()
+    spawn: bool = False
+    video: File = None
+    slow: float = 1.0
+
+    def run(self) -> Viewed:
+        """Read the flights, look at them with the model, show them.
+
+        Raises:
+            CfbError: bad logs, a bad model, something missing that is needed, or a file that cannot be written.
+        """
+        output = self._checked_output()
+        if self._opens_recording:
+            from cfb_mjx.view.recorder import open_viewer
+
+            open_viewer(self.logs[0])
+            return Viewed(shown=True)
+        from cfb_mjx.logs import read_log
+        from cfb_mjx.runtime import Progress, configure_jax
+
+        logs = [read_log(path) for path in self.logs]  # before jax loads: a bad log is refused at once
+        configure_jax(x64=True)
+        from cfb_mjx.model import Quadrotor
+        from cfb_mjx.parameters import load_model_file
+        from cfb_mjx.sysid import evaluate
+        from cfb_mjx.sysid.sensor_faults import SensorFaults
+        from cfb_mjx.sysid.tracing.residuals import model_residuals
+        from cfb_mjx.view.log_recording import write_log_film, write_log_recording
+        from cfb_mjx.view.recorder import open_viewer
+
+        described = load_model_file(self.model, self.set)
+        drone = Quadrotor.from_file(described)
+        faults = SensorFaults.from_mappings(described.effects, self.model)
+        bar, residuals = Progress("residuals"), []
+        for log in logs:
+            residuals.append(model_residuals(drone, faults.repaired(log)))
+            bar(len(residuals), len(logs))
+        if output is None and self.spawn:
+            output = Path(tempfile.gettempdir()) / f"{logs[0].name}.rrd"
+        if output is not None:
+            evaluation = evaluate(drone, logs, progress=Progress("predictions"), faults=faults)
+            write_log_recording(output, drone, evaluation, residuals)
+        if self.spawn:
+            open_viewer(output)
+        if self.video is not None:
+            write_log_film(self.video, drone, logs[0], residuals[0][1], self.slow)
+        return Viewed(output, self.spawn, self.video)
+
+    @property
+    def _opens_recording(self) -> bool:
+        return any(path.suffix == ".rrd" for path in self.logs)
+
+    def _checked_output(self) -> Path | None:
+        """Which recording to write; None: none was asked for by name.
+
+        Raises:
+            CfbError: nothing to show, impossible numbers, or outputs without a folder or of the wrong kind.
+        """
+        if not self.logs:
+            raise CfbError("view needs at least one log; see 'cfb view --help'.")
+        output = self.output
+        if output is None and not self.spawn and self.video is None and not self._opens_recording:
+            output = Path(f"{self.logs[0].stem}.rrd")
+        if self.slow <= 0:
+            raise CfbError(f"--slow {self.slow}: must be above zero.")
+        require_folder(output, self.video)
+        if self._opens_recording and (not self.spawn or output or self.video or len(self.logs) > 1):
+            raise CfbError(f"{self.logs[0]}: is a recording already; open one with 'cfb view FILE.rrd --spawn'.")
+        if self.video is not None:
+            from cfb_mjx.view.film import check_film
+
+            check_film(self.video)
+        return output

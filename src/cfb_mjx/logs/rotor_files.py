@@ -1,0 +1,72 @@
+"""Files that tell of motors and rotors, seen from their content: bench tables by their columns, all else a flight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.files import read_bytes
+from cfb_mjx.logs.bench_layouts import Bench, read_bench_table, recognises
+from cfb_mjx.logs.bench_points import SteadyPoints, ThrustPoints, joined
+from cfb_mjx.logs.bench_tables import MapTable, MotorRecord, record_of
+from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.reading import read_log
+from cfb_mjx.logs.tabular import read_table
+
+
+@dataclass(frozen=True)
+class RotorFiles:
+    """What some files hold.
+
+    Attributes:
+        records: motors in time, of flights and benches.
+        tables: steady force and torque at rotor speeds.
+        points: steady speeds at commands.
+        flights: the logs among the files.
+        notes: what was done to read them, in words.
+    """
+
+    records: list[MotorRecord] = field(default_factory=list)
+    tables: list[MapTable] = field(default_factory=list)
+    points: list[SteadyPoints] = field(default_factory=list)
+    flights: list[FlightLog] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def read_rotor_files(paths: Sequence[Path], rotors: int | None = None) -> RotorFiles:
+    """Read flights and bench tables.
+
+    Args:
+        paths: of the files, whatever each is.
+        rotors: of how many rotors force and torque are; None: as `read_bench_table` has it.
+
+    Raises:
+        CfbError: a file that is neither, or a flight without rotor speeds.
+    """
+    found, thrust = RotorFiles(), []
+    for path in paths:
+        bench = _bench(path, rotors)
+        if bench is None:
+            log = read_log(path, keep_ground=True)
+            record = record_of(log)
+            if record is None:
+                raise CfbError(f"{path}: holds no rotor speeds; log them, or leave this flight out.")
+            bench = Bench([record], [])
+            found.flights.append(log)
+        found.notes.extend(bench.notes)
+        for part in bench.parts:
+            kinds = {MapTable: found.tables, SteadyPoints: found.points, ThrustPoints: thrust}
+            kinds.get(type(part), found.records).append(part)
+    found.tables.extend(joined(part, found.points, rotors, found.notes) for part in thrust)
+    return found
+
+
+def _bench(path: Path, rotors: int | None) -> Bench | None:
+    """What a bench table holds; None: it is none."""
+    head = read_bytes(path, 4)
+    if path.suffix.lower() not in (".csv", ".txt", ".tsv", ".parquet") and head != b"PAR1":
+        return None
+    table = read_table(path)
+    return read_bench_table(table, path, rotors) if recognises(table) else None

@@ -1,0 +1,44 @@
+"""Effects by seeds: every cell is one drone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from cfb_mjx.errors import CfbError
+from cfb_mjx.labelled_plants import EFFECTS, Case
+
+FIRST_SEED, BETWEEN_SEEDS = 61_000, 100
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One drone: its effect, and the seed of its policies and, with the effect's place in the list, of all draws."""
+
+    effect: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Of its folder."""
+        return f"{self.effect}-{self.seed}"
+
+    @property
+    def case(self) -> Case:
+        """The drone."""
+        return Case(self.name, self.seed + 1 + list(EFFECTS).index(self.effect), ((self.effect, 1.0),))
+
+
+def cells_of(effects: Iterable[str], seeds: int, first: int = FIRST_SEED) -> list[Cell]:
+    """Cells seed by seed, so that an unfinished study has every effect.
+
+    Raises:
+        CfbError: an unknown effect, or none.
+    """
+    effects = list(dict.fromkeys(effects))
+    known = [name for name in EFFECTS if not name.startswith(("outside", "sensor"))]
+    if unknown := [name for name in effects if name not in known]:
+        raise CfbError(f"--effects {unknown[0]}: there is no such effect; choose from {', '.join(known)}.")
+    if not effects:
+        raise CfbError(f"--effects: name at least one of {', '.join(known)}.")
+    return [Cell(effect, first + BETWEEN_SEEDS * k) for k in range(seeds) for effect in effects]

@@ -1,0 +1,167 @@
+"""A manoeuvre tried in simulation before it is flown: what a fit will know, and whether the drone is caught."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from cfb_mjx.control import FirmwarePid, PositionHold
+from cfb_mjx.model import Quadrotor
+from cfb_mjx.parameters import ModelFile
+from cfb_mjx.sysid.excitation.conditions import Conditions
+from cfb_mjx.sysid.excitation.design import Problem, optimise
+from cfb_mjx.sysid.excitation.experiment import Experiment, fly
+from cfb_mjx.sysid.excitation.information import Prediction, log_determinant, predict, typical
+from cfb_mjx.sysid.excitation.manoeuvres import STEP, Limits, roll_pitch, scaled, single_motor
+from cfb_mjx.sysid.excitation.safety import Attained, attained, worst_of
+from cfb_mjx.sysid.identification.fitting import default_parameters
+from cfb_mjx.sysid.identification.unknowns import choose
+
+PAPER = {"roll-pitch": roll_pitch, "single-motor": single_motor}
+ITERATIONS = 1000
+FLIGHTS = 3
+"""Each with its own noise and disturbances; the middle one's uncertainty counts, the first is kept."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A manoeuvre flown in simulation.
+
+    Attributes:
+        commands: (m, 4) of one repetition.
+        calm: the flight without noise and disturbances.
+        flown: a flight with them.
+        prediction: what a fit will know of such a flight.
+        log_det: information of one repetition about what is fitted.
+        undisturbed: what `calm` attains.
+        worst: of the flights with disturbances, and how many repetitions kept the limits and were caught.
+    """
+
+    commands: Float[np.ndarray, "m 4"]
+    calm: Experiment
+    flown: Experiment
+    prediction: Prediction
+    log_det: float
+    undisturbed: Attained
+    worst: dict[str, Any]
+
+    def expected(self) -> dict[str, dict[str, Any]]:
+        """Value, standard deviation and unit of every parameter that a fit will know."""
+        return {name: asdict(one) for name, one in self.prediction.parameters.items()}
+
+    def commands_csv(self) -> str:
+        """The commands as a table to fly: time, and the command of each motor from then on."""
+        lines = (f"{STEP * i:.3f}," + ",".join(f"{u:.6f}" for u in row) for i, row in enumerate(self.commands))
+        return "\n".join(["t,u1,u2,u3,u4", *lines]) + "\n"
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """A manoeuvre, beside those of the paper where it is not one of them.
+
+    Attributes:
+        manoeuvre: its name.
+        trials: by name, it among them.
+        repetitions: in one flight.
+        duration: of the open-loop part, s.
+        limits: that it keeps.
+        conditions: noise and disturbances.
+    """
+
+    manoeuvre: str
+    trials: dict[str, Trial]
+    repetitions: int
+    duration: float
+    limits: Limits
+    conditions: Conditions
+
+    @property
+    def chosen(self) -> Trial:
+        """The trial of the manoeuvre itself."""
+        return self.trials[self.manoeuvre]
+
+    def to_json(self) -> dict[str, Any]:
+        """All numbers."""
+        chosen = self.chosen
+        return {
+            "manoeuvre": self.manoeuvre,
+            "repetitions": self.repetitions,
+            "duration_s": self.duration,
+            "limits": asdict(self.limits),
+            "conditions": asdict(self.conditions),
+            "parameters": chosen.expected(),
+            "unidentifiable": chosen.prediction.unidentifiable,
+            "identifiable_together": chosen.prediction.combinations,
+            "log_det_one_repetition": chosen.log_det,
+            "undisturbed": asdict(chosen.undisturbed) | {"within_limits": chosen.undisturbed.within(self.limits)},
+            "with_disturbances": chosen.worst,
+            "compared_with": {
+                name: {"parameters": trial.expected(), "log_det_one_repetition": trial.log_det} | trial.worst
+                for name, trial in self.trials.items()
+                if name != self.manoeuvre
+            },
+        }
+
+
+def excite(
+    manoeuvre: Literal["roll-pitch", "single-motor", "optimised"],
+    described: ModelFile,
+    parameters: str | None = None,
+    repetitions: int = 5,
+    duration: float = 0.5,
+    limits: Limits = Limits(),
+    conditions: Conditions = Conditions(),
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    designing: Callable[[int, int], None] | None = None,
+) -> Excitation:
+    """Choose or design a manoeuvre, and fly it in simulation.
+
+    Before an optimised one come the paper's, which it is compared with and whose noise it assumes.
+
+    Args:
+        manoeuvre: its name.
+        described: the best guess of the drone. Run with x64 enabled.
+        parameters: what will be fitted, as for `choose`; by default what a fit would choose.
+        repetitions: of the manoeuvre in one flight.
+        duration: of the open-loop part, s.
+        limits: not to exceed.
+        conditions: noise and disturbances to expect.
+        progress: called with (done, total) simulations and predictions.
+        designing: called with (done, total) iterations of an optimised manoeuvre's design.
+
+    Raises:
+        CfbError: unknown parameters, or limits or a duration that leave no room.
+    """
+    nominal = described.parameters()
+    model = Quadrotor.from_file(described)
+    stabiliser = PositionHold(FirmwarePid.hovering(nominal))
+    if parameters is not None:
+        choose(parameters, nominal)  # refuses unknown names before the work
+    names = [manoeuvre] if manoeuvre in PAPER else [*PAPER, manoeuvre]
+    problem, trials = None, {}
+    for index, name in enumerate(names):
+        if name in PAPER:
+            commands = scaled(model, PAPER[name](duration), limits)
+        else:
+            commands = optimise(problem, duration, ITERATIONS, progress=designing).commands
+        calm = fly(model, stabiliser, commands, repetitions, conditions.calm, name=name)
+        flown = [fly(model, stabiliser, commands, repetitions, conditions, seed=i, name=name) for i in range(FLIGHTS)]
+        progress(2 * index + 1, 2 * len(names))
+        unknowns = choose(parameters or default_parameters([flown[0].log]), nominal)
+        prediction = typical([predict([flight.log], unknowns, conditions.measured_rotors) for flight in flown])
+        problem = problem or Problem.of(model, unknowns, prediction.noise, limits, conditions.measured_rotors)
+        progress(2 * index + 2, 2 * len(names))
+        trials[name] = Trial(
+            commands,
+            calm,
+            flown[0],
+            prediction,
+            float(log_determinant(problem.judged(commands))),
+            attained(calm)[0],
+            worst_of([one for flight in flown for one in attained(flight)], limits),
+        )
+    return Excitation(manoeuvre, trials, repetitions, duration, limits, conditions)

@@ -1,0 +1,105 @@
+"""A test flown on one drone or many, and what was measured in JSON terms: what ``cfb fly`` says."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from cfb_mjx.control.controllers import Controller
+from cfb_mjx.devices import Devices
+from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.train.flips import FLIPS, flips
+from cfb_mjx.train.flying import TESTS, Flight
+
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+
+
+def measured(
+    test: str, controller: Controller, task: TargetTask, keys: PRNGKeyArray, over: Devices
+) -> Callable[[Quadrotor], tuple[dict[str, Any], Flight]]:
+    """What flies a test on a drone.
+
+    Args:
+        test: of `TESTS`, or a flip of `FLIPS`.
+        controller: who flies; a manoeuvre for a flip.
+        task: says which drones and how much noise; with room for its delays (`cfb_mjx.envs.episode.with_room`).
+        keys: one per flight.
+        over: devices that share the flights.
+
+    Returns:
+        A function of the drone that gives the `summary`, and the flights, axes (drones, steps).
+    """
+    flown_by = flips if test in FLIPS else TESTS[test]
+    divided = over.divided(lambda controller, drone, keys: flown_by(controller, task, drone, keys), (None, None, 0), 0)
+
+    def fly(drone: Quadrotor) -> tuple[dict[str, Any], Flight]:
+        if over.several:
+            found = over.here(eqx.filter_jit(divided)(controller, drone, over.along(over.padded(keys))))
+            numbers, flown = jax.tree.map(lambda x: x[: len(keys)], found)
+        else:
+            numbers, flown = flown_by(controller, task, drone, keys)
+        completed = np.asarray(numbers.completed(FLIPS[test])) if test in FLIPS else None
+        diverged = ~np.isfinite(np.asarray(flown.position)).all(axis=(1, 2))
+        return summary(test, {k: np.asarray(v) for k, v in numbers._asdict().items()}, completed, diverged), flown
+
+    return fly
+
+
+def summary(
+    test: str,
+    numbers: Mapping[str, np.ndarray],
+    completed: np.ndarray | None = None,
+    diverged: np.ndarray | None = None,
+) -> dict[str, Any]:
+    """JSON of a test: means over the flights, and over many also quantiles and the rate of success.
+
+    Flights that diverged failed; they are counted, and no mean is taken of them.
+
+    Args:
+        test: what was flown.
+        numbers: what was measured, one number per flight.
+        completed: for flips, who completed them.
+        diverged: whose state is no number at the end; nobody's by default.
+    """
+    diverged = np.zeros_like(numbers["failed"]) if diverged is None else diverged
+    failed = numbers["failed"] | diverged
+    if test == "hover":
+        values = {"mean_distance_mm": 1e3 * numbers["mean_distance_m"], "command_std": numbers["command_std"]}
+        good = ~failed
+    elif test == "step":
+        values = {key: numbers[key] for key in ("arrival_s", "peak_speed_mps", "overshoot_m")}
+        good = ~failed & np.isfinite(numbers["arrival_s"])
+    elif test == "recover":
+        values = {key: numbers[key] for key in ("lost_height_m", "final_distance_m")}
+        good = numbers["recovered"] & ~diverged
+    else:
+        values = {key: value for key, value in numbers.items() if key != "failed"}
+        good = completed & ~diverged
+    # A lost flip's numbers say nothing, and some are infinite.
+    counted = good if completed is not None and good.any() else ~diverged
+    result = {key: _finite(np.mean(value[counted])) if counted.any() else None for key, value in values.items()}
+    result["failed"] = bool(failed.any())
+    if diverged.any():
+        result["diverged"] = int(diverged.sum())
+    if len(failed) > 1:
+        result |= {"failure_rate": float(failed.mean()), "success_rate": float(good.mean())}
+        result["quantiles"] = {
+            key: {f"{q:g}": _finite(np.quantile(value[good], q)) if good.any() else None for q in QUANTILES}
+            for key, value in values.items()
+        }
+    elif test == "recover":
+        result["recovered"] = bool(good[0])
+    elif completed is not None:
+        result["completed"] = bool(good[0])
+    return result
+
+
+def _finite(number: float) -> float | None:
+    return float(number) if math.isfinite(number) else None
