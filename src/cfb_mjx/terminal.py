@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TextIO
 
 # Controls but for tab and newline, what turns the direction of writing, other ends of lines, and lone surrogates: bytes
@@ -53,8 +52,9 @@ def escaped() -> Iterator[None]:
             sys.stderr = err.unescaped
 
 
-def print_paths(**paths: Path | None) -> None:
-    """A line for each file that was written (None: was not asked for), after what it is."""
-    for what, path in paths.items():
-        if path is not None:
-            print(f"{what}: {path}")
+def aligned(rows: Iterable[Sequence[str]], gap: int = 2) -> str:
+    """Rows of texts as a table: columns as wide as what stands in them, apart by at least ``gap`` spaces."""
+    rows = [list(row) for row in rows]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ((text.ljust(width + gap) for text, width in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join("".join(line).rstrip() for line in lines)

@@ -10,6 +10,7 @@ from typing import Any
 from cfb_mjx.commands.command import Command, Devices, Figure, File, Logs, Model, Pairs, Result, command, lines_of
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json
+from cfb_mjx.terminal import aligned
 
 _LABELS = {
     "commands_in": "commands in",
@@ -119,10 +120,7 @@ class Evaluate(Command):
 def errors_table(numbers: Mapping[str, Any]) -> str:
     """RMSE of every quantity and variant at every horizon, with 95 % intervals."""
     horizons = [key.partition("@")[2] for key in numbers["hold"] if key.startswith("position_rmse")]
-    lines = [
-        f"RMS error of {numbers['windows']} open-loop predictions by {numbers['model']} [95 % interval]",
-        f"{'':31}" + "".join(f"{float(h[:-1]) * 1e3:.0f} ms".ljust(26) for h in horizons).rstrip(),
-    ]
+    rows = [["", "", *(f"{float(h[:-1]) * 1e3:.0f} ms" for h in horizons)]]
     for quantity, unit in _ROWS:
         for variant, label in _LABELS.items():
             if numbers.get(variant) is None:
@@ -131,9 +129,10 @@ def errors_table(numbers: Mapping[str, Any]) -> str:
             for horizon in horizons:
                 key = f"{quantity}_rmse_{unit}@{horizon}"
                 low, high = numbers["intervals"][variant][key]
-                cells.append(f"{numbers[variant][key]:.3g} [{low:.3g}, {high:.3g}]".ljust(26))
-            head = f"{quantity}, {_UNITS[unit]}" if variant == "commands_in" else ""
-            lines.append(f"{head:<15}{label:<16}" + "".join(cells).rstrip())
+                cells.append(f"{numbers[variant][key]:.3g} [{low:.3g}, {high:.3g}]")
+            rows.append([f"{quantity}, {_UNITS[unit]}" if variant == "commands_in" else "", label, *cells])
+    head = f"RMS error of {numbers['windows']} open-loop predictions by {numbers['model']} [95 % interval]"
+    lines = [head, aligned(rows)]
     if numbers["rotor_speed_in"] is not None and numbers["windows"] > numbers["rotor_speed_in_windows"]:
         lines.append(f"rotor speed was measured in {numbers['rotor_speed_in_windows']} of the windows.")
     return "\n".join(lines)

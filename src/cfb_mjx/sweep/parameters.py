@@ -53,7 +53,7 @@ class Parameters:
         Raises:
             CfbError: a value of another kind or out of its range, or one that is missing.
         """
-        given: dict[str, Any] = {"output": "."} if "output" in self.shapes else {}
+        given: dict[str, Any] = {} if self.kind.output is None else {"output": self.kind.output}
         for name, shape in self.shapes.items():
             if shape == "pairs" or values.get(name) is None:
                 continue

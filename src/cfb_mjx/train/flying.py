@@ -66,8 +66,8 @@ def fly(
     """One flight to the origin on a drone drawn as the task says; ``vmap`` over ``key`` (and ``state``) for many.
 
     The simulation takes steps of the controller's control step where that is shorter than the model's. ``watch`` says
-    what of the controller's memory to keep. With ``targets``, the target of every command, positions are the world's and the
-    targets are what is watched.
+    what of the controller's memory to keep. With ``targets``, the target of every command, positions are the world's
+    and the targets are what is watched.
     """
     dt = controller.control_dt_s
     if dt < nominal.dt:
