@@ -15,9 +15,11 @@ from cfb_mjx.deploy.deployment import find_deployment
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.errors import CfbError
+from cfb_mjx.logs.gate import judge
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_randomisation
 from cfb_mjx.train.config import FlipTrainingConfig, config_from, load_config
+from cfb_mjx.train.flight_logs import flight_log
 from cfb_mjx.train.flip_search import Goal, bounds, search, shortfall
 from cfb_mjx.train.flips import FLIP_S, FLIPS, flips, measure, replay
 from cfb_mjx.train.flying import Flight, fly
@@ -72,6 +74,15 @@ def test_what_a_made_up_flip_measures():
 @pytest.mark.parametrize("name", ["double-flip", "double-flip-paper"])
 def test_double_flips_keep_the_papers_numbers(name):
     found, flown = flips(shipped(name), TargetTask(), DRONE, keys(8))
+    # As a log: nothing but the rotors pushes, along the body's z axis, and its signals agree.
+    dt = shipped(name).control_dt_s
+    log = flight_log(flown, dt, name)
+    turning = np.abs(log.body_rate[:, 0]) > 10.0
+    assert np.abs(log.specific_force[turning, :2].mean(axis=0)).max() < 0.1
+    assert judge(log).problem is None
+    # An accelerometer that is late by half a row turns with the drone; that is no wrong axis.
+    turned = log.specific_force - 0.5 * dt * np.cross(log.body_rate, log.specific_force)
+    assert judge(log.replace(specific_force=turned)).problem is None
     assert np.all(found.completed(2))
     np.testing.assert_allclose(found.rotations, 2, atol=0.03)
     assert np.max(found.vertical_extent_m) <= 1.8

@@ -25,6 +25,7 @@ _MOST_WINDOWS = 4000
 _TRIMMED = 0.1  # share of the worst windows that does not count: a glitch is no wrong unit
 _RARE = 0.03  # share of the liveliest windows that do not make an axis move
 _FEWEST = 10
+_BLOCK, _TURNED = 0.2, 1.0  # s and rad: within a block the body must not turn so far, or it has no axes of its own
 _PUSHES, _CROSSED = 0.4, 0.65  # correlations: with motion along the axis; against motion along the other
 _FAST = 5.0  # rad/s: rotations are compared over half the time
 ORDER = (0, 1, 2, 3)
@@ -200,18 +201,26 @@ def _gravity(log: FlightLog, force: np.ndarray) -> list[Relation]:
 
 def _drag(log: FlightLog, q: np.ndarray) -> list[Relation]:
     """Along x and y of the body nothing but the air pushes, and that against the motion."""
-    width = max(1, round(0.2 / log.nominal_interval))
+    width = max(1, round(_BLOCK / log.nominal_interval))
     count = len(log) // width
     if count < _FEWEST:
         return []
 
+    def means(values):
+        return values[: count * width].reshape(count, width, -1).mean(axis=1)
+
+    # In a flip "along y" is another direction at the end of a block than at its beginning.
+    calm = _BLOCK * means(np.linalg.norm(log.body_rate, axis=1))[:, 0] < _TURNED
+    if calm.sum() < _FEWEST:
+        return []
+
     def blocks(values):
-        means = values[: count * width, :2].reshape(count, width, 2).mean(axis=1)
-        return means - np.median(means, axis=0)
+        kept = means(values[:, :2])[calm]
+        return kept - np.median(kept, axis=0)
 
     speed, force = blocks(rotation.to_body(q, log.velocity)), blocks(log.specific_force)
     sizes = np.sqrt(np.mean(speed**2, axis=0)), np.sqrt(np.mean(force**2, axis=0))
-    matrix = speed.T @ force / count / np.maximum(np.outer(*sizes), 1e-12)
+    matrix = speed.T @ force / len(speed) / np.maximum(np.outer(*sizes), 1e-12)
     found = []
     swapped = max(matrix[0, 1], matrix[1, 0]) < -_CROSSED and np.abs(np.diag(matrix)).max() < 0.5 * _CROSSED
     for axis in range(2):

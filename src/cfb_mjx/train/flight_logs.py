@@ -13,7 +13,8 @@ from cfb_mjx.train.flying import Flight, steps_flown
 def flight_log(flown: Flight, dt: float, name: str, gravity: float = 9.81, drone: int = 0) -> FlightLog:
     """One flight as a log: true states, without delay or sensor noise, a row for each command.
 
-    The specific force is the mean over the control step before a row, as an accelerometer that is filtered shows it.
+    The specific force is the mean over the control step before a row, as an accelerometer that is filtered shows it, in
+    the axes of the body in the middle of that step: in a flip it turns by a tenth of a radian until its end.
 
     Args:
         flown: flights, axes (drones, steps).
@@ -33,13 +34,18 @@ def flight_log(flown: Flight, dt: float, name: str, gravity: float = 9.81, drone
     velocity, quaternion = flight["velocity"], flight["quaternion"][:rows]
     change = np.diff(velocity[:rows], axis=0, prepend=velocity[:1]) / dt
     change[0] = change[1]
+    # Signs as each row's: a quaternion and its negative are the same attitude.
+    along = quaternion * np.sign(np.sum(quaternion * np.roll(quaternion, 1, axis=0), axis=1, keepdims=True))
+    middle = along + np.roll(quaternion, 1, axis=0)
+    middle[0] = quaternion[0]
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
     return FlightLog(
         time=dt * np.arange(1, rows + 1),
         position=flight["position"][:rows],
         velocity=velocity[:rows],
         quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
         body_rate=flight["body_rate"][:rows],
-        specific_force=to_body(quaternion, change + np.array([0.0, 0.0, gravity])),
+        specific_force=to_body(middle, change + np.array([0.0, 0.0, gravity])),
         command=np.clip(flight["command"][1 : rows + 1], 0.0, 1.0),
         rotor_speed=flight["rotor_speed"][:rows],
         metadata={"name": name, "source": "simulated by cfb fly", "format": "simulated", "observation_delay": 0.0},
