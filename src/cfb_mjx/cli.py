@@ -72,6 +72,11 @@ def _dispatch(arguments: list[str]) -> int:
     if name in ("-V", "--version"):
         print(f"cfb_mjx {__version__}")
         return 0
+    if name == "--install-completion":
+        from cfb_mjx.completion import install
+
+        print(install(*rest[:1] or [os.path.basename(os.environ.get("SHELL", ""))]))
+        return 0
     if name not in COMMANDS:
         raise CfbError(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}.")
     from cfb_mjx.commands.line import run_line
@@ -84,7 +89,8 @@ def _help() -> str:
     rows = "\n".join(f"  {name:<{width}}  {entry.summary}" for name, entry in COMMANDS.items())
     return (
         f"usage: cfb COMMAND ...\n\nCrazyflie Brushless: simulate, identify, train. cfb_mjx {__version__}\n\n"
-        f"commands:\n{rows}\n\n'cfb COMMAND --help' explains a command."
+        f"commands:\n{rows}\n\n"
+        "'cfb help COMMAND' explains a command; 'cfb --install-completion bash' (zsh, fish) completes lines."
     )
 
 

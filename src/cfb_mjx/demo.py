@@ -16,6 +16,7 @@ import numpy as np
 from cfb_mjx.files import shipped
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.model import Quadrotor, State, rollout
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import ModelFile, load_model_file, load_randomisation, sample_parameters
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.evaluation import HORIZONS
@@ -151,11 +152,12 @@ def _fly_randomised(model: ModelFile, log: FlightLog, program: tuple[Callable, f
     drones = jax.jit(jax.vmap(lambda key: sample_parameters(key, single.parameters, ranges)))(keys)
 
     compiled, compile_s = program
-    seconds = []
+    seconds, last = [], None
     for _ in range(4):  # The first run also touches memory for the first time.
         begin = time.perf_counter()
-        flown = jax.block_until_ready(compiled(single, state, commands, drones))
+        last = jax.block_until_ready(compiled(single, state, commands, drones))
         seconds.append(time.perf_counter() - begin)
+    flown = not_none(last)
 
     position, tilt = np.asarray(flown.position), tilt_deg(np.asarray(flown.quaternion))
     _draw_spread(log, delay, start, windows, window, position, tilt, nominal.dt, figure)

@@ -12,12 +12,13 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from cfb_mjx.errors import CfbError
@@ -37,7 +38,7 @@ def over_cores(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator
         yield from map(function, items)
         return
     # Set for a thread by a context, this would not hold in others.
-    x64 = bool(jax.config.jax_enable_x64)
+    x64 = bool(cast(Any, jax.config).jax_enable_x64)
 
     def alike(item: Any) -> Any:
         with jax.enable_x64(x64):
@@ -186,7 +187,7 @@ def _spec(axis: int | None) -> PartitionSpec:
 
 
 def _placed(x: Any, sharding: NamedSharding) -> Any:
-    if isinstance(x, jax.core.Tracer):
+    if isinstance(x, Tracer):
         return jax.lax.with_sharding_constraint(x, sharding)
     if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         data = _placed(jax.random.key_data(x), sharding)

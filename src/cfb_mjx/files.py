@@ -181,9 +181,11 @@ def _begin(path: Path) -> _Written:
 
 def _clear(folder: Path) -> None:
     """Delete the temporary files of dead processes: nobody holds their locks."""
+    if fcntl is None:
+        return
     # A folder may be written and not listed, and a lock may be held.
     with contextlib.suppress(OSError):
-        left = [entry for entry in os.scandir(folder) if fcntl is not None and _TEMPORARY.fullmatch(entry.name)]
+        left = [entry for entry in os.scandir(folder) if _TEMPORARY.fullmatch(entry.name)]
         for entry in left:
             with contextlib.suppress(OSError), open(entry.path, "rb") as file:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -119,9 +119,13 @@ def _join(hosts: Hosts) -> None:
     # The default of newer versions only.
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     given = {} if hosts.coordinator == "auto" else _arguments(hosts)
-    limits = {"initialization_timeout": JOINING_S, "shutdown_timeout_seconds": LEAVING_S}
     try:
-        jax.distributed.initialize(**given, **limits, heartbeat_timeout_seconds=HEARTBEAT_S)
+        jax.distributed.initialize(
+            **given,
+            initialization_timeout=JOINING_S,
+            shutdown_timeout_seconds=LEAVING_S,
+            heartbeat_timeout_seconds=HEARTBEAT_S,
+        )
     except ValueError as error:
         raise CfbError(
             f"--coordinator auto: no cluster is found here ({error}); start with srun or mpirun, or give "

@@ -18,6 +18,7 @@ from pathlib import Path
 from types import ModuleType
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.optional import not_none
 
 GROUP = "cfb_mjx.effects"
 """Entry points of installed packages: an effect, or a module with effects."""
@@ -141,8 +142,9 @@ def _module(path: Path) -> ModuleType:
     if there is not None and there.__digest__ == digest:
         return there
     # Executed here, not by the import system: that would leave compiled files beside the user's.
-    module = module_from_spec(spec_from_loader(name, None, origin=str(path)))
-    module.__file__, module.__digest__ = str(path), digest
+    module = module_from_spec(not_none(spec_from_loader(name, None, origin=str(path))))
+    module.__file__ = str(path)
+    vars(module)["__digest__"] = digest
     sys.modules[name] = module
     try:
         exec(compile(source, str(path), "exec", dont_inherit=True), vars(module))

@@ -21,6 +21,7 @@ from cfb_mjx.bench.timed_process import TimedProcess
 from cfb_mjx.devices import Devices
 from cfb_mjx.engine.gpu import kernel_is_chosen
 from cfb_mjx.errors import CfbError
+from cfb_mjx.optional import not_none
 from cfb_mjx.runtime import cores, environment, say
 
 TURN_S = 0.03
@@ -51,7 +52,7 @@ class Peer(TimedProcess):
                 )
         except OSError as error:
             raise CfbError(f"--peer-python {python}: cannot be run ({error.strerror}).") from None
-        answer = self.process.stdout.readline().split()
+        answer = not_none(self.process.stdout).readline().split()
         if len(answer) != 4 or answer[0] != "ready":
             last = (self.process.communicate()[1].strip().splitlines() or ["no output"])[-1]
             raise CfbError(f"--peer-python {python}: crazyflow does not run there ({last}).")

@@ -32,7 +32,7 @@ class Operations(NamedTuple):
     moved: float
     """Bytes that must pass from one step of a loop to the next, or in and out of a matrix product."""
 
-    def __add__(self, other: Operations) -> Operations:
+    def __add__(self, other: tuple[Any, ...]) -> Operations:
         return Operations(*(a + b for a, b in zip(self, other, strict=True)))
 
     def times(self, factor: float) -> Operations:

@@ -22,7 +22,7 @@ def _cores(count: int) -> str:
     return f"{count} core{'s' if count > 1 else ''}"
 
 
-def ratios(result: dict) -> list[str]:
+def ratios(result: Mapping[str, Any]) -> list[str]:
     """Side-by-side sentences for every batch size."""
     lines = []
     for drones in sorted({row["drones"] for row in result["rows"]}):
@@ -49,7 +49,7 @@ def ratios(result: dict) -> list[str]:
 def _beside_peers(rows: list[dict], speed) -> list[str]:
     lines = []
     for what, title in (("rollout", "closed form"), ("rollout_policy", "the same network in the loop")):
-        parts = []
+        name, parts = "", []
         for peer in (row for row in rows if "version" in row and row["what"] == what):
             # As many devices of ours as it has cores, where that was measured; else the one.
             ours = speed(what, devices=peer["cores"]) if peer["cores"] else None

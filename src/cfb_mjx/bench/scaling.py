@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 from cfb_mjx.bench.timed_process import TimedProcess
+from cfb_mjx.optional import not_none
 
 DRONES = {"rollout": 8192, "rollout_policy": 8192, "ppo": 512}
 """What is measured, and with how many drones."""
@@ -59,7 +60,7 @@ class _Runner(TimedProcess):
             stdout=subprocess.PIPE,
             text=True,
         )
-        answer = self.process.stdout.readline()
+        answer = not_none(self.process.stdout).readline()
         if not answer:
             raise RuntimeError(f"the measurement of {what} on {len(cores)} cores ended with {self.process.wait()}")
         self.steps = int(answer)

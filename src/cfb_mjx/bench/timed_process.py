@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import subprocess
+from typing import IO
+
+from cfb_mjx.optional import not_none
 
 
 class TimedProcess:
@@ -12,14 +15,19 @@ class TimedProcess:
 
     def seconds(self) -> float:
         """Wall time of one run there."""
-        self.process.stdin.write("\n")
-        self.process.stdin.flush()
-        return float(self.process.stdout.readline())
+        given, answers = self._pipes()
+        given.write("\n")
+        given.flush()
+        return float(answers.readline())
 
     def close(self) -> None:
         """End it."""
-        self.process.stdin.close()
+        given, answers = self._pipes()
+        given.close()
         self.process.wait()
-        self.process.stdout.close()
+        answers.close()
         if self.process.stderr is not None:
             self.process.stderr.close()
+
+    def _pipes(self) -> tuple[IO[str], IO[str]]:
+        return not_none(self.process.stdin), not_none(self.process.stdout)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -24,6 +25,7 @@ from cfb_mjx.model import MjxBody, Quadrotor, rollout_final
 from cfb_mjx.model import rollout as every_state
 from cfb_mjx.model.mjx_body import mjx
 from cfb_mjx.model.state import State
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import load_randomisation, sample_parameters
 
 STEPS = 500
@@ -66,7 +68,7 @@ def _compile(
     begin = time.perf_counter()
     compiled = jax.jit(function).lower(*arguments).compile()
     compile_s = time.perf_counter() - begin
-    memory = compiled.memory_analysis()
+    memory = not_none(compiled.memory_analysis())
     peak = memory.temp_size_in_bytes + memory.argument_size_in_bytes + memory.output_size_in_bytes
     jax.block_until_ready(compiled(*arguments))  # first call: allocations
 
@@ -180,7 +182,8 @@ def network_file(folder: Path) -> Path:
     network = load_policy("target-analytic").controller.network
     layers = enumerate(zip(network.weights, network.biases, strict=True))
     path = folder / "network.npz"
-    np.savez(path, **{f"{k}{i}": np.asarray(x) for i, layer in layers for k, x in zip("wb", layer, strict=True)})
+    arrays: dict[str, Any] = {f"{k}{i}": np.asarray(x) for i, layer in layers for k, x in zip("wb", layer, strict=True)}
+    np.savez(path, **arrays)
     return path
 
 
@@ -224,24 +227,26 @@ def fit_jacobian() -> Workload:
     logs = [read_log(path) for path in sorted(shipped("data", "flight_logs").glob("*.mcap"))]
     data = prepare(logs)
     unknowns = choose("inertia,rotor_inertia,motor,thrust_scale,torque_scale", nominal)
-    segments, noise = jax.tree.map(jnp.asarray, (data.segments, Noise.first(data)))
+    segments, noise = jax.tree.map(jnp.asarray, (not_none(data.segments), Noise.first(data)))
 
     def slopes(vector, segments):
         return fit_slopes(unknowns, vector, noise, segments, True, False)
 
-    count, rows = data.segments.valid.shape
+    count, rows = segments.valid.shape
     return _compile("fit_jacobian", f"{len(unknowns.names)} parameters", count, rows, slopes, unknowns.start, segments)
 
 
 def ppo_update(drones: int = 512) -> Workload:
     """One update of PPO with the shipped configuration: flights of all drones, and the learning from them."""
     from cfb_mjx.train.config import load_config
+    from cfb_mjx.train.ppo import Ppo
     from cfb_mjx.train.run import Training, build
 
     training = Training.prepare(load_config("target", (f"ppo.drones={drones}",)), {})
     nominal, config = training.nominal(), training.config
     task = config.build_task()
     algorithm = build(config, task, nominal)
+    assert isinstance(algorithm, Ppo)  # as the shipped configuration says
     state = algorithm.begin(jax.random.PRNGKey(0), training.first_controller(nominal))
     arrays, rest = eqx.partition(state, eqx.is_array)
 

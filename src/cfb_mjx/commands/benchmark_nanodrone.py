@@ -113,6 +113,7 @@ def errors_table(numbers: Mapping[str, Any]) -> str:
         "plant_observer": f"{PLANT} with observer",
         "model_observer": "model with observer",
     }
+    rows: Mapping[str, Mapping[str, float]] = numbers["rows"]
     keys = [[f"{q}_mean_{u}@{h}" for h in SHOWN] + [f"{q}_sum_{u}"] for q, u in QUANTITIES.items()]
     heads = [f"h = {h}" for h in SHOWN] + ["sum"]
     return "\n".join(
@@ -120,7 +121,7 @@ def errors_table(numbers: Mapping[str, Any]) -> str:
             f"mean errors after h steps of 10 ms, and their sum over h = 1 to {STEPS}; {numbers['windows']} windows",
             f"{'':<26}" + "".join(f"{f'{q}, {_UNITS[q]}':<38}" for q in QUANTITIES).rstrip(),
             f"{'':<26}" + "".join("".join(f"{head:<9}" for head in heads) + "  " for _ in QUANTITIES).rstrip(),
-            *(_row(labels.get(name, name), row, keys) for name, row in numbers["rows"].items()),
+            *(_row(labels.get(name, name), row, keys) for name, row in rows.items()),
             "as published, on the paper's own test flights:",
             *(_row(name, row, keys) for name, row in numbers["published"].items()),
         ]

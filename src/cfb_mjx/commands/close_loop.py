@@ -98,13 +98,14 @@ class CloseLoop(Command):
 
         base = load_model_file(self.model, self.set)
         folder = output_folder(self.output)
-        checkpoint = Checkpoint.open(folder / "search.json", self.fit, base, say)
+        checkpoint = Checkpoint.open(folder / "search.json", list(self.fit), base, say)
         outcome = close_loop(logs, judged, base, say, checkpoint)
         words, judged_on = ["close-loop", *self.words()], [path.name for path in self.held_out]
         story = provenance(words, base.name, "fit_logs_sha256", self.fit, held_out=judged_on)
         corrected = outcome.model_file(f"{base.name}-closed", story)
         facts = environment()
-        numbers = {"case": folder.resolve().name, "summary": verdict(outcome)} | outcome.to_json()
+        numbers: dict[str, Any] = {"case": folder.resolve().name, "summary": verdict(outcome)}
+        numbers |= outcome.to_json()
         numbers |= {"model": base.name, "environment": facts}
         say("writing the report")
         model = folder / "model.yaml"

@@ -81,7 +81,7 @@ class Demo(Command):
         return Shown(numbers, page, tuple(folder / name for name in names), json)
 
 
-def _errors(flight: Mapping[str, Any]) -> list[str]:
+def _errors(flight: dict[str, Any]) -> list[str]:
     from cfb_mjx.view.demo import error_rows
 
     head = f"{flight['log']}: {flight['windows']} windows, RMS error after 0.5 s [95 % interval]"

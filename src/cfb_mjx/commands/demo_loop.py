@@ -11,6 +11,7 @@ import tyro
 
 from cfb_mjx.commands.command import Command, OutputFolder, Result, Within, command, lines_of
 from cfb_mjx.files import require_no_file, together, write_json, write_text
+from cfb_mjx.optional import not_none
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Improved(Result):
     def __str__(self) -> str:
         from cfb_mjx.view.closed_loop import lead
 
-        return "\n".join([lead(self.numbers), *lines_of(self.files)])
+        return "\n".join([lead(dict(self.numbers)), *lines_of(self.files)])
 
 
 @command
@@ -67,9 +68,10 @@ class DemoLoop(Command):
         configure_jax(x64=False)
         from cfb_mjx.loop.study import study
 
+        improved = None
         for numbers in study(cells, self.output):
-            files = self._write(numbers)
-        return Improved(numbers, files)
+            improved = Improved(numbers, self._write(numbers))
+        return not_none(improved)
 
     def _write(self, numbers: dict[str, Any]) -> dict[str, Path]:
         from cfb_mjx.view import html_page

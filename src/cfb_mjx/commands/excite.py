@@ -236,6 +236,7 @@ class Excite(Command):
         described = load_model_file(self.model, self.set)
         limits = Limits(rate=self.rate_limit, altitude_loss=self.altitude_loss)
         about = (self.parameters, self.repetitions, self.duration, limits, conditions)
+        assert self.manoeuvre != "separate"  # that names effects to tell apart, and `_separate` does it
         excitation = excite(self.manoeuvre, described, *about, progress, designing)
         numbers = excitation.to_json() | {"model": described.name, "environment": environment()}
         chosen = excitation.chosen

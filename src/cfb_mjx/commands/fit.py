@@ -26,6 +26,7 @@ from cfb_mjx.commands.command import (
 from cfb_mjx.commands.fitted import provenance, require_apart
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, together, write_json
+from cfb_mjx.optional import not_none
 
 if TYPE_CHECKING:
     from cfb_mjx.devices import Devices as Shared
@@ -110,12 +111,14 @@ class Fitted(Result):
             old, new = self.before.metrics(variant), self.after.metrics(variant)
             if old is None:
                 continue
+            # The same logs as before.
+            new, still = not_none(new), not_none(hold)
             for key in ("velocity_rmse_mps", "attitude_rmse_deg", "rate_rmse_radps"):
                 for horizon in ("0.2", "0.5"):
                     name = f"{key}@{horizon}s"
                     quantity, _, unit = key.split("_")
                     text = f"{label}, {quantity} {unit}, {horizon} s"
-                    yield f"{text:<40}{old[name]:>10.4g}{new[name]:>12.4g}{hold[name]:>12.4g}"
+                    yield f"{text:<40}{old[name]:>10.4g}{new[name]:>12.4g}{still[name]:>12.4g}"
 
 
 @command

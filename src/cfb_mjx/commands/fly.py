@@ -13,6 +13,7 @@ from cfb_mjx.commands.command import Command, Devices, File, Model, Pairs, Resul
 from cfb_mjx.documents import require_seed
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, together, write_json
+from cfb_mjx.optional import not_none
 
 if TYPE_CHECKING:
     from cfb_mjx.control.controllers import Controller
@@ -145,7 +146,7 @@ class Fly(Command):
         spread = load_randomisation(self.randomisation)
         require_possible(nominal, spread, self.magnitude, "--magnitude")
         # Scaled for the model that was named, whatever it is flown on.
-        controller = find_controller(name, nominal)
+        controller, manoeuvre = find_controller(name, nominal), None
         course = TargetTask(
             noise=Noise() if self.noise else QUIET,
             randomisation=spread if self.magnitude else None,
@@ -157,7 +158,8 @@ class Fly(Command):
         flips = task in FLIPS
         if flips:
             wild = replace(course, randomisation=spread, magnitude=self.magnitude or 1.0)
-            controller = self._manoeuvre(controller, name, task, wild, nominal)
+            manoeuvre = self._manoeuvre(controller, name, task, wild, nominal)
+            controller = manoeuvre
         else:
             if is_flip_policy(controller):
                 raise CfbError(f"{name}: is a flip policy and cannot fly --task {task}; fly flip or double-flip.")
@@ -167,8 +169,8 @@ class Fly(Command):
         fly = measured(task, controller, with_room(course, nominal), keys, Devices.take(self.devices))
         numbers = {"controller": name, "task": task, "model": self.model, "plants": self.plants}
         numbers |= {"magnitude": self.magnitude, "gyro": "late" if course.lumped_delay else "local"}
-        if flips:
-            numbers["knobs"] = {name: float(x) for name, x in controller.knobs._asdict().items() if np.isfinite(x)}
+        if manoeuvre is not None:
+            numbers["knobs"] = {name: float(x) for name, x in manoeuvre.knobs._asdict().items() if np.isfinite(x)}
         found, flown = self._measured(fly, described, nominal)
         numbers |= found
         numbers |= {"environment": environment()}
@@ -179,7 +181,8 @@ class Fly(Command):
                 from cfb_mjx.view.flown import write_flights
 
                 title = f"{name}, {task}, {self.model}"
-                write_flights(flown, controller.control_dt_s, nominal, title, flips, **self._shown)
+                # Of one model, as `_check` demands.
+                write_flights(not_none(flown), controller.control_dt_s, nominal, title, flips, **self._shown)
         return Flown(numbers, {"knobs": self.keep, "results": self.json, **self._shown}, self.search is not None)
 
     @property
@@ -240,7 +243,7 @@ class Fly(Command):
         from cfb_mjx.train.flip_search import Goal, improved
         from cfb_mjx.train.flips import FLIPS
 
-        if not is_flip_policy(turner):
+        if not isinstance(turner, NeuralController) or not is_flip_policy(turner):
             raise CfbError(
                 f"{controller}: is no flip policy and cannot fly --task {task}; give flip, or one of cfb train flip."
             )

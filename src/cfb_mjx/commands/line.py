@@ -14,6 +14,7 @@ import tyro
 from cfb_mjx.commands import COMMANDS, load
 from cfb_mjx.commands.command import Command, default_of, told
 from cfb_mjx.errors import CfbError
+from cfb_mjx.optional import not_none
 from cfb_mjx.terminal import escaped, shown
 
 _DOCUMENTED = re.compile(r"\n\s*(Attributes|Examples):")
@@ -74,7 +75,7 @@ def _arguments(kind: type[Command]):
     ]
     given.__name__ = kind.__name__
     shared = "".join(inspect.cleandoc(one.__doc__ or "").partition("\nAttributes:")[2] for one in kind.__mro__[1:])
-    given.__doc__ = inspect.getdoc(kind).replace("\nAttributes:", f"\nArgs:{shared}")
+    given.__doc__ = not_none(inspect.getdoc(kind)).replace("\nAttributes:", f"\nArgs:{shared}")
     given.__signature__ = inspect.Signature(parameters)
     given.__annotations__ = {one.name: told(hints[one.name]) for one in fields(kind)}
     return given
@@ -83,5 +84,5 @@ def _arguments(kind: type[Command]):
 def _description(name: str) -> str:
     """What stands above the arguments: two examples, and what the command does."""
     examples = "\n".join(f"  {line}" for line in COMMANDS[name].examples)
-    text = _DOCUMENTED.split(inspect.getdoc(load(name)))[0].strip()
+    text = _DOCUMENTED.split(not_none(inspect.getdoc(load(name))))[0].strip()
     return f"Examples:\n{examples}\n\n{text}"

@@ -139,7 +139,10 @@ class Train(Command):
         with ended_by_sigterm(), learning_events(self.output / EVENTS if self.tensorboard and first() else None) as log:
 
             def reported(row: dict[str, float]) -> None:
-                log(row["commands"], {name: row[name] for name in row if name not in ("update", "commands", "seconds")})
+                log(
+                    int(row["commands"]),
+                    {name: row[name] for name in row if name not in ("update", "commands", "seconds")},
+                )
                 say(_said(row))
 
             rows = train(training, self.output, self.resume, advanced, reported, devices=self.devices, log=log)

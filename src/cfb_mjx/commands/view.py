@@ -12,6 +12,7 @@ import tyro
 from cfb_mjx.commands.command import Command, File, Logs, Model, Pairs, Result, command, lines_of
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder
+from cfb_mjx.optional import not_none
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ class View(Command):
             evaluation = evaluate(drone, logs, progress=Progress("predictions"), faults=faults)
             write_log_recording(output, drone, evaluation, residuals)
         if self.spawn:
-            open_viewer(output)
+            open_viewer(not_none(output))
         if self.video is not None:
             write_log_film(self.video, drone, logs[0], residuals[0][1], self.slow)
         return Viewed(output, self.spawn, self.video)

@@ -6,7 +6,7 @@ Training and evaluation (`cfb_mjx.envs`, `cfb_mjx.train.flying`) add late estima
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -95,7 +95,7 @@ def rollout_closed_loop(
     results: list[Any] = []
 
     def loop(drones, parts):
-        leaves, *results[:] = jax.tree.flatten(_loop(drones, *parts, hold, commands, every))
+        leaves, *results[:] = jax.tree.flatten(_loop(drones, parts, hold, commands, every))
         return leaves
 
     def plainly(*leaves):
@@ -143,7 +143,7 @@ def rollout_closed_loop(
 class _Drones(NamedTuple):
     """The axis of the drones: the last one of every array."""
 
-    count: int | None
+    size: int | None
     """None: there is one drone, and no axis."""
     own_models: bool
     """Whether the model has the axis too."""
@@ -155,23 +155,22 @@ class _Drones(NamedTuple):
     @property
     def many(self) -> bool:
         """Whether moving numbers costs more than calling functions."""
-        return self.count is not None and self.count > LANES
+        return self.size is not None and self.size > LANES
 
     def each(self, function: Callable, *arguments) -> Any:
         """``function(model, ...)`` of one drone, for each; what comes after the model has the axis."""
-        if self.count is None:
+        if self.size is None:
             return function(*arguments)
         axes = (-1 if self.own_models else None, *(-1 for _ in arguments[1:]))
-        return jax.vmap(function, in_axes=axes, out_axes=-1, axis_size=self.count)(*arguments)
+        return jax.vmap(function, in_axes=axes, out_axes=-1, axis_size=self.size)(*arguments)
 
     def given(self, x: Array, own: bool) -> Array:
         """Given the axis, if it does not have it."""
-        return x if own else jnp.broadcast_to(x[..., None], (*x.shape, self.count))
+        return x if own else jnp.broadcast_to(x[..., None], (*x.shape, self.size))
 
 
-def _loop(
-    drones: _Drones, model, controller, state, target, memory, hold: int, commands: int, every: int
-) -> ClosedLoop:
+def _loop(drones: _Drones, parts: Sequence[Any], hold: int, commands: int, every: int) -> ClosedLoop:
+    model, controller, state, target, memory = parts
     prepared = drones.each(prepare, model) if drones.own_models else prepare(model)
 
     def begin(prepared, state):
@@ -224,7 +223,8 @@ def _loop(
         return carry, pack(kept_of(at, command))
 
     (_, memory, _), kept = jax.lax.scan(some, (at, memory, command), length=commands // every)
-    return ClosedLoop(*unpack(kept), memory)
+    state, command = unpack(kept)
+    return ClosedLoop(state, command, memory)
 
 
 def _by_kernel(drones, controller, after, kept_of, prepared, target, first, commands: int, every: int) -> ClosedLoop:
@@ -252,7 +252,7 @@ def _by_kernel(drones, controller, after, kept_of, prepared, target, first, comm
         carry = jax.lax.scan(one, carry, length=every)[0]
         return carry, carry
 
-    start = pack(first), jnp.zeros((4, drones.count), own.dtype)
+    start = pack(first), jnp.zeros((4, drones.size), own.dtype)
     (packed, _), kept = jax.lax.scan(some, start, length=commands // every)
     state, command = jax.vmap(lambda packed, command: kept_of(unpack(packed)[0], command))(*kept)
     return ClosedLoop(state, command, unpack(packed)[1])

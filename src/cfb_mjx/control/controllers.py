@@ -21,13 +21,18 @@ from cfb_mjx.model.state import State
 class Controller(Protocol):
     """What holds the target: what it sees is relative to it. `NeuralController` is one."""
 
-    control_dt_s: float
+    @property
+    def control_dt_s(self) -> float:
+        """Time between two commands, s."""
+        ...
 
     def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
         """Memory at take-over; ``command`` is what the rotors turn at."""
+        ...
 
     def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
         """New memory and command."""
+        ...
 
 
 class PidController(eqx.Module):

@@ -22,7 +22,12 @@ class Gains(eqx.Module):
 
 def gains(kp, ki=(0, 0, 0), kd=(0, 0, 0), integral_limit=(5000,) * 3, output_limit=(float("inf"),) * 3) -> Gains:
     """`Gains` from numbers; the defaults are the firmware's."""
-    return Gains(*(tuple(map(float, x)) for x in (kp, ki, kd, integral_limit, output_limit)))
+    return Gains(*map(_three, (kp, ki, kd, integral_limit, output_limit)))
+
+
+def _three(numbers) -> tuple[float, float, float]:
+    x, y, z = map(float, numbers)
+    return x, y, z
 
 
 class Memory(eqx.Module):

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.envs.observation import Estimate, Memory, observation, remember
 from cfb_mjx.errors import CfbError
+from cfb_mjx.model.state import AnyArray
 
 CLIMB, TURN, CATCH = range(3)
 """The phases, in order."""
@@ -48,7 +49,7 @@ class ManoeuvreMemory(NamedTuple):
     catch: Memory
     phase: Int[Array, ""]
     """Of the last command."""
-    count: Int[Array, ""]
+    count: Int[Array, ""]  # pyright: ignore[reportIncompatibleMethodOverride]  # nobody counts in it
     """Commands given in this phase."""
     roll: Float[Array, ""]
     """Of the last estimate, rad."""
@@ -123,7 +124,7 @@ class Manoeuvre(eqx.Module):
         return eqx.tree_at(lambda e: e.position, estimate, estimate.position - up)
 
 
-def roll_angle(quaternion: Float[Array, "*times 4"]) -> Float[Array, "*times"]:
+def roll_angle(quaternion: Float[AnyArray, "*times 4"]) -> Float[Array, "*times"]:
     """Direction of the body's z axis in the world's YZ plane, rad in (-pi, pi]: the roll of flips about x."""
     w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
     return jnp.arctan2(2 * (w * x - y * z), 1 - 2 * (x * x + y * y))

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.control.pid import COUNTS, DT, mix
 from cfb_mjx.model.rotors import hover_command
-from cfb_mjx.model.state import State
+from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.model.vector import rotate as rotated
 from cfb_mjx.parameters import Parameters
@@ -70,7 +70,7 @@ class MellingerState(eqx.Module):
     """Integral of the position error, m s."""
     attitude: Float[Array, "3"]
     """Integral of the attitude error, s."""
-    body_rate: Float[Array, "3"]
+    body_rate: Float[AnyArray, "3"]
     """Of the step before, rad/s."""
 
 
@@ -80,7 +80,7 @@ def init(measurement: State) -> MellingerState:
     return MellingerState(zero, zero, jnp.asarray(measurement.body_rate, zero.dtype))
 
 
-def attitude_error(quaternion: Float[Array, "4"], wanted: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def attitude_error(quaternion: Float[AnyArray, "4"], wanted: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """(R_des^T R - R^T R_des) as a vector, without the half of the article, as in the firmware.
 
     Args:

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int
 
 from cfb_mjx.control.loop import Gains, Memory, gains, update
 from cfb_mjx.model.rotors import hover_command
-from cfb_mjx.model.state import State
+from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.parameters import Parameters
 
 COUNTS = 65535.0
@@ -204,6 +204,6 @@ def _signals(measurement: State):
     )
 
 
-def _heading_frame(vector: Float[Array, "3"], yaw: Float[Array, ""]) -> Float[Array, "3"]:
+def _heading_frame(vector: Float[AnyArray, "3"], yaw: Float[Array, ""]) -> Float[Array, "3"]:
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     return jnp.stack([c * vector[0] + s * vector[1], c * vector[1] - s * vector[0], vector[2]])

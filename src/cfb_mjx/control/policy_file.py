@@ -60,7 +60,7 @@ def save_policy(policy: PolicyFile, path: str | Path) -> None:
         CfbError: the file cannot be written.
     """
     network = policy.controller.network
-    arrays = {f"weight_{i}": np.asarray(w, np.float32) for i, w in enumerate(network.weights)}
+    arrays: dict[str, Any] = {f"weight_{i}": np.asarray(w, np.float32) for i, w in enumerate(network.weights)}
     arrays |= {f"bias_{i}": np.asarray(b, np.float32) for i, b in enumerate(network.biases)}
     about = {
         "format": FORMAT,
@@ -94,8 +94,9 @@ def load_policy(path: str | Path) -> PolicyFile:
             if about["format"] != FORMAT:
                 raise CfbError(f"{path}: is a policy of another format ({about['format']!r}, not {FORMAT!r}).")
             shown, activation = about["observation"], about["activation"]
-            former = with_former(shown, "position_scale_m", BEFORE_BENDS)
-            layout = Layout(**former | {"setpoint_scales": tuple(shown.get("setpoint_scales", ()))})
+            settings = dict(with_former(shown, "position_scale_m", BEFORE_BENDS))
+            settings["setpoint_scales"] = tuple(shown.get("setpoint_scales", ()))
+            layout = Layout(**settings)
             weights = tuple(archive[f"weight_{i}"] for i in range(about["layers"]))
             biases = tuple(archive[f"bias_{i}"] for i in range(about["layers"]))
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):

@@ -9,6 +9,7 @@ from cfb_mjx import __version__
 from cfb_mjx.control.policy_file import PolicyFile
 from cfb_mjx.deploy.deployment import CATCH_S, Deployment
 from cfb_mjx.envs.observation import Layout
+from cfb_mjx.optional import not_none
 
 FORMAT = "cfb_mjx contract 1"
 BLIND_STEPS = 5
@@ -52,13 +53,13 @@ def contract(deployment: Deployment) -> dict[str, Any]:
         "trained_on": trained,
     }
     if deployment.flips:
-        ranges = deployment.setpoint_ranges
+        ranges, manoeuvre = deployment.setpoint_ranges, not_none(deployment.manoeuvre)
         found["flip"] = {
             "begins": "with the step after cfb_policy_set_flip(v_target, rate_target)",
             "v_target": {"unit": "m/s", "meaning": "speed along the body's z axis", "range": ranges["speed_mps"]},
             "rate_target": {"unit": "rad/s", "meaning": "rate about the body's x axis", "range": ranges["rate_radps"]},
-            "rotations": deployment.manoeuvre.rotations,
-            "knobs": {k: float(v) for k, v in deployment.manoeuvre.knobs._asdict().items() if math.isfinite(v)},
+            "rotations": manoeuvre.rotations,
+            "knobs": {k: float(v) for k, v in manoeuvre.knobs._asdict().items() if math.isfinite(v)},
             "catch_s": CATCH_S,
         }
     return found

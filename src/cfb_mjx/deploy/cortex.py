@@ -21,6 +21,7 @@ from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.deploy.export import Exported, literal
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import scratch
+from cfb_mjx.optional import not_none
 
 CLOCK_HZ = 168e6
 CYCLES_PER_INSTRUCTION = 2.0
@@ -148,7 +149,7 @@ def _read(said: str, steps: int) -> Emulated:
 
 def _inputs(deployment: Deployment, inputs: np.ndarray) -> str:
     rows = ",\n".join("  {" + ", ".join(literal(x) for x in row) + "}" for row in np.asarray(inputs, np.float32))
-    knobs = deployment.manoeuvre.knobs if deployment.flips else None
+    knobs = not_none(deployment.manoeuvre).knobs if deployment.flips else None
     return (
         f"#define STEPS {len(inputs)}\n#define FLIPS {int(deployment.flips)}\n"
         f"#define FLIP_SPEED {literal(knobs.speed_mps if knobs else 0)}\n"

@@ -14,6 +14,7 @@ from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, shipped_policies
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters.model_file import load_model_file
 from cfb_mjx.parameters.parameters import current_names
 
@@ -47,20 +48,21 @@ class Deployment:
         """The same in JAX. A flip begins with its first command."""
         if self.turner is None:
             return self.holder.controller
-        return Manoeuvre(self.holder.controller, self.turner.controller, self.manoeuvre.knobs)
+        return Manoeuvre(self.holder.controller, self.turner.controller, not_none(self.manoeuvre).knobs)
 
     @property
     def policies(self) -> dict[str, PolicyFile]:
         """All of them by what they do."""
-        return {"holder": self.holder} | ({"turner": self.turner} if self.flips else {})
+        return {"holder": self.holder} | ({} if self.turner is None else {"turner": self.turner})
 
     @property
     def setpoint_ranges(self) -> dict[str, tuple[float, float]]:
         """Of a flip's speed and rate: what its policy was trained for, and the manoeuvre's own, where that is more."""
-        trained = (self.turner.training.get("config") or {}).get("setpoints", {})
+        turner, manoeuvre = not_none(self.turner), not_none(self.manoeuvre)
+        trained = (turner.training.get("config") or {}).get("setpoints", {})
         ranges = {}
         for name in ("speed_mps", "rate_radps"):
-            own = float(getattr(self.manoeuvre.knobs, name))
+            own = float(getattr(manoeuvre.knobs, name))
             low, high = trained.get(name, (own, own))
             ranges[name] = min(low, own), max(high, own)
         return ranges

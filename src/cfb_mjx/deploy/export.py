@@ -15,6 +15,7 @@ from cfb_mjx.control.policy_file import PolicyFile
 from cfb_mjx.deploy.contract import BLIND_STEPS, LARGEST, contract
 from cfb_mjx.deploy.deployment import CATCH_S, Deployment
 from cfb_mjx.files import output_folder, plain, remove, together, write_texts
+from cfb_mjx.optional import not_none
 
 FIXED = ("cfb_network.h", "cfb_network.c", "cfb_pilot.h", "cfb_policy.h", "cfb_policy.c", "controller_out_of_tree.c")
 BUILD = ("Kbuild", "Makefile", "app-config", "README.md")
@@ -100,8 +101,9 @@ def _marks(deployment: Deployment) -> dict[str, str]:
     }
     if not deployment.flips:
         return marks
-    knobs, ranges = deployment.manoeuvre.knobs, deployment.setpoint_ranges
-    times = {1: "once", 2: "twice"}.get(deployment.manoeuvre.rotations, f"{deployment.manoeuvre.rotations} times")
+    manoeuvre, ranges = not_none(deployment.manoeuvre), deployment.setpoint_ranges
+    knobs = manoeuvre.knobs
+    times = {1: "once", 2: "twice"}.get(manoeuvre.rotations, f"{manoeuvre.rotations} times")
     flip = f"""
 ## Flipping
 
@@ -159,7 +161,7 @@ def _header(deployment: Deployment) -> str:
         "CFB_HOVER_COMMAND": literal(deployment.hover_command()),
     }
     if deployment.flips:
-        knobs, ranges = deployment.manoeuvre.knobs, deployment.setpoint_ranges
+        knobs, ranges = not_none(deployment.manoeuvre).knobs, deployment.setpoint_ranges
         values |= {f"CFB_{name.upper()}": literal(getattr(knobs, name)) for name in knobs._fields[:3]}
         values |= {"CFB_CLIMB_MPS": literal(knobs.climb_mps), "CFB_TURN_RAD": literal(knobs.turn_rad)}
         values |= {"CFB_CATCH_S": literal(CATCH_S)}

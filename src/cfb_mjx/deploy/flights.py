@@ -11,14 +11,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from cfb_mjx.control.controllers import Controller
+from cfb_mjx.control.manoeuvre import Manoeuvre
+from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.deploy.compiled import CompiledPolicy
 from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.deploy.parity import begin
-from cfb_mjx.envs import Estimate, TargetTask
+from cfb_mjx.envs import Estimate, TargetTask, Task
 from cfb_mjx.envs.episode import Episode, reset, step, with_room
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
+
+Flier = NeuralController | Manoeuvre
 
 
 class Beside(NamedTuple):
@@ -85,16 +88,16 @@ def fly_beside(
 
 # Compiled once for all flights of a policy.
 @eqx.filter_jit
-def _first(task: TargetTask, plant: Quadrotor, controller: Controller, start: State, hover: Array, key: Array):
+def _first(task: Task, plant: Quadrotor, controller: Flier, start: State, hover: Array, key: Array):
     episode = reset(task, plant, key, start)
     return episode, controller.start(episode.estimate, hover)
 
 
 @eqx.filter_jit
-def _commanded(controller: Controller, memory: Any, estimate: Estimate):
+def _commanded(controller: Flier, memory: Any, estimate: Estimate):
     return controller.command(memory, estimate)
 
 
 @eqx.filter_jit
-def _flown(task: TargetTask, episode: Episode, u: Array) -> Episode:
+def _flown(task: Task, episode: Episode, u: Array) -> Episode:
     return step(task, episode, u)[0]

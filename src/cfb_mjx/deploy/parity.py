@@ -12,6 +12,7 @@ import numpy as np
 from cfb_mjx.deploy.compiled import CompiledPolicy
 from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.envs.observation import Estimate
+from cfb_mjx.optional import not_none
 
 SEQUENCES, STEPS = 10_000, 12
 TOLERANCE = 1e-5
@@ -56,7 +57,7 @@ def begin(deployment: Deployment, compiled: CompiledPolicy) -> None:
     """Reset; a flip begins with the next step."""
     compiled.reset()
     if deployment.flips:
-        knobs = deployment.manoeuvre.knobs
+        knobs = not_none(deployment.manoeuvre).knobs
         compiled.set_flip(float(knobs.speed_mps), float(knobs.rate_radps))
 
 

@@ -17,6 +17,7 @@ from jaxtyping import Array
 
 from cfb_mjx.engine import scalars
 from cfb_mjx.engine.cpu_kernel import HELD
+from cfb_mjx.optional import not_none
 
 
 class System(NamedTuple):
@@ -75,7 +76,8 @@ class _Lanes:
             return [jnp.asarray(x, dtype) for x in leaves]
 
         examples = [jax.ShapeDtypeStruct(x.shape, dtype) for x in self.model]
-        self.prepare = scalars.trace(prepared, *examples, elementwise=HELD)
+        # Systems consist of numbers (`scalars.consists_of`), so there is a program.
+        self.prepare = not_none(scalars.trace(prepared, *examples, elementwise=HELD))
         (self.structure,) = structure
         self.prepared = self.prepared_from(self.model)
         shapes = [x.shape for x in self.prepare.traced.out_avals]

@@ -17,12 +17,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
 from cfb_mjx.engine.groups import LANES, grouped
 from cfb_mjx.engine.lanes import PACKING, Flight, System, flown, pulled, pushed
+from cfb_mjx.optional import not_none
 
 
 def fly(system: System, constants: Any, state: Any, rows: Array, hold: int, every: int | None = None) -> Any:
@@ -89,7 +91,7 @@ def _primitive(name: str) -> Primitive:
         if what is pulled:
             shapes = [operands[i].shape[:-1] if batched[i] else operands[i].shape for i in moving]
         axis = () if drones is None else (drones,)
-        return [jax.core.ShapedArray((*shape, *axis), operands[0].dtype) for shape in shapes]
+        return [ShapedArray((*shape, *axis), operands[0].dtype) for shape in shapes]
 
     plain = partial(_evaluated, what, in_groups=False)
     mlir.register_lowering(primitive, mlir.lower_fun(plain, multiple_results=True))
@@ -121,7 +123,8 @@ def _join(x: Array, axis: int | None, batched: bool, size: int, drones: int | No
     if axis is None and not batched:
         return x
     if drones is None:
-        return jnp.moveaxis(x, axis, -1)
+        # Without an earlier batch axis only a new one is left.
+        return jnp.moveaxis(x, not_none(axis), -1)
     x = x[None] if axis is None else jnp.moveaxis(x, axis, 0)
     x = x if batched else x[..., None]
     x = jnp.moveaxis(jnp.broadcast_to(x, (size, *x.shape[1:-1], drones)), 0, -2)
@@ -171,8 +174,8 @@ def _pull(cotangents, *operands, flight, drones, batched, moving):
     )
     found = [next(pulled) if w else None for w in wanted]
     if drones is not None:
-        shared = [i for i, x in enumerate(found) if x is not None and not batched[count + i]]
-        for i, total in zip(shared, _totals([found[i] for i in shared]), strict=True):
+        shared = {i: x for i, x in enumerate(found) if x is not None and not batched[count + i]}
+        for i, total in zip(shared, _totals(list(shared.values())), strict=True):
             found[i] = total
     return [None] * count + found
 

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Literal
 
 _ELEMENTWISE = """
@@ -54,7 +56,7 @@ def _unstack(array: np.ndarray, axis: int) -> tuple[np.ndarray, ...]:
     return tuple(rows[i : i + 1].reshape(rows.shape[1:]) for i in range(len(rows)))
 
 
-MOVES: dict[str, Callable[..., np.ndarray]] = {
+MOVES: dict[str, Callable[..., np.ndarray | tuple[np.ndarray, ...]]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda *arrays, dimension: np.concatenate(arrays, axis=dimension),
     "copy": lambda array: array,
@@ -160,7 +162,9 @@ def _run(jaxpr, constants, arguments) -> list[np.ndarray]:
     values.update(zip(jaxpr.invars, arguments, strict=True))
 
     def read(atom) -> np.ndarray:
-        return _numbers(np.asarray(atom.val, atom.aval.dtype)) if isinstance(atom, Literal) else values[atom]
+        if not isinstance(atom, Literal):
+            return values[atom]
+        return _numbers(np.asarray(atom.val, cast(ShapedArray, atom.aval).dtype))
 
     for equation in _needed(jaxpr)[0]:
         name, inputs = equation.primitive.name, [read(atom) for atom in equation.invars]

@@ -12,7 +12,8 @@ Actions are 2 u - 1 in [-1, 1]. Observations are a dictionary: ``state``, what t
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from dataclasses import replace
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -69,14 +70,17 @@ class BraxEnv(Env):
         """Begin an episode, which ``rng`` decides: the drone, the start, what is asked for, and all noise."""
         episode = reset(self.task, self.sys, rng)
         zero = jnp.zeros((), episode.state.position.dtype)
-        return State(episode, self._shown(episode), zero, zero, self._metrics(episode, zero), {"time_out": zero})
+        # Brax's annotations know no pipelines but its own, here and in `step`.
+        flying = cast(Any, episode)
+        return State(flying, self._shown(episode), zero, zero, self._metrics(episode, zero), {"time_out": zero})
 
     def step(self, state: State, action: jax.Array) -> State:
         """Fly one command. ``done`` says that the drone failed; that the time is up, Brax's wrappers say."""
-        episode, outcome = step(self.task, state.pipeline_state, 0.5 * (1 + action))
+        episode, outcome = step(self.task, cast(Episode, state.pipeline_state), 0.5 * (1 + action))
         failed = outcome.failed.astype(state.done.dtype)
         time_out = (outcome.timed_out & ~outcome.failed).astype(state.done.dtype)
-        return state.replace(
+        return replace(
+            state,
             pipeline_state=episode,
             obs=self._shown(episode),
             reward=outcome.reward.astype(state.reward.dtype),

@@ -8,12 +8,13 @@ wanted of the drone is said by a `Task`: `cfb_mjx.envs.target` and `cfb_mjx.envs
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cfb_mjx.envs import observation as seen
@@ -140,7 +141,7 @@ def longest_delay_s(task: Task, nominal: Quadrotor, magnitude: Float[Array, ""] 
     longest = 0.0
     for name in _DELAYS[: 1 if task.lumped_delay else 2]:
         value, spread = getattr(nominal.parameters, name), ranges.get(name)
-        if isinstance(value, jax.core.Tracer) or (spread is not None and isinstance(magnitude, jax.core.Tracer)):
+        if isinstance(value, Tracer) or (spread is not None and isinstance(magnitude, Tracer)):
             return None
         value = float(np.asarray(value).max())
         if spread is not None:
@@ -158,7 +159,10 @@ def longest_delay_s(task: Task, nominal: Quadrotor, magnitude: Float[Array, ""] 
 _DELAYS = ("pose_delay", "gyro_delay")
 
 
-def with_room(task: Task, nominal: Quadrotor) -> Task:
+_AnyTask = TypeVar("_AnyTask", bound=Task)
+
+
+def with_room(task: _AnyTask, nominal: Quadrotor) -> _AnyTask:
     """The task with room for late estimates of every drone it draws about ``nominal``, which may then be traced."""
     longest = longest_delay_s(task, nominal)
     return task if longest is None else replace(task, longest_delay_s=longest)
@@ -167,18 +171,20 @@ def with_room(task: Task, nominal: Quadrotor) -> Task:
 def _room_s(task: Task, nominal: Quadrotor, magnitude) -> float:
     """For how long estimates are kept."""
     longest, room = longest_delay_s(task, nominal, magnitude), task.longest_delay_s
-    if room is None and longest is None:
-        raise CfbError(
-            "reset: the delay of a traced model is not known while compiling; give the task its longest_delay_s, for "
-            "instance by with_room(task, model) outside of jit and vmap."
-        )
-    if room is not None and longest is not None and longest > room * (1 + 1e-6):
+    if room is None:
+        if longest is None:
+            raise CfbError(
+                "reset: the delay of a traced model is not known while compiling; give the task its longest_delay_s, "
+                "for instance by with_room(task, model) outside of jit and vmap."
+            )
+        return longest
+    if longest is not None and longest > room * (1 + 1e-6):
         names = " or ".join(_DELAYS[: 1 if task.lumped_delay else 2])
         raise CfbError(
             f"The task keeps estimates for longest_delay_s = {room:g} s, but {names} can be {longest:g} s; raise it or "
             "leave it out."
         )
-    return longest if room is None else room
+    return room
 
 
 class Streams(NamedTuple):
@@ -204,10 +210,10 @@ class Streams(NamedTuple):
 class Pose(eqx.Module):
     """What of the state an estimator could know."""
 
-    position: Array
-    velocity: Array
-    quaternion: Array
-    body_rate: Array
+    position: AnyArray
+    velocity: AnyArray
+    quaternion: AnyArray
+    body_rate: AnyArray
 
 
 class Episode(eqx.Module):

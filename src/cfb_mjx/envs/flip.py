@@ -17,7 +17,7 @@ from cfb_mjx.envs.observation import Layout, rotation_matrix
 from cfb_mjx.envs.reward import length, too_fast, triangle
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import hover_rotor_speed
-from cfb_mjx.model.state import State
+from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.parameters import Parameters
 
 SETPOINTS = ("speed_mps", "rate_radps")
@@ -81,7 +81,7 @@ class FlipReward:
 
 def deviations(
     state: State, setpoint: Float[Array, "2"], axis_direction: tuple[float, ...] = (1.0, 0.0, 0.0)
-) -> tuple[Float[Array, "3"], Float[Array, "3"], Float[Array, "3"]]:
+) -> tuple[Float[AnyArray, "3"], Float[AnyArray, "3"], Float[AnyArray, "3"]]:
     """Of velocity (body axes, m/s), of the body's x axis (world), and of the body rate (rad/s)."""
     turn = rotation_matrix(state.quaternion)
     speed, rate = setpoint

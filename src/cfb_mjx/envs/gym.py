@@ -243,7 +243,7 @@ class TargetVectorEnv(VectorEnv):
         why = {}
         if failed.any():
             reasons = np.where(np.asarray(outcome.diverged), DIVERGED, FAST)
-            why = {"failure": np.where(failed, reasons, None), "_failure": failed}
+            why = {"failure": np.where(failed, reasons, np.array(None, object)), "_failure": failed}
         over = failed | timed_out
         self._over, final = over, {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP and over.any():

@@ -17,6 +17,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cfb_mjx.model.state import AnyArray
+from cfb_mjx.optional import not_none
+
 
 @dataclass(frozen=True)
 class Layout:
@@ -76,13 +79,13 @@ gives ``position_scale_m`` and none of these."""
 class Estimate(eqx.Module):
     """What the state estimator reports."""
 
-    position: Float[Array, " 3 *drones"]
+    position: Float[AnyArray, " 3 *drones"]
     """Position minus target, world, m."""
-    velocity: Float[Array, " 3 *drones"]
+    velocity: Float[AnyArray, " 3 *drones"]
     """World, m/s."""
-    quaternion: Float[Array, " 4 *drones"]
+    quaternion: Float[AnyArray, " 4 *drones"]
     """[w, x, y, z], body to world."""
-    body_rate: Float[Array, " 3 *drones"]
+    body_rate: Float[AnyArray, " 3 *drones"]
     """Body, rad/s."""
 
 
@@ -97,7 +100,7 @@ class Memory(eqx.Module):
     """Of the relative position, m s."""
 
 
-def rotation_matrix(q: Float[Array, " 4 *drones"]) -> Float[Array, "3 3 *drones"]:
+def rotation_matrix(q: Float[AnyArray, " 4 *drones"]) -> Float[Array, "3 3 *drones"]:
     """Rotation matrix of a unit quaternion, body to world."""
     w, x, y, z = q
     return jnp.stack(
@@ -131,7 +134,7 @@ def frame(layout: Layout, estimate: Estimate) -> Float[Array, " frame *drones"]:
     return jnp.concatenate(parts)
 
 
-def _length(vector: Float[Array, " 3 *drones"]) -> Float[Array, " *drones"]:
+def _length(vector: Float[AnyArray, " 3 *drones"]) -> Float[Array, " *drones"]:
     # The square root has no slope at zero; the small number keeps the gradient finite there.
     return jnp.sqrt(jnp.sum(vector * vector, axis=0) + 1e-12)
 
@@ -168,7 +171,7 @@ def observation(
         parts.append(memory.integral / layout.integral_limit_ms)
     if layout.setpoint_scales:
         scales = jnp.asarray(layout.setpoint_scales, estimate.velocity.dtype)
-        parts.append(setpoint / scales.reshape(-1, *(1 for _ in drones)))
+        parts.append(not_none(setpoint) / scales.reshape(-1, *(1 for _ in drones)))
     return jnp.concatenate(parts)
 
 

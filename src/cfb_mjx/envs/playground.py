@@ -12,7 +12,7 @@ first one.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -35,7 +35,11 @@ try:
     with quietly():
         from brax.envs import base as brax
         from ml_collections import config_dict
-        from mujoco_playground import MjxEnv, State, dm_control_suite
+        from mujoco_playground import (  # pyright: ignore[reportMissingImports]  # whoever wants this installs it
+            MjxEnv,
+            State,
+            dm_control_suite,
+        )
 except ImportError as error:
     raise CfbError(f"MuJoCo Playground is not installed ({error}): pip install playground.") from None
 
@@ -188,7 +192,8 @@ class CfbFlipEnv(CfbEnv):
 
 
 def _shown(state: brax.State) -> State:
-    return State(Data(state.pipeline_state), state.obs, state.reward, state.done, state.metrics, state.info)
+    episode = cast(Episode, state.pipeline_state)
+    return State(Data(episode), state.obs, state.reward, state.done, state.metrics, state.info)
 
 
 for name, kind in {"CfbTarget": CfbEnv, "CfbFlip": CfbFlipEnv}.items():

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from cfb_mjx.model.rotors import TORQUE_SIGNS, thrust
-from cfb_mjx.model.state import State
+from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.parameters import Parameters
 
 
@@ -97,6 +97,6 @@ def commanded_torque(parameters: Parameters, command: Float[Array, "4"]) -> Floa
     return parameters.rotor_spacing / 2 * (jnp.asarray(TORQUE_SIGNS[:2], settled.dtype) @ settled)
 
 
-def length(vector: Float[Array, " n"]) -> Float[Array, ""]:
+def length(vector: Float[AnyArray, " n"]) -> Float[Array, ""]:
     """Euclidean norm with a finite slope at zero."""
     return jnp.sqrt(jnp.sum(vector * vector) + 1e-12)

@@ -94,6 +94,7 @@ def derivative(p: SimpleNamespace, x: np.ndarray, command: np.ndarray, held: Sim
         bend, bend_rate = x[FLEX]
         pull = p.flex_frequency**2 * bend + 2 * p.flex_damping * p.flex_frequency * bend_rate
         moment[1] += p.flex * pull
+        rates[31], rates[32] = bend_rate, -pull
     world = held.push * p.mass
     if p.on & WORLD_EFFECTS:
         world = world + _world_force(p, x, held, rates)
@@ -117,8 +118,7 @@ def derivative(p: SimpleNamespace, x: np.ndarray, command: np.ndarray, held: Sim
         if lag_rate is not None:
             rates[LAGGED] = lag_rate
         if "flex" in p.on:
-            rates[31] = bend_rate
-            rates[32] = -pull - rate[1]
+            rates[32] -= rate[1]
     return rates, specific
 
 

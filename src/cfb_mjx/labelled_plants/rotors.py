@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from cfb_mjx.labelled_plants import constants as c
+from cfb_mjx.optional import not_none
 
 HUB_EFFECTS = frozenset({"inflow", "rotor_drag", "flapping", "ground"})
 DISC = np.pi * c.BLADE_RADIUS**2
@@ -55,7 +56,7 @@ def rotor_wrench(p: SimpleNamespace, height, rotation, body_velocity, w, speed, 
         drag = drag * p.torque_scale
     if "blades" in p.on:
         thrust, drag = thrust * p.blades[0], drag * p.blades[1]
-    hub = None
+    across2 = hub = loading = None
     if p.on & HUB_EFFECTS:
         hub = (
             body_velocity[0] - w[2] * c.ROTOR_Y,
@@ -64,7 +65,7 @@ def rotor_wrench(p: SimpleNamespace, height, rotation, body_velocity, w, speed, 
         )
         across2 = hub[0] ** 2 + hub[1] ** 2
     if "inflow" in p.on:
-        thrust = thrust * _inflow(p, thrust, hub[2], across2, speed)
+        thrust = thrust * _inflow(p, thrust, not_none(hub)[2], across2, speed)
     if "ground" in p.on:
         thrust = thrust * _ground(p, height, rotation, across2)
     spin = (c.ROTOR_INERTIA * speed_rate + drag) * c.YAW
@@ -85,6 +86,7 @@ def rotor_wrench(p: SimpleNamespace, height, rotation, body_velocity, w, speed, 
     if p.on & {"rotor_drag", "flapping"}:
         loading = np.sqrt(thrust / c.HOVER_THRUST)
     if "rotor_drag" in p.on:
+        hub, across2, loading = not_none(hub), not_none(across2), not_none(loading)
         size = loading / np.sqrt(1 + across2 / p.rotor_drag_speed**2)
         side_x, side_y = -p.rotor_drag[0] * size * hub[0], -p.rotor_drag[1] * size * hub[1]
         force[0] += side_x.sum(0)
@@ -93,6 +95,7 @@ def rotor_wrench(p: SimpleNamespace, height, rotation, body_velocity, w, speed, 
     if "flapping" in p.on:
         # The disc tips away from the motion: nose up when flying forward. The part at right angles to the motion
         # turns with each rotor's sense and nearly cancels over the four.
+        hub, across2, loading = not_none(hub), not_none(across2), not_none(loading)
         size = 0.25 * p.flapping * loading**2 / np.sqrt(1 + across2 / 49.0)
         size = size * (1 - p.flapping_climb * np.tanh(hub[2] / 2.0))
         turn = p.flapping_cross * c.YAW

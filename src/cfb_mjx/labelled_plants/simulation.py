@@ -155,11 +155,10 @@ class _Loop:
         return command + self.p.play_share * (self.plays.mean(axis=0) - command)
 
     def _move(self, tick, held):
-        x, first, step = self.x, None, c.TICK / c.SUBSTEPS
-        for sub in range(c.SUBSTEPS):
-            time = tick * c.TICK + sub * step
-            x, specific = advance(self.p, x, self._arrived(tick, sub), held, time, step)
-            first = specific if first is None else first
+        step, time = c.TICK / c.SUBSTEPS, tick * c.TICK
+        x, first = advance(self.p, self.x, self._arrived(tick, 0), held, time, step)
+        for sub in range(1, c.SUBSTEPS):
+            x, _ = advance(self.p, x, self._arrived(tick, sub), held, time + sub * step, step)
         return x, first
 
     def _arrived(self, tick, sub):

@@ -14,6 +14,7 @@ import numpy as np
 
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.gaps import stretches
+from cfb_mjx.optional import not_none
 
 BAND_HZ = (5.0, 17.0)
 MAX_SHIFT = 0.06  # s: under one period of the band's centre, so that the neighbouring correlation peak stays outside
@@ -86,8 +87,9 @@ def estimate_command_shift(
         measured = log.rotor_speed is not None and np.isfinite(log.rotor_speed).all(axis=1).mean() > 0.5
         method = "rotor_speed" if measured else "command"
     if method == "rotor_speed":
-        valid = ~np.isnan(log.rotor_speed).any(axis=1)
-        times, speeds, gyro = log.time[valid], log.rotor_speed[valid], log.body_rate[valid]
+        measured_speed = not_none(log.rotor_speed)
+        valid = ~np.isnan(measured_speed).any(axis=1)
+        times, speeds, gyro = log.time[valid], measured_speed[valid], log.body_rate[valid]
     elif method == "command":
         times, speeds, gyro = log.time, nominal_speeds(log), log.body_rate
     else:
@@ -97,6 +99,7 @@ def estimate_command_shift(
     blocks = _spectra(times, predicted, gyro[:, :2], log, band_hz)
     if blocks is None:
         return AlignmentEstimate(0.0, float("inf"), 0.0, 0.0, method, band_hz, 0)
+    low, high = band_hz
     frequency, cross, power_x, power_y = blocks
     lags = np.arange(-MAX_SHIFT, MAX_SHIFT + 5e-4, 1e-3)
     steer = np.exp(2j * np.pi * np.outer(frequency, lags))
@@ -109,7 +112,7 @@ def estimate_command_shift(
     std = float(np.std(resampled)) if len(pairs) >= 4 else float("inf")
     correlation = float(peak[0] / np.sqrt(power_x * power_y)) if power_x * power_y > 0 else 0.0
     gain = float(peak[0] / power_x) if power_x > 0 else 0.0
-    return AlignmentEstimate(float(shift[0]), std, correlation, gain, method, tuple(band_hz), len(cross))
+    return AlignmentEstimate(float(shift[0]), std, correlation, gain, method, (low, high), len(cross))
 
 
 def apply_shift(log: FlightLog, shift: float) -> FlightLog:

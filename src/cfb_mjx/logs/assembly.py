@@ -82,8 +82,7 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
             beside = f" ({', '.join(parts)} alone does not tell it.)" if parts else ""
             held = f" {merger.beyond:.1%} of them lay beyond 0 to 1 and were held there." if merger.beyond else ""
             read.warnings.append(_DERIVED[field] + beside + (held if field == "command" else ""))
-    if "battery_voltage" in fields:
-        fields["battery_voltage"] = _backfilled(fields["battery_voltage"][:, 0])
+    battery = _backfilled(fields["battery_voltage"][:, 0]) if "battery_voltage" in fields else None
     keep = np.all([merger.usable[f] for f in chosen if f in REQUIRED], axis=0)
     if keep.sum() < 2:
         raise CfbError(
@@ -91,9 +90,10 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
             "2 are needed; log all of them during the same time."
         )
     rows = reference.time[keep]
-    fields = {f: None if v is None else v[keep] for f, v in fields.items()}
-    if fields.get("rotor_speed") is not None and np.isnan(fields["rotor_speed"]).all():
-        fields["rotor_speed"] = None
+    fields = {f: v[keep] for f, v in fields.items()}
+    rotor_speed = fields.get("rotor_speed")
+    if rotor_speed is not None and np.isnan(rotor_speed).all():
+        rotor_speed = None
     held = merger.report()
     if (late := max((held[s.name]["mean_age_ms"] for s in merger.poses(chosen)), default=0.0)) > _LATE * 1e3:
         read.notes.append(
@@ -103,8 +103,8 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
     log = FlightLog(
         time=quantise_time(rows - rows[0]),
         **{f: fields[f] for f in names},
-        rotor_speed=fields.get("rotor_speed"),
-        battery_voltage=fields.get("battery_voltage"),
+        rotor_speed=rotor_speed,
+        battery_voltage=None if battery is None else battery[keep],
         metadata={
             "name": path.stem,
             "source": path.name,
@@ -211,7 +211,8 @@ class _Merger:
             return rate
         if field == "command":
             # Readings are of one time, whatever field asks for them.
-            speed, known = fields["rotor_speed"], np.isfinite(fields["rotor_speed"]).all(axis=1)
+            speed = fields["rotor_speed"]
+            known = np.all(np.isfinite(speed), axis=1)
             self.usable[field] = known
             needed = nominal_command(self.reference.time, np.where(known[:, None], speed, 0.0))
             command = np.clip(needed, 0.0, 1.0)

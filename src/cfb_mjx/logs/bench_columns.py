@@ -10,6 +10,7 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.tabular import Table, require_numbers
+from cfb_mjx.optional import not_none
 
 GRAVITY = 9.81
 RPM = 2 * np.pi / 60
@@ -151,7 +152,7 @@ def _header(column: str) -> _Header:
 
 def _converted(table: Table, key: str, column: str, path: Path) -> np.ndarray:
     kind, header = key.rstrip("1234"), _header(column)
-    default = dict(_NAMES[kind])[_NUMBERED.fullmatch(header.name)["name"]]
+    default = dict(_NAMES[kind])[not_none(_NUMBERED.fullmatch(header.name))["name"]]
     known, unit = _UNITS[kind], default if header.unit is None else header.unit
     if unit not in known:
         raise CfbError(f"{path}: column {column} is in {unit}, which is none of {', '.join(known)}; convert it.")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ _SETTLED = 0.01  # of the speed over 0.1 s: faster changes are not steady
 class Bench(NamedTuple):
     """What one file holds, and what was done to read it."""
 
-    parts: list[MotorRecord | MapTable | SteadyPoints | ThrustPoints]
+    parts: Sequence[MotorRecord | MapTable | SteadyPoints | ThrustPoints]
     notes: list[str]
 
 
@@ -172,8 +173,9 @@ def _parts(
     if command and "t" in si:
         table = {"t": si["t"]} | {f"omega{numbers[k] or ''}": v for k, v in speeds.items()}
         table |= {k: np.clip(v, 0, None) for k, v in command.items()}
-        record = dataclasses.replace(from_columns(Table(table), path), battery_voltage=si.get("vbat"))
-        parts.append(_command_before(record, notes))
+        record = from_columns(Table(table), path)
+        assert isinstance(record, MotorRecord)  # there is a time, and neither force nor torque
+        parts.append(_command_before(dataclasses.replace(record, battery_voltage=si.get("vbat")), notes))
         steady = _steady(si["t"], mean_of(speeds))
     elif command:
         parts.append(steady_points(speeds, command, si.get("vbat"), path, notes))

@@ -143,7 +143,9 @@ def joined(thrust: ThrustPoints, steady: list[SteadyPoints], rotors: int | None,
         "supply."
     )
     table = Table({"omega": speed[good], "force": thrust.force[good] / count})
-    return from_columns(table, thrust.path)
+    found = from_columns(table, thrust.path)
+    assert isinstance(found, MapTable)  # there is a force
+    return found
 
 
 def _typical(readings: np.ndarray) -> float:

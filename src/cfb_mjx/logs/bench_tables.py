@@ -112,7 +112,7 @@ def _steps(table: Table, path: Path) -> MotorRecord:
     if missing := sorted({f"u{m}" for m, c in zip(motors, commands, strict=True) if c not in table}):
         raise CfbError(f"{path}: missing column {', '.join(missing)} (or u); a step table holds {STEP_LAYOUT}.")
     require_numbers(table, ["t", *dict.fromkeys(commands), *speeds], path)
-    time = table["t"]
+    time = table.numbers("t")
     if len(time) < 2:
         raise CfbError(f"{path}: the table has {len(time)} rows; record at least a second of steps.")
     _finite(table, ["t", *dict.fromkeys(commands)], path)
@@ -122,9 +122,9 @@ def _steps(table: Table, path: Path) -> MotorRecord:
         raise CfbError(f"{path}: t does not increase in row {row} (counted from 0); sort by t and drop duplicates.")
     if np.median(step) >= 0.5:
         raise CfbError(f"{path}: rows are {np.median(step):g} s apart, so t is probably in ms or us; convert it to s.")
-    command = np.stack([table[c] for c in commands], axis=1)
+    command = np.stack([table.numbers(c) for c in commands], axis=1)
     check_command(command, commands, path)
-    speed = np.stack([table[c] for c in speeds], axis=1)
+    speed = np.stack([table.numbers(c) for c in speeds], axis=1)
     _speed(speed, path)
     return MotorRecord(path.stem, time, np.clip(command, 0, 1), speed, motors)
 
@@ -137,9 +137,9 @@ def _map(table: Table, path: Path) -> MapTable:
     if not len(table["omega"]):
         raise CfbError(f"{path}: the table has no rows; export the measurement again.")
     _finite(table, used, path)
-    speed = table["omega"]
+    speed = table.numbers("omega")
     _speed(speed[:, None], path)
-    force, torque, motor = (table.get(c) for c in ("force", "torque", "motor"))
+    force, torque, motor = (table.numbers(c) if c in table else None for c in ("force", "torque", "motor"))
     if force is not None:
         top = float(np.abs(force).max())
         if top > FORCE_LIMIT:
@@ -164,7 +164,7 @@ def _map(table: Table, path: Path) -> MapTable:
 
 def _finite(table: Table, columns: list[str], path: Path) -> None:
     for column in columns:
-        bad = ~np.isfinite(table[column])
+        bad = ~np.isfinite(table.numbers(column))
         if bad.any():
             raise CfbError(
                 f"{path}: column {column} has no finite value in row {int(np.argmax(bad))} (counted from 0; "

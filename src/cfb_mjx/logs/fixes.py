@@ -13,6 +13,7 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
 from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.optional import not_none
 
 _G = 9.81
 _VECTORS = {
@@ -149,13 +150,13 @@ def fix_of(name: str) -> Fix:
 def candidates() -> Iterable[Fix]:
     """All changes of what is not the motors', the likely ones first."""
     yield from _named()
-    yield from (_time(str(scale)) for scale in _SCALES)
+    yield from (not_none(_time(str(scale))) for scale in _SCALES)
     for part in _VECTORS:
         for order in itertools.permutations("xyz"):
             for signs in itertools.product(("", "-"), repeat=3):
                 spec = ",".join(s + a for s, a in zip(signs, order, strict=True))
                 if spec != "x,y,z":
-                    yield _axes(part, spec)
+                    yield not_none(_axes(part, spec))
 
 
 def motor_fixes(order: tuple[int, ...], sign: int = 1, key: str = "motors") -> tuple[Fix, ...]:
@@ -166,7 +167,8 @@ def motor_fixes(order: tuple[int, ...], sign: int = 1, key: str = "motors") -> t
         sign: -1 where the commands are one minus the duty.
         key: ``motors`` for commands and rotor speeds, ``command-order`` or ``rotor-order`` for one of the two.
     """
-    ordered = () if order == (0, 1, 2, 3) else (_order(",".join(str(column + 1) for column in order), key),)
+    spec = ",".join(str(column + 1) for column in order)
+    ordered = () if order == (0, 1, 2, 3) else (not_none(_order(spec, key)),)
     return ordered if sign > 0 else (*ordered, _inverted())
 
 

@@ -16,6 +16,8 @@ from cfb_mjx.logs.gaps import longest_step, stretches
 
 REQUIRED = ("time", "position", "velocity", "quaternion", "body_rate", "specific_force", "command")
 OPTIONAL = ("rotor_speed", "battery_voltage")
+# The class has a method of the name slice.
+Rows = np.ndarray | slice
 _WIDTH = {
     "position": 3,
     "velocity": 3,
@@ -122,7 +124,7 @@ class FlightLog:
         border = self.time[0] + share * self.duration
         return self.slice(self.time[0], border), self.slice(border, self.time[-1])
 
-    def rows(self, index: np.ndarray) -> FlightLog:
+    def rows(self, index: Rows) -> FlightLog:
         """The rows that ``index`` (a mask, indices or a slice) selects."""
         arrays = {f: getattr(self, f) for f in (*REQUIRED, *OPTIONAL)}
         return self.replace(**{f: None if a is None else a[index] for f, a in arrays.items()})

@@ -247,8 +247,8 @@ def _repeated(log: FlightLog) -> str | None:
 
 
 def _judge_motors(log: FlightLog, relations: list[Relation]) -> Verdict:
-    if (found := motor_checks.followed(log)) is not None:
-        return Verdict(relations, {}, *found)
+    if (unfollowed := motor_checks.followed(log)) is not None:
+        return Verdict(relations, {}, *unfollowed)
     agreement, moving = {}, {}
     for source in ("rotor_speed", "command"):
         found = consistency.agreement(log, source)

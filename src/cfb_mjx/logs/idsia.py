@@ -120,12 +120,12 @@ def _as_logged(table: Table, path: Path) -> tuple[FlightLog, Table]:
         raise CfbError(
             f"{path}: column {bad[0]} has no finite value in row {row}; drop such rows or fetch the file again."
         )
-    time = table["t"]
+    time = table.numbers("t")
     if len(time) < 2 or not (np.diff(time) > 0).all():
         raise CfbError(f"{path}: column t must increase over at least 2 rows; sort the rows by t and drop duplicates.")
 
     def stack(names):
-        return np.stack([table[c] for c in names], axis=1)
+        return np.stack([table.numbers(c) for c in names], axis=1)
 
     quaternion = stack(QUATERNION)
     if (np.abs(np.linalg.norm(quaternion, axis=1) - 1.0) > 0.05).any():
@@ -142,7 +142,7 @@ def _as_logged(table: Table, path: Path) -> tuple[FlightLog, Table]:
         specific_force=rotation.to_body(quaternion, stack(ACCELERATION)),
         command=stack(COMMAND),
         rotor_speed=None if np.isnan(erpm).all() else erpm * RAD_PER_S_PER_ERPM,
-        battery_voltage=table["Vbat"],
+        battery_voltage=table.numbers("Vbat"),
         metadata={
             "name": path.stem,
             "source": path.name,

@@ -7,7 +7,7 @@ The pose uses Foxglove's published message, field names and numbers as in https:
 from __future__ import annotations
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 METADATA_RECORD = "cfb_mjx.flight_log"
 FORMAT_VERSION = "1"
@@ -99,7 +99,7 @@ def descriptor_set(message: str) -> bytes:
     return result.SerializeToString(deterministic=True)
 
 
-def message_class(name: str, descriptors: bytes):
+def message_class(name: str, descriptors: bytes) -> type[Any]:
     """The Python class of a message from a serialised FileDescriptorSet, in a descriptor pool of its own.
 
     Raises:

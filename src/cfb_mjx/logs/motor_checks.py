@@ -9,6 +9,7 @@ from cfb_mjx.logs.alignment import GAIN, nominal_speeds, nominal_thrust
 from cfb_mjx.logs.consistency import ORDER
 from cfb_mjx.logs.fixes import COMMAND_UNITS, Fix, motor_fixes
 from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.optional import not_none
 
 _GAIN = (1100.0, 6500.0)  # rad/s of a rotor for a command of one, brushed and brushless
 _OFF = 0.03  # of full: the motors are off
@@ -30,7 +31,7 @@ def heaves_against(log: FlightLog, source: str) -> bool:
 
 def _heave(log: FlightLog, source: str) -> float:
     """Correlation of what all motors together change with the specific force along z."""
-    thrust = log.rotor_speed if source == "rotor_speed" else nominal_speeds(log)
+    thrust = not_none(log.rotor_speed) if source == "rotor_speed" else nominal_speeds(log)
     both = _swings(log, np.stack([np.nansum(thrust, axis=1), log.specific_force[:, 2]], axis=1))
     size = float(np.sqrt(np.mean(both[:, 0] ** 2) * np.mean(both[:, 1] ** 2)))
     return float(np.mean(both[:, 0] * both[:, 1])) / size if size > 0 else 0.0

@@ -90,8 +90,9 @@ def _fields(numbers: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
     if "quaternion" not in found:
         angles = {m[2].lower(): n for n in numbers if (m := _ANGLES.fullmatch(_plain(n))) and not m[1].endswith("rate")}
         names = [angles.get(a) or angles.get(b) for a, b in (("roll", "phi"), ("pitch", "theta"), ("yaw", "psi"))]
-        if None not in names:
-            found["angles"] = names
+        known = [name for name in names if name is not None]
+        if len(known) == len(names):
+            found["angles"] = known
     if "body_rate" not in found:
         rates = {(m[1] or m[3]).lower(): n for n in numbers if (m := _RATES.fullmatch(_plain(n)))}
         if len(rates) == 3:

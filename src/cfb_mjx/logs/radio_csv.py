@@ -127,14 +127,14 @@ def _of_table(
         raise CfbError(f"{path}: there is no time column; name it Timestamp (ms) or t (s).")
     named = _of_one_drone(table, mapping, path, robot)
     require_numbers(table, [clock.column, *named.values()], path)
-    ticks = table[clock.column]
+    ticks = table.numbers(clock.column)
     if not np.isfinite(ticks).all():
         raise CfbError(
             f"{path}: column {clock.column} has no value in row {int(np.argmin(np.isfinite(ticks)))} (counted from 0); "
             "every row needs a time."
         )
     time, unit = _seconds(ticks, clock, time_unit, path, notes)
-    streams = [ordered(s, path, notes) for s in _streams({n: table[c] for n, c in named.items()}, time)]
+    streams = [ordered(s, path, notes) for s in _streams({n: table.numbers(c) for n, c in named.items()}, time)]
     _check_unit(streams, path, unit)
     known = {*named.values(), clock.column}
     ignored = [c for c, v in table.items() if c not in known and not isinstance(v, Text)]
@@ -161,7 +161,9 @@ def _candidates(columns: Iterable[str], mapping: VariableMap) -> dict[str, list[
     for column in columns:
         # "cf3/stateEstimate.x", "est_stateEstimate_x"
         match = _PREFIX.fullmatch(column.strip())
-        name = None if match is None else wanted.get(_bare(match["rest"]))
+        if match is None:
+            continue
+        name = wanted.get(_bare(match["rest"]))
         if name is not None and name not in found and match["head"].lower() not in _NOT_MEASURED:
             candidates.setdefault(name, []).append(column)
     return candidates
@@ -186,7 +188,7 @@ def _of_one_drone(columns: Iterable[str], mapping: VariableMap, path: Path, robo
     heads = {c: _PREFIX.fullmatch(c.strip()) for same in candidates.values() for c in same}
     drones = {m["head"] for same in candidates.values() if len(same) > 1 for c in same if (m := heads[c])}
     if robot is not None:
-        mine = {n: [c for c in same if heads[c] and heads[c]["head"] == robot] for n, same in candidates.items()}
+        mine = {n: [c for c in same if (m := heads[c]) and m["head"] == robot] for n, same in candidates.items()}
         if not any(mine.values()):
             there = f"those of {', '.join(sorted(drones))}" if drones else "of one drone only"
             raise CfbError(f"{path}: has no columns of {robot}; they are {there}.")
@@ -211,8 +213,8 @@ def _bare(name: str) -> str:
 def _long_form(columns: Iterable[str]) -> tuple[str, str] | None:
     """The columns with names and values of a table of one value per line."""
     by_name = {c.strip().lower(): c for c in columns}
-    found = [next((by_name[n] for n in sorted(names) if n in by_name), None) for names in _LONG]
-    return None if None in found or len(by_name) > 5 else tuple(found)
+    name, value = (next((by_name[n] for n in sorted(names) if n in by_name), None) for names in _LONG)
+    return None if name is None or value is None or len(by_name) > 5 else (name, value)
 
 
 def _of_long_form(table, name_column, value_column, path, mapping, time_unit, robot, notes) -> list[Stream]:

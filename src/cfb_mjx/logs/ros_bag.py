@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, scratch
@@ -176,7 +176,9 @@ def _by_rosbags(path: Path, suffix: str, warnings: list[str]) -> list[BagMessage
                     and (described or name != STATUS)
                 ]
                 for connection, logged, raw in reader.messages(connections=wanted):
-                    content, single = reader.deserialize(raw, connection.msgtype), False
+                    # Classes of messages are made while reading.
+                    content: Any = cast(Any, reader.deserialize(raw, connection.msgtype))
+                    single = False
                     if connection.msgtype == kind:
                         single = content.values.dtype.itemsize == 4
                         if not described and single and len(stores[32].serialize_cdr(content, kind)) < len(raw) - 4:

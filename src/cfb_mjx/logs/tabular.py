@@ -54,6 +54,12 @@ class Table(dict[str, np.ndarray | Text]):
         self.notes = [] if notes is None else notes
         self.warnings = [] if warnings is None else warnings
 
+    def numbers(self, column: str) -> np.ndarray:
+        """A column that holds numbers, as `require_numbers` sees to."""
+        values = self[column]
+        assert not isinstance(values, Text), f"column {column} holds text"
+        return values
+
 
 def read_table(path: str | os.PathLike) -> Table:
     """Read a parquet or text file, every numeric column as float64.
@@ -147,7 +153,7 @@ def _compare_with_footer(path: Path, footer, table) -> None:
         name = groups[0].path_in_schema if groups else ""
         if len(noted) < len(groups) or table.column_names.count(name) != 1:
             continue
-        found = pcm.min_max(table[name]).as_py()
+        found = pcm.call_function("min_max", [table[name]]).as_py()
         low, high = min(s.min for s in noted), max(s.max for s in noted)
         if found["min"] is not None and (found["min"] < low or found["max"] > high):
             raise CfbError(
@@ -209,24 +215,27 @@ def from_columns(table: Table, path: Path) -> FlightLog:
     known = [c for names in (COLUMNS | OPTIONAL_COLUMNS).values() for c in names if c in table]
     require_numbers(table, known, path)
 
-    def stack(names):
-        return table[names[0]] if len(names) == 1 else np.stack([table[c] for c in names], axis=1)
+    def stack(names: tuple[str, ...]) -> np.ndarray:
+        return table.numbers(names[0]) if len(names) == 1 else np.stack([table.numbers(c) for c in names], axis=1)
+
+    def measured(field: str) -> np.ndarray | None:
+        """A column without a single value means "not measured", as does a missing one."""
+        names = OPTIONAL_COLUMNS[field]
+        values = stack(names) if names[0] in table else None
+        return None if values is None or np.isnan(values).all() else values
 
     fields = {field: stack(names) for field, names in COLUMNS.items()}
-    for field, names in OPTIONAL_COLUMNS.items():
-        values = stack(names) if names[0] in table else None
-        # A column without a single value means "not measured", as does a missing one.
-        fields[field] = None if values is None or np.isnan(values).all() else values
+    rotor_speed, battery_voltage = measured("rotor_speed"), measured("battery_voltage")
     notes = list(table.notes)
-    if fields["battery_voltage"] is not None and np.isnan(fields["battery_voltage"]).any():
-        fields["battery_voltage"] = _held(fields["battery_voltage"])
+    if battery_voltage is not None and np.isnan(battery_voltage).any():
+        battery_voltage = _held(battery_voltage)
         notes.append("vbat has values in some rows only; each was held until the next.")
     if np.isfinite(fields["time"]).all() and np.abs(fields["time"]).max(initial=0.0) < 1e12:
         fields["time"] = quantise_time(fields["time"])
     metadata = {"name": path.stem, "source": path.name, "format": "tabular", "observation_delay": None}
     if notes or table.warnings:
         metadata |= {"warnings": list(table.warnings), "notes": notes}
-    return FlightLog(**fields, metadata=metadata)
+    return FlightLog(**fields, rotor_speed=rotor_speed, battery_voltage=battery_voltage, metadata=metadata)
 
 
 def _held(values: np.ndarray) -> np.ndarray:

@@ -15,6 +15,7 @@ import re
 import struct
 import zlib
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 
@@ -102,7 +103,7 @@ def _cut_at_impossible(log: FlightLog) -> FlightLog:
 def _header(data: bytes, path: Path) -> tuple[int, list[_Event], int]:
     """Version, event types and where the records begin."""
 
-    def fail(problem: str):
+    def fail(problem: str) -> NoReturn:
         raise CfbError(f"{path}: the header is damaged or cut short ({problem}); copy the log from the card again.")
 
     position = 1
@@ -207,8 +208,10 @@ def _streams(data: bytes, version: int, events: list[_Event], path: Path, notes:
             if wraps:
                 notes.append(f"{event.name}: the 32-bit time stamp overflowed {wraps} times; it was continued.")
         bytes_of = np.array(event.offsets)[:, None] + np.arange(event.dtype.itemsize)
-        table = np.ascontiguousarray(whole[bytes_of]).view(event.dtype).reshape(-1) if event.dtype.names else None
-        values = {n: table[n].astype(np.float64) for n in event.dtype.names or ()}
+        values = {}
+        if names := event.dtype.names:
+            table = np.ascontiguousarray(whole[bytes_of]).view(event.dtype).reshape(-1)
+            values = {n: table[n].astype(np.float64) for n in names}
         stream = Stream(event.name, ticks.astype(np.float64) * _SECONDS_PER_TICK[version], values)
         streams.append(ordered(stream, path, notes))
     return streams

@@ -180,7 +180,7 @@ def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
         firmware={k: firmware.get(k) for k in _FIRMWARE_KEYS},
         observation_delay=None if delay is None else float(delay),
         recognised_by=tuple(marks),
-        motion_capture=tuple(tuple(_choice(f, _mapping(c[f], f, path), path) for f in _CAPTURED) for c in captures),
+        motion_capture=tuple(_captured(c, path) for c in captures),
     )
 
 
@@ -224,6 +224,11 @@ def _choice(field: str, raw: dict, path: Path) -> Choice:
         raise CfbError(f"{path}: {where}: 'invalid' must be a list of numbers; found {told(invalid)}.")
     factors = tuple(s * UNITS[field][unit] for s in sign)
     return Choice(tuple(names), unit, factors, frame, form, tuple(float(v) for v in invalid))
+
+
+def _captured(raw: dict, path: Path) -> tuple[Choice, Choice]:
+    position, quaternion = (_choice(f, _mapping(raw[f], f, path), path) for f in _CAPTURED)
+    return position, quaternion
 
 
 def _mapping(value: Any, field: str, path: Path) -> dict:

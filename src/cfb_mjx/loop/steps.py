@@ -12,7 +12,7 @@ from typing import Any
 
 import jax
 
-from cfb_mjx.commands import CloseLoop
+from cfb_mjx.commands.close_loop import CloseLoop
 from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.files import write_json
 from cfb_mjx.logs import write_mcap
@@ -80,7 +80,7 @@ def close(own: Path) -> dict[str, Any]:
     """Diagnose the drone from its logs and the declared model, as ``cfb close-loop`` does; what its report says."""
     report, began = own / CLOSED / "report.json", time.perf_counter()
     if not report.exists():
-        fit, held_out = (sorted((own / "flights" / side).glob("*.mcap")) for side in ("fit", "held-out"))
+        fit, held_out = (tuple(sorted((own / "flights" / side).glob("*.mcap"))) for side in ("fit", "held-out"))
         declared = load_config(CONFIG).model
         closed = CloseLoop(own / CLOSED, fit=fit, held_out=held_out, model=declared).run()
         say(f"close-loop names {', '.join(effect['name'] for effect in closed.numbers['effects']) or 'no effect'}")

@@ -23,12 +23,14 @@ class Body(Protocol):
 
     def prepare(self, parameters: Parameters, dt) -> object:
         """Quantities computed once per rollout with integration steps of ``dt`` seconds."""
+        ...
 
     def accelerations(self, prepared, state: Components, wrench: Wrench, gyroscopic: bool = True) -> tuple[Vec, Vec]:
         """Acceleration of the centre of gravity (world, m/s^2) and angular acceleration (body, rad/s^2).
 
         ``wrench`` is about the centre of gravity, body axes. ``gyroscopic`` False leaves -J^-1 (omega x J omega) out.
         """
+        ...
 
 
 class _Prepared(eqx.Module):

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, PyTree
 
 from cfb_mjx.errors import CfbError
@@ -60,7 +61,7 @@ class DelayLine(eqx.Module):
             CfbError: the delay is negative, or longer than the line.
         """
         count = jax.tree.leaves(self.samples)[0].shape[0]
-        if not isinstance(delay, jax.core.Tracer) and not _fits(np.asarray(delay) / self.dt, count):
+        if not isinstance(delay, Tracer) and not _fits(np.asarray(delay) / self.dt, count):
             longest = (count - 1) * self.dt
             raise CfbError(
                 f"A delay of {delay:g} s does not fit in a line of {longest:g} s; fill one for the longest delay."

@@ -65,7 +65,8 @@ class MjxBody:
         self.mujoco_model = _compile(self.mjcf, self.floor)
 
     def prepare(self, parameters: Parameters, dt) -> _Prepared:
-        template = _on_device(self.mjcf, self.floor, jax.config.jax_enable_x64)
+        x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]  # jax adds it as it loads
+        template = _on_device(self.mjcf, self.floor, x64)
         model, data = jax.tree.map(jnp.asarray, template)
         body = _body_index(self.mujoco_model)
         mass, inertia = parameters.mass, Vec.unstack(parameters.inertia).stack()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from cfb_mjx.errors import CfbError, CfbWarning
@@ -124,7 +126,7 @@ class Quadrotor(eqx.Module):
             raise CfbError(f"control_dt_s = {control_dt_s} is no multiple of the simulation step of {self.dt} s.")
         return round(steps)
 
-    def hover_state(self, position=(0.0, 0.0, 1.0)) -> State:
+    def hover_state(self, position: ArrayLike | Sequence[Any] = (0.0, 0.0, 1.0)) -> State:
         """Level and motionless at ``position`` [m], rotors carrying the weight (forces of effects not considered)."""
         return begin(self, State.at_rest(position, rotors.hover_rotor_speed(self.changed_parameters())))
 
@@ -234,18 +236,18 @@ def integrate_commanded(prepared: Prepared, state: Components, command: Vec) -> 
 
 def commanded_path(prepared: Prepared, rotor_speed: Vec, memory: tuple, command: Vec) -> tuple[rotors.RotorPath, tuple]:
     """How the rotors run from ``rotor_speed`` while the command is held for ``prepared.dt``, and the new memory."""
-    model, parameters, memory = prepared.model, prepared.parameters, list(memory)
+    model, parameters, remembered = prepared.model, prepared.parameters, list(memory)
     command = command.map(lambda u: jnp.clip(u, 0.0, 1.0))
     order = in_order(model.effects)
     for i in order:
-        command, memory[i] = model.effects[i].command(command, memory[i], prepared.dt, parameters)
-    motors = Motors(rotors.steady_speed(prepared.rotors, command), parameters.motor_time_constant)
+        command, remembered[i] = model.effects[i].command(command, remembered[i], prepared.dt, parameters)
+    motors = Motors(rotors.steady_speed(prepared.rotors, command), Vec.unstack(parameters.motor_time_constant))
     for i in order:
-        motors, memory[i] = model.effects[i].motors(motors, rotor_speed, memory[i], prepared.dt, parameters)
+        motors, remembered[i] = model.effects[i].motors(motors, rotor_speed, remembered[i], prepared.dt, parameters)
     constants = prepared.rotors
     if any(overrides(effect, "motors") for effect in model.effects):
         constants = rotors.with_time_constant(constants, motors.time_constant, prepared.dt)
-    return rotors.path_to(constants, rotor_speed, motors.target), tuple(memory)
+    return rotors.path_to(constants, rotor_speed, motors.target), tuple(remembered)
 
 
 def remembering(state: Components, memory: tuple) -> Components:
@@ -260,6 +262,7 @@ def integrate_measured(prepared: Prepared, state: Components, end_speed: Vec) ->
 
 def _integrate(prepared: Prepared, state: Components, path: rotors.RotorPath) -> Components:
     model, parameters = prepared.model, prepared.parameters
+    center = Vec.unstack(parameters.center_of_gravity)
     stages = {
         START: (path.start, path.rate_start),
         MIDDLE: (path.middle, path.rate_middle),
@@ -272,7 +275,7 @@ def _integrate(prepared: Prepared, state: Components, path: rotors.RotorPath) ->
         wrench = loaded(model, parameters, loads, conditions(prepared, at, speed))
         if prepared.wrench_once:
             wrench = jax.lax.optimization_barrier(wrench)
-        torque = wrench.torque - parameters.center_of_gravity.cross(wrench.force)
+        torque = wrench.torque - center.cross(wrench.force)
         return model.body.accelerations(prepared.body, at, Wrench(wrench.force, torque), gyroscopic)
 
     inertia = Vec.unstack(parameters.inertia)
@@ -299,7 +302,7 @@ def at_rotor_center(parameters: Parameters, wrench: Wrench, body_rate: Vec) -> t
 
     Body axes, free flight: what a gyro's slope and an accelerometer there show.
     """
-    center, inertia = parameters.center_of_gravity, parameters.inertia
+    center, inertia = Vec.unstack(parameters.center_of_gravity), Vec.unstack(parameters.inertia)
     about = wrench.torque - center.cross(wrench.force)
     turning = (about - body_rate.cross(inertia * body_rate)) * inertia.map(lambda x: 1 / x)
     lever = -center
@@ -325,7 +328,8 @@ def conditions(prepared: Prepared, at: Components, speed: Vec) -> tuple[Conditio
 def in_still_air(prepared: Prepared, at: Components, speed: Vec) -> Condition:
     """The flight condition without effects."""
     parameters = prepared.parameters
-    velocity = rotate_inverse(at.quaternion, at.velocity) - at.body_rate.cross(parameters.center_of_gravity)
+    center = Vec.unstack(parameters.center_of_gravity)
+    velocity = rotate_inverse(at.quaternion, at.velocity) - at.body_rate.cross(center)
     return Condition(at.position, at.velocity, velocity, velocity, at.quaternion, at.body_rate, speed, parameters)
 
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cfb_mjx.model.state import AnyArray
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.parameters import Parameters
 
@@ -83,7 +84,7 @@ class Polynomial(eqx.Module):
         )
 
 
-def polynomial(coefficients: Array | Vec, scale: Array | Vec, sigma: Array) -> Polynomial:
+def polynomial(coefficients: AnyArray | Vec, scale: AnyArray | Vec, sigma: Array) -> Polynomial:
     """Polynomial in rotor speed from the coefficients of s^3, s^2, s with s = Omega / sigma."""
     c3, c2, c1 = Vec.unstack(coefficients)
     scale = Vec.unstack(scale)
@@ -172,13 +173,13 @@ def loads_at(constants: RotorConstants, speed: Vec, rate: Vec) -> RotorLoads:
     return RotorLoads(constants.thrust(speed).map(_at_least_zero), constants.torque(speed), rate)
 
 
-def thrust(parameters: Parameters, speed: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+def thrust(parameters: Parameters, speed: Float[AnyArray, "*batch 4"]) -> Float[Array, "*batch 4"]:
     """Thrust of each rotor [eq. 8], N. Clamped at zero: the cubic is negative below 229 rad/s, a fit artefact."""
     curve = polynomial(parameters.thrust_polynomial, parameters.thrust_scale, parameters.reference_rotor_speed)
     return curve(Vec.unstack(speed)).map(_at_least_zero).stack()
 
 
-def torque(parameters: Parameters, speed: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+def torque(parameters: Parameters, speed: Float[AnyArray, "*batch 4"]) -> Float[Array, "*batch 4"]:
     """Aerodynamic torque magnitude of each rotor [eq. 9], N m."""
     curve = polynomial(parameters.torque_polynomial, parameters.torque_scale, parameters.reference_rotor_speed)
     return curve(Vec.unstack(speed)).stack()
@@ -216,9 +217,9 @@ def hover_command(parameters: Parameters) -> Float[Array, "4"]:
     return steady_command(parameters, hover_rotor_speed(parameters))
 
 
-def steady_command(parameters: Parameters, speed: Float[Array, "4"]) -> Float[Array, "4"]:
+def steady_command(parameters: Parameters, speed: Float[AnyArray, "4"]) -> Float[Array, "4"]:
     """Commands at which the rotors turn at ``speed`` [rad/s] in the end."""
-    return (speed - parameters.motor_speed_offset) / parameters.motor_gain
+    return (jnp.asarray(speed) - parameters.motor_speed_offset) / parameters.motor_gain
 
 
 def rotor_speed_history(

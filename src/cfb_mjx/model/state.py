@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.vector import Vec, rotate
@@ -32,7 +34,11 @@ class State(eqx.Module):
     """What effects remember (`cfb_mjx.model.Effect.start`), one entry per effect; empty means long steady flight."""
 
     @classmethod
-    def at_rest(cls, position=(0.0, 0.0, 0.0), rotor_speed=0.0) -> State:
+    def at_rest(
+        cls,
+        position: ArrayLike | Sequence[Any] = (0.0, 0.0, 0.0),
+        rotor_speed: ArrayLike | Sequence[Any] = 0.0,
+    ) -> State:
         """Level, motionless, at ``position`` [m] with the given rotor speed(s) [rad/s]."""
         dtype = jnp.result_type(float)
         return cls(
@@ -62,8 +68,9 @@ class Components(eqx.Module):
     memory: Any = ()
 
 
-def unstack(state: State, center_of_gravity: Vec) -> Components:
+def unstack(state: State, center_of_gravity: Vec | AnyArray) -> Components:
     """State to components, given the centre of gravity in body axes [m]."""
+    center_of_gravity = Vec.unstack(center_of_gravity)
     quaternion, body_rate = Vec.unstack(state.quaternion), Vec.unstack(state.body_rate)
     return Components(
         Vec.unstack(state.position) + rotate(quaternion, center_of_gravity),
@@ -75,8 +82,9 @@ def unstack(state: State, center_of_gravity: Vec) -> Components:
     )
 
 
-def stack(state: Components, center_of_gravity: Vec) -> State:
+def stack(state: Components, center_of_gravity: Vec | AnyArray) -> State:
     """Components to state; the inverse of `unstack`."""
+    center_of_gravity = Vec.unstack(center_of_gravity)
     lever = rotate(state.quaternion, center_of_gravity)
     lever_velocity = rotate(state.quaternion, state.body_rate.cross(center_of_gravity))
     return State(

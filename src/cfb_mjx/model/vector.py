@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 
@@ -47,7 +48,7 @@ class Vec:
         raise AttributeError("Vec is immutable")
 
     @classmethod
-    def unstack(cls, array: Array | Vec) -> Vec:
+    def unstack(cls, array: Array | np.ndarray | Vec) -> Vec:
         """Split the last axis of ``array`` into components; a `Vec` is returned as it is."""
         if isinstance(array, Vec):
             return array

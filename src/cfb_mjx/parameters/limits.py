@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from cfb_mjx.errors import CfbError, CfbWarning
 
@@ -86,7 +87,7 @@ class Limits:
 
 def concrete(value: Any) -> np.ndarray | None:
     """The numbers of an array in float64; None where they are not known yet (traced), or not in this process."""
-    if isinstance(value, jax.core.Tracer) or (isinstance(value, jax.Array) and not value.is_fully_addressable):
+    if isinstance(value, Tracer) or (isinstance(value, jax.Array) and not value.is_fully_addressable):
         return None
     try:
         return np.asarray(value, np.float64)

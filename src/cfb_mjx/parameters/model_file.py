@@ -173,7 +173,7 @@ def save_model_file(model: ModelFile, path: str | Path) -> None:
         item = {"value": _plain(entry.value), "unit": SPECIFICATIONS[key].unit, "source": entry.source}
         item |= {key: _plain(found) for key in _SPREADS if (found := getattr(entry, key)) is not None}
         parameters[key] = item
-    document = {"format": FORMAT} | ({} if model.kind == "plant" else {"kind": model.kind})
+    document: dict[str, Any] = {"format": FORMAT} | ({} if model.kind == "plant" else {"kind": model.kind})
     document |= {"name": model.name, "description": model.description, "parameters": parameters}
     if model.effects:
         document["effects"] = [dict(e) for e in model.effects]

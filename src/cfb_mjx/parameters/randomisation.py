@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,6 +18,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from cfb_mjx.documents import load_named, load_yaml, refuse_unknown, told
 from cfb_mjx.errors import CfbError
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters.limits import concrete
 from cfb_mjx.parameters.model_file import FORMAT as MODEL_FORMAT
 from cfb_mjx.parameters.model_file import ModelFile, load_model_file, preset_names
@@ -44,14 +46,15 @@ class Range:
     @property
     def width(self) -> np.ndarray:
         """The half-width: a number, or one of each component."""
-        return np.asarray(self.half_width if len(self.half_width) > 1 else self.half_width[0])
+        widths = self.half_width
+        return np.asarray(widths[0] if len(widths) == 1 else widths)
 
     def reach(self, center: np.ndarray | np.generic) -> np.ndarray:
         """How far from ``center`` a draw at magnitude 1 can lie."""
         return np.broadcast_to(np.abs(center) * self.width if self.relative else self.width, center.shape)
 
 
-def largest_magnitude(room: np.ndarray | np.generic, reach: np.ndarray | np.generic) -> float:
+def largest_magnitude(room: np.ndarray | np.floating, reach: np.ndarray | np.floating) -> float:
     """Up to which no draw that reaches so far leaves the room there is."""
     return float(np.min(np.where(reach > 0, room / np.where(reach > 0, reach, 1.0), np.inf)))
 
@@ -170,7 +173,7 @@ def _widths(where: str, raw, path: Path, *more: str) -> tuple[float, ...]:
         raise CfbError(f"{path}: {where} must be a mapping with half_width and unit.")
     refuse_unknown(raw, {"half_width", "unit", "source", *more}, path, f"{where}.")
     width = raw.get("half_width")
-    widths = width if isinstance(width, list) else [width]
+    widths: list[Any] = width if isinstance(width, list) else [width]
     if not widths or not all(
         isinstance(w, int | float) and not isinstance(w, bool) and 0 <= w < float("inf") for w in widths
     ):
@@ -279,7 +282,7 @@ def _possible(name: str, value: Array) -> Array:
     specification = SPECIFICATIONS[name]
     holds = specification.limits.holds(value)
     if name in _SUMS:
-        holds = holds & specification.together(value)[..., None]
+        holds = holds & not_none(specification.together)(value)[..., None]
     return jnp.where(holds, value, jnp.nan)
 
 

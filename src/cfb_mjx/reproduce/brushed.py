@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cfb_mjx.optional import not_none
 from cfb_mjx.reproduce.flights import GENERATED, REAL_MASS_KG, SKIPPED, SOURCE, Given, generated, real_flights
 from cfb_mjx.reproduce.item import Result, Row, write_csv
 
@@ -53,8 +54,8 @@ def brushed(folder: Path, real: Path | None, given: Given | None = None) -> Resu
     for where, (logs, models) in flights.items():
         for name, file in models.items():
             found = evaluate(Quadrotor.from_file(file), logs)
-            errors[where, name] = found.metrics("commands_in")
-            errors[where, "hold"] = found.metrics("hold")
+            errors[where, name] = not_none(found.metrics("commands_in"))
+            errors[where, "hold"] = not_none(found.metrics("hold"))
     less, more = able["brushed"]["thrust_n"], able["brushless"]["thrust_n"]
     limits = (
         "at full command of both; the brushed one's limit is the one gym-pybullet-drones gives it, the brushless one's "

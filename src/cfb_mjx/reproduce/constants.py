@@ -20,7 +20,7 @@ SHARED = {
     "rotor_spacing": ("rotor spacing l, m", 0.0707),
     "pose_delay": ("observation delay, s", 0.008),
 }
-INPUT = {"why": "as shipped", "kind": "input"}
+SHIPPED = "as shipped"
 NAMES = {"cfb-guards": "with guards", "cfb": "without guards"}
 RANDOMISATION = {
     "mass": ("mass", 0.1),
@@ -44,13 +44,19 @@ def parameters(folder: Path, real: Path | None) -> Result:
     for preset, stated in PAPER.items():
         entries = load_model_file(preset).entries
         rows.append(
-            Row(f"mass {NAMES[preset]}, kg", f"{stated['mass']:g}", f"{float(entries['mass'].value):g}", **INPUT)
+            Row(
+                f"mass {NAMES[preset]}, kg",
+                f"{stated['mass']:g}",
+                f"{float(entries['mass'].value):g}",
+                SHIPPED,
+                "input",
+            )
         )
         for axis, paper, ours in zip("xyz", stated["inertia"], np.asarray(entries["inertia"].value), strict=True):
-            rows.append(Row(f"inertia J_{axis} {NAMES[preset]}, kg m^2", f"{paper:g}", f"{ours:g}", **INPUT))
+            rows.append(Row(f"inertia J_{axis} {NAMES[preset]}, kg m^2", f"{paper:g}", f"{ours:g}", SHIPPED, "input"))
     entries = load_model_file("cfb-guards").entries
     for name, (what, paper) in SHARED.items():
-        rows.append(Row(what, f"{paper:g}", f"{float(np.ravel(entries[name].value)[0]):g}", **INPUT))
+        rows.append(Row(what, f"{paper:g}", f"{float(np.ravel(entries[name].value)[0]):g}", SHIPPED, "input"))
     for preset in PAPER:
         drone = Quadrotor.from_file(preset)
         p = drone.parameters
@@ -61,7 +67,7 @@ def parameters(folder: Path, real: Path | None) -> Result:
     ranges = dict(load_randomisation("paper").ranges)
     for name, (what, paper) in RANDOMISATION.items():
         ours = _half(name, max(ranges[name].half_width))
-        rows.append(Row(f"randomisation of {what}", _half(name, paper), ours, **INPUT))
+        rows.append(Row(f"randomisation of {what}", _half(name, paper), ours, SHIPPED, "input"))
     write_csv(folder / "parameters.csv", ("quantity", "paper", "ours"), [(r.what, r.paper, r.ours) for r in rows])
     return Result(
         "Parameters and randomisation",

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from cfb_mjx.optional import not_none
 from cfb_mjx.reproduce.item import Result, Row, write_csv
 
 SHAPES = ("flip-low", "flip-fast", "flip-wide", "flip-high")
@@ -16,6 +17,7 @@ SIMULATED = "Ours flies in simulation, seen 8 ms late and with noise; the paper'
 def _flown(name: str, count: int):
     import jax
 
+    from cfb_mjx.control.manoeuvre import Manoeuvre
     from cfb_mjx.deploy.deployment import find_deployment
     from cfb_mjx.envs import TargetTask
     from cfb_mjx.model import Quadrotor
@@ -23,8 +25,10 @@ def _flown(name: str, count: int):
 
     nominal = Quadrotor.from_file("cfb-guards")
     of = find_deployment(name)
-    measured, flown = flips(of.controller, TargetTask(), nominal, jax.random.split(jax.random.PRNGKey(11), count))
-    return of.manoeuvre, measured, flown, of.controller.control_dt_s
+    controller = of.controller
+    assert isinstance(controller, Manoeuvre)  # what is named here flips
+    measured, flown = flips(controller, TargetTask(), nominal, jax.random.split(jax.random.PRNGKey(11), count))
+    return not_none(of.manoeuvre), measured, flown, controller.control_dt_s
 
 
 def four_flips(folder: Path, real: Path | None) -> Result:

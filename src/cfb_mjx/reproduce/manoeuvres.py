@@ -313,7 +313,8 @@ def _draw(piece: Bands, path: Path, title: str) -> None:
 
     with context():
         figure = new_figure(10.0, 6.4)
-        for i, (axis, label) in enumerate(zip(figure.subplots(3, 3, sharex=True).flat, LABELS, strict=True)):
+        panels = figure.subplots(3, 3, sharex=True)
+        for i, (axis, label) in enumerate(zip(panels.flat, LABELS, strict=True)):
             values = piece.simulated[..., i]
             for low, high, name, alpha in BANDS:
                 lower, upper = np.percentile(values, [low, high], axis=0)
@@ -327,7 +328,7 @@ def _draw(piece: Bands, path: Path, title: str) -> None:
             axis.margins(x=0)
             if i >= 6:
                 axis.set_xlabel("time, s")
-        figure.legend(*axis.get_legend_handles_labels(), loc="lower center", ncols=4)
+        figure.legend(*panels[-1, -1].get_legend_handles_labels(), loc="lower center", ncols=4)
         figure.suptitle(title, fontsize=10)
         figure.subplots_adjust(left=0.07, right=0.99, top=0.94, bottom=0.13, wspace=0.3, hspace=0.12)
         save(figure, path)

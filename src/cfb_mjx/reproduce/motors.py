@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.files import shipped
+from cfb_mjx.optional import not_none
 from cfb_mjx.reproduce.flights import REAL_MASS_KG, SKIPPED, SOURCE, real_flights
 from cfb_mjx.reproduce.item import Result, Row, with_std, write_csv
 
@@ -25,17 +26,19 @@ LOW_PASS_HZ = 8.0
 
 def motor_step(folder: Path, real: Path | None) -> Result:
     """Rotor speed after steps of the command, with T and K fitted."""
-    from cfb_mjx.logs.bench_tables import read_bench, record_of
+    from cfb_mjx.logs.bench_tables import MotorRecord, read_bench, record_of
     from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid.rotors.motor_replay import replay
     from cfb_mjx.sysid.rotors.motors import fit_motors
 
     nominal = load_model_file("cfb-guards").parameters()
-    bench = fit_motors([read_bench(shipped("data", "bench", "motor_steps.csv"))], nominal)
+    steps = read_bench(shipped("data", "bench", "motor_steps.csv"))
+    assert isinstance(steps, MotorRecord)
+    bench = fit_motors([steps], nominal)
     fits, text = {"bench": bench}, [BENCH]
     flights = real_flights(real)[:FITTED]
     if flights:
-        fits["real flights"] = fit_motors([record_of(log) for log in flights], nominal, offset=True)
+        fits["real flights"] = fit_motors([not_none(record_of(log)) for log in flights], nominal, offset=True)
         text.append(
             f"Right: the same fit to real flights ({', '.join(log.name for log in flights)}) of {SOURCE}, of which two "
             "seconds are shown. There the "
@@ -109,15 +112,17 @@ def rotor_curves(folder: Path, real: Path | None) -> Result:
     """Thrust and torque of a rotor, their cubics, and what other sources say of the same rotor."""
     import jax.numpy as jnp
 
-    from cfb_mjx.logs.bench_tables import read_bench
+    from cfb_mjx.logs.bench_tables import MapTable, read_bench
     from cfb_mjx.model.rotors import thrust, torque
     from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid.rotors.rotor_maps import fit_map
 
     table = read_bench(shipped("data", "bench", "rotor_points.csv"))
+    assert isinstance(table, MapTable)
+    forces, torques = not_none(table.force), not_none(table.torque)
     fitted = {
-        "thrust": fit_map(table.rotor_speed, table.force, name="thrust"),
-        "torque": fit_map(table.rotor_speed, table.torque, name="torque"),
+        "thrust": fit_map(table.rotor_speed, forces, name="thrust"),
+        "torque": fit_map(table.rotor_speed, torques, name="torque"),
     }
     text, rows = [BENCH], []
     for name, ((unit, scale), paper) in CUBICS.items():
@@ -165,7 +170,7 @@ def rotor_curves(folder: Path, real: Path | None) -> Result:
         ]
         + [
             ("bench point", float(s), float(f), float(t))
-            for s, f, t in zip(table.rotor_speed, table.force, table.torque, strict=True)
+            for s, f, t in zip(table.rotor_speed, forces, torques, strict=True)
         ],
     )
     _draw_curves(speed, curves, fitted, folder / "rotor-curves.png")

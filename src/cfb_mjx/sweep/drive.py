@@ -19,9 +19,11 @@ class Workers(Protocol):
 
     def submit(self, function: Callable[..., Outcome], *arguments: object) -> object:
         """Hand in a call."""
+        ...
 
     def finished(self, handles: list) -> list[tuple[object, Outcome]]:
         """Calls that ended."""
+        ...
 
 
 @dataclass(frozen=True)

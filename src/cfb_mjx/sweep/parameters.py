@@ -17,7 +17,7 @@ from cfb_mjx.sweep.kinds import CHOSEN_HERE, REPEATED, Kind
 
 Shape = Literal["flag", "pairs", "files", "file", "texts", "text", "whole", "number"]
 _NUMBERS = {"whole": int, "number": float}
-_SHAPES = {bool: "flag", Path: "file", int: "whole", float: "number"}
+_SHAPES: dict[Any, Shape] = {bool: "flag", Path: "file", int: "whole", float: "number"}
 
 
 @dataclass(frozen=True)

@@ -152,7 +152,7 @@ def _checked(key: str, value: Any, parameters: Parameters, where: str) -> Any:
     return value
 
 
-def _taken(kind: Kind) -> set[str]:
+def _taken(kind: Kind) -> set[str | None]:
     return {kind.result, kind.output, "task.json", "output.txt"}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC")
+_THREADS: tuple[str, ...] = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NPROC", "PJRT_NPROC")
 """Of BLAS and the like; the last two of XLA."""
 
 
@@ -14,7 +14,7 @@ def environment(cpus: float, gpus: float) -> dict[str, str]:
         gpus: of the task; without one jax computes on processors, also where a GPU is free.
     """
     threads = max(1, int(cpus))
-    found = dict.fromkeys(_THREADS, str(threads))
+    found: dict[str, str] = dict.fromkeys(_THREADS, str(threads))
     if not gpus:
         found["JAX_PLATFORMS"] = "cpu"
     elif gpus < 1:

@@ -35,7 +35,8 @@ class Disturbance(Effect):
         """With the correlation times of ``observer``."""
         o = observer
         times = o.torque_time, o.trim_time, o.force_time, o.rotor_offset_time
-        return cls(tuple(jnp.asarray(t, jnp.result_type(float)) for t in times))
+        torque, trim, force, rotors = (jnp.asarray(t, jnp.result_type(float)) for t in times)
+        return cls((torque, trim, force, rotors))
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
         zero = jnp.zeros_like(rotor_speed[0])
@@ -50,9 +51,9 @@ class Disturbance(Effect):
         torque, trim, force, _ = condition.memory
         drone = condition.parameters
         push = force * drone.mass
-        turn = drone.inertia.map(lambda inertia, a: inertia * a, torque + trim)
+        turn = Vec.unstack(drone.inertia).map(lambda inertia, a: inertia * a, torque + trim)
         # The force was seen at the rotors' centre but must not turn the drone: the gyro has told what does.
-        return Wrench(wrench.force + push, wrench.torque + turn + drone.center_of_gravity.cross(push))
+        return Wrench(wrench.force + push, wrench.torque + turn + Vec.unstack(drone.center_of_gravity).cross(push))
 
     def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
         return tuple(m * jnp.exp(-dt / time) for m, time in zip(condition.memory, self.times, strict=True))

@@ -51,7 +51,7 @@ class Evaluation:
 
     def metrics(self, variant: str) -> dict[str, float] | None:
         """Metrics of a variant over all windows of all logs; None where no log allows it."""
-        parts = [log.errors[variant] for log in self.logs if log.errors[variant] is not None]
+        parts = self._errors(variant)
         if not parts:
             return None
         pooled = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
@@ -59,8 +59,12 @@ class Evaluation:
 
     def intervals(self, variant: str) -> dict[str, list[float]] | None:
         """95 % bootstrap intervals of `metrics`."""
-        parts = [log.errors[variant] for log in self.logs if log.errors[variant] is not None]
+        parts = self._errors(variant)
         return metrics.intervals(parts, self.horizons) if parts else None
+
+    def _errors(self, variant: str) -> list[dict[str, np.ndarray]]:
+        """Of each log that allows the variant."""
+        return [errors for log in self.logs if (errors := log.errors[variant]) is not None]
 
     @property
     def each(self) -> tuple[Evaluation, ...]:
@@ -139,7 +143,9 @@ def before_and_after(before: Evaluation, after: Evaluation) -> dict:
 
 def _refuse_diverged(result: LogEvaluation) -> None:
     for variant, errors in result.errors.items():
-        lost = [] if errors is None else ~np.isfinite(list(errors.values())).all(axis=(0, 2))
+        if errors is None:
+            continue
+        lost = np.asarray(~np.isfinite(list(errors.values())).all(axis=(0, 2)))
         if np.any(lost):
             of = result.windows.start[result.measured] if variant.startswith("rotor") else result.windows.start
             raise CfbError(
@@ -185,7 +191,7 @@ def _evaluate_log(
     log, delay, faults = recording.log, recording.delay, recording.faults
     recorded, windows = recording.recorded, recording.windows
     began = faults.began(recording.as_logged, windows, delay)
-    measured = np.isfinite(windows.rotor_speed).all(axis=(1, 2))
+    measured = np.asarray(np.isfinite(windows.rotor_speed).all(axis=(1, 2)))
     predictions: dict[str, State | None] = dict.fromkeys(VARIANTS + OBSERVED)
     if len(windows):
         start, memory = at_start

@@ -121,7 +121,7 @@ def fleet(drones: Sequence[OfDrone], own: Collection[str] = ()) -> Fleet:
     inside = np.flatnonzero(~alone)
     found, std = neutral.copy(), np.zeros(count)
     inverse = np.linalg.inv(matrix[np.ix_(inside, inside)])
-    found[inside] = neutral[inside] + inverse @ (pull[inside] - matrix[np.ix_(inside, range(count))] @ neutral)
+    found[inside] = neutral[inside] + inverse @ (pull[inside] - matrix[np.ix_(inside, np.arange(count))] @ neutral)
     std[inside] = np.sqrt(np.diag(inverse))
     return Fleet(numbers, found, std, np.sqrt(between), told)
 

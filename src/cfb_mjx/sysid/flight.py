@@ -9,12 +9,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from cfb_mjx.devices import last_repeated
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import tidy
+from cfb_mjx.model.state import AnyArray
 from cfb_mjx.parameters import Parameters
 
 ROWS = 512
@@ -32,26 +33,26 @@ _VOLTAGE_SMOOTHING = 0.02
 class Flight(eqx.Module):
     """N rows of one log; the padding repeats the last row with zero time between."""
 
-    time: Float[Array, " n"]
+    time: Float[AnyArray, " n"]
     """Since the log's time zero, s."""
-    interval: Float[Array, " n"]
+    interval: Float[AnyArray, " n"]
     """To the next row, s; 0 at the last and in the padding."""
-    position: Float[Array, "n 3"]
-    velocity: Float[Array, "n 3"]
-    quaternion: Float[Array, "n 4"]
+    position: Float[AnyArray, "n 3"]
+    velocity: Float[AnyArray, "n 3"]
+    quaternion: Float[AnyArray, "n 4"]
     """Pose and velocity when the row's time stamp was written, not ``pose_delay`` before."""
-    body_rate: Float[Array, "n 3"]
-    specific_force: Float[Array, "n 3"]
-    command: Float[Array, "n 4"]
-    rotor_speed: Float[Array, "n 4"]
+    body_rate: Float[AnyArray, "n 3"]
+    specific_force: Float[AnyArray, "n 3"]
+    command: Float[AnyArray, "n 4"]
+    rotor_speed: Float[AnyArray, "n 4"]
     """Measured, rad/s; 0 where not."""
-    measured: Float[Array, ""]
+    measured: Float[AnyArray, ""]
     """1 where the log has rotor speeds throughout."""
-    voltage: Float[Array, " n"]
+    voltage: Float[AnyArray, " n"]
     """Of the battery, V, smoothed over past rows; NaN where not measured."""
-    fresh: Float[Array, " n"]
+    fresh: Float[AnyArray, " n"]
     """1 at the first row and at the first after a gap."""
-    valid: Float[Array, " n"]
+    valid: Float[AnyArray, " n"]
     """1 where what the model predicts can be compared with the row."""
 
 
@@ -63,7 +64,7 @@ def delay_of(log: FlightLog, parameters: Parameters) -> float:
 
 def usual_delay(logs: Sequence[FlightLog], parameters: Parameters) -> float:
     """One `delay_of` for several logs: the median of what they say."""
-    delays = {log.observation_delay for log in logs} - {None}
+    delays = {log.observation_delay for log in logs if log.observation_delay is not None}
     return float(np.median(list(delays))) if delays else float(parameters.pose_delay)
 
 

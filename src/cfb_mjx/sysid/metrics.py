@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cfb_mjx.model.state import State
+from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.sysid.windows import Windows
 
 QUANTITIES = {"position": "m", "velocity": "mps", "attitude": "deg", "rate": "radps"}
@@ -37,7 +37,7 @@ def _errors(windows: Windows, predicted: State) -> dict[str, np.ndarray]:
     }
 
 
-def geodesic_deg(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+def geodesic_deg(p: AnyArray, q: AnyArray) -> np.ndarray:
     """Angle of the rotation between two unit quaternions, degrees; precise for small angles too."""
     # |p - q| and |p + q| are 2 sin and 2 cos of a quarter of the angle; arccos would lose half the digits near zero.
     near = np.linalg.norm(p - q, axis=-1)
@@ -56,7 +56,7 @@ def metrics(error: Mapping[str, np.ndarray], horizons: tuple[float, ...]) -> dic
 
 
 def intervals(
-    per_log: list[Mapping[str, np.ndarray]], horizons: tuple[float, ...], resamples: int = 500, seed: int = 0
+    per_log: Sequence[Mapping[str, np.ndarray]], horizons: tuple[float, ...], resamples: int = 500, seed: int = 0
 ) -> dict[str, list[float]]:
     """95 % confidence intervals of `metrics` by bootstrap over blocks of `BLOCK` consecutive windows of one log."""
     counts = [len(e["position"]) for e in per_log]

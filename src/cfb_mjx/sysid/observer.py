@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -26,8 +27,8 @@ from jaxtyping import Array, Float
 from cfb_mjx.devices import last_repeated
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.model.effects import Memory
 from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.state import AnyArray
 from cfb_mjx.sysid.flight import MEASURED_SHARE, Flight, delay_of, lengthened, prepare_flight
 from cfb_mjx.sysid.replay import Lane, Replay, replays
 from cfb_mjx.sysid.windows import Windows
@@ -82,6 +83,31 @@ class Observer(eqx.Module):
     """Its correlation time, s."""
 
 
+class _Levels(eqx.Module):
+    """The numbers of an `Observer` as arrays, those of the three axes as one."""
+
+    gyro: Array
+    rate_walk: Array
+    rate_share: Array
+    torque: Array
+    torque_time: Array
+    trim: Array
+    trim_time: Array
+    accelerometer: Array
+    force_share: Array
+    force: Array
+    force_time: Array
+    rotor: Array
+    rotor_walk: Array
+    rotor_offset: Array
+    rotor_offset_time: Array
+
+    @classmethod
+    def of(cls, observer: Observer) -> _Levels:
+        numbers = {f.name: getattr(observer, f.name) for f in dataclasses.fields(observer)}
+        return cls(**{name: jnp.asarray(number, jnp.result_type(float)) for name, number in numbers.items()})
+
+
 FORECASTER = Observer(
     gyro=0.04,
     rate_walk=0.4,
@@ -102,22 +128,22 @@ def usual_observer(kind: str) -> Observer:
 class Observed(eqx.Module):
     """What an observer knows at each row from that row and earlier ones; or at each window's start."""
 
-    body_rate: Float[Array, "n 3"]
+    body_rate: Float[AnyArray, "n 3"]
     """Filtered, rad/s."""
-    angular_acceleration: Float[Array, "n 3"]
+    angular_acceleration: Float[AnyArray, "n 3"]
     """Of the model with the disturbances, over the last interval, rad/s^2."""
-    torque: Float[Array, "n 3"]
+    torque: Float[AnyArray, "n 3"]
     """Unmodelled angular acceleration that fades with ``torque_time``, rad/s^2."""
-    trim: Float[Array, "n 3"]
+    trim: Float[AnyArray, "n 3"]
     """The same, fading with ``trim_time``."""
-    force: Float[Array, "n 3"]
+    force: Float[AnyArray, "n 3"]
     """Unmodelled specific force, body axes, m/s^2."""
-    rotor_speed: Float[Array, "n 4"]
+    rotor_speed: Float[AnyArray, "n 4"]
     """From the commands, corrected by what was measured, rad/s."""
-    rotor_offset: Float[Array, "n 4"]
+    rotor_offset: Float[AnyArray, "n 4"]
     """Error of the steady rotor speed, rad/s; zero where rotor speed was not measured."""
 
-    def memory(self, rotors: bool) -> Memory:
+    def memory(self, rotors: bool) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
         """Of a `disturbance.Disturbance`, with or without ``rotors``' offsets."""
         return self.torque, self.trim, self.force, self.rotor_offset * rotors
 
@@ -136,7 +162,7 @@ def observe(model: Quadrotor, log: FlightLog, delay: float, observer: Observer, 
         NumPy arrays, one row per row of the log.
     """
     inputs = replay_inputs(log, delay, float(model.parameters.gyro_delay), use_measured)
-    found = _observe(model, *_replayed(model, *inputs), _numbers(observer))
+    found = _observe(model, *_replayed(model, *inputs), _Levels.of(observer))
     return jax.tree.map(lambda x: np.asarray(x)[: len(log)], found)
 
 
@@ -160,22 +186,22 @@ def fit_observer(model: Quadrotor, logs: Sequence[FlightLog], observer: Observer
     """
     if not logs:
         raise CfbError("fit_observer needs at least one log.")
-    first = _numbers(observer or Observer())
-    data = []
+    first = _Levels.of(observer or Observer())
+    data: list[tuple[Quadrotor, Flight, AnyArray, Replay]] = []
     for log in logs:
         flight, driven = replay_inputs(log, delay_of(log, model.parameters), float(model.parameters.gyro_delay))
         data.append((model, *_replayed(model, flight, driven)))
     leaves, structure = jax.tree.flatten(first)
     sizes = [leaf.size for leaf in leaves]
 
-    def levels(vector):
+    def levels(vector: Array) -> _Levels:
         parts = jnp.split(vector, np.cumsum(sizes)[:-1])
         return jax.tree.unflatten(
             structure, [leaf * jnp.exp(part.reshape(leaf.shape)) for leaf, part in zip(leaves, parts, strict=True)]
         )
 
     @eqx.filter_jit
-    def cost(vector, data):
+    def cost(vector: Array, data: tuple[tuple[Quadrotor, Flight, AnyArray, Replay], ...]) -> Array:
         total = sum(_surprise(*one, levels(vector)) for one in data)
         rows = sum(jnp.sum(one[1].valid) for one in data)
         return total / rows + RIDGE * jnp.sum(vector**2)
@@ -184,19 +210,14 @@ def fit_observer(model: Quadrotor, logs: Sequence[FlightLog], observer: Observer
     start = jnp.zeros(sum(sizes), jnp.result_type(float))
     best = optx.minimise(cost, solver, start, tuple(data), max_steps=60, throw=False).value
     found = levels(best)
-    values = {f.name: np.asarray(getattr(found, f.name)) for f in dataclasses.fields(found)}
-    return Observer(**{name: tuple(x.tolist()) if x.ndim else float(x) for name, x in values.items()})
+    arrays = {f.name: np.asarray(getattr(found, f.name)) for f in dataclasses.fields(found)}
+    values: dict[str, Any] = {name: tuple(x.tolist()) if x.ndim else float(x) for name, x in arrays.items()}
+    return Observer(**values)
 
 
-def _numbers(observer: Observer) -> Observer:
-    """The observer's numbers as arrays, those of the three axes as one."""
-    fields = {
-        f.name: jnp.asarray(getattr(observer, f.name), jnp.result_type(float)) for f in dataclasses.fields(observer)
-    }
-    return Observer(**fields)
-
-
-def replay_inputs(log: FlightLog, delay: float, gyro_delay: float, use_measured: bool = True) -> tuple[Flight, Array]:
+def replay_inputs(
+    log: FlightLog, delay: float, gyro_delay: float, use_measured: bool = True
+) -> tuple[Flight, np.ndarray]:
     """The flight and the rotor speeds that drive the body; its ``measured`` says whether they do."""
     flight = prepare_flight(log, delay, gyro_delay)
     driven = causal_rotor_speed(log) if use_measured else None
@@ -225,13 +246,13 @@ def _replayed(model: Quadrotor, flight: Flight, driven: np.ndarray) -> tuple[Fli
 
 
 @eqx.filter_jit
-def _observe(model: Quadrotor, flight: Flight, driven: Array, said: Replay, observer: Observer) -> Observed:
+def _observe(model: Quadrotor, flight: Flight, driven: AnyArray, said: Replay, observer: _Levels) -> Observed:
     body, _ = _body(model, flight, said, observer)
     motors, _ = _motors(model, flight, driven, said, observer)
     return Observed(*body, *motors)
 
 
-def _surprise(model: Quadrotor, flight: Flight, driven: Array, said: Replay, observer: Observer) -> Array:
+def _surprise(model: Quadrotor, flight: Flight, driven: AnyArray, said: Replay, observer: _Levels) -> Array:
     """Negative log-likelihood of all innovations, without the constant."""
     _, errors = _body(model, flight, said, observer)
     _, motor_errors = _motors(model, flight, driven, said, observer)
@@ -244,12 +265,12 @@ def _surprise(model: Quadrotor, flight: Flight, driven: Array, said: Replay, obs
     return of(*turning, counts) + of(*pushing, counts) + of(*motor_errors[0], counts * flight.measured)
 
 
-def _before(x: Array) -> Array:
+def _before(x: AnyArray) -> Array:
     """What was given for the interval after each row, for the interval before it."""
     return jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
 
 
-def _body(model: Quadrotor, flight: Flight, said: Replay, o: Observer):
+def _body(model: Quadrotor, flight: Flight, said: Replay, o: _Levels):
     """Rate, angular acceleration, its unmodelled parts and the unmodelled force; innovations and variances."""
 
     def axis(rate, model_rate, torque, trim):
@@ -296,7 +317,7 @@ def _body(model: Quadrotor, flight: Flight, said: Replay, o: Observer):
     return known, ((error, variance), (push_error, push_variance))
 
 
-def _motors(model: Quadrotor, flight: Flight, driven: Array, said: Replay, o: Observer):
+def _motors(model: Quadrotor, flight: Flight, driven: AnyArray, said: Replay, o: _Levels):
     """Rotor speed and the error of its steady value; innovations and variances.
 
     The error e of the modelled speed follows that of its steady value b as the motors follow their commands:

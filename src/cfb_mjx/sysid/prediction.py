@@ -13,8 +13,9 @@ import numpy as np
 from cfb_mjx.devices import Devices, last_repeated
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.quadrotor import Quadrotor, begin, commanded_path, integrate_commanded, integrate_measured, prepare
-from cfb_mjx.model.state import State, stack, unstack
+from cfb_mjx.model.state import AnyArray, State, stack, unstack
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.replay import remembered_along, rotors_alone
 from cfb_mjx.sysid.windows import Windows
@@ -26,7 +27,7 @@ _STATE = ("position", "velocity", "quaternion", "body_rate")
 def predict(
     model: Quadrotor,
     windows: Windows,
-    rotor_speed: np.ndarray | None = None,
+    rotor_speed: AnyArray | None = None,
     memory: tuple = (),
     over: Devices | None = None,
 ) -> State:
@@ -57,7 +58,8 @@ def predict(
     for first in range(0, count, rows):
         chosen = slice(first, min(first + rows, count))
         padded = [jax.tree.map(lambda x, c=chosen: last_repeated(x[c], rows), x) for x in (state, step, inputs)]
-        trajectory = over.here(_predict_batch(model, *over.along(padded), measured, over))
+        here, steps_here, inputs_here = over.along(padded)
+        trajectory = over.here(_predict_batch(model, here, steps_here, inputs_here, measured, over))
         index = np.arange(chosen.stop - first)[:, None], windows.at[chosen]
         found.append(jax.tree.map(lambda x, i=index: np.asarray(x)[i], trajectory))
     return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
@@ -65,7 +67,7 @@ def predict(
 
 @eqx.filter_jit
 def _predict_batch(model: Quadrotor, state: State, step, inputs, measured: bool, over: Devices) -> State:
-    flown = over.mapped(lambda *x: predict_one(model, *x, measured))(state, step, inputs)
+    flown = over.mapped(lambda *x: predict_one(model, *x, measured=measured))(state, step, inputs)
     return eqx.tree_at(lambda s: s.memory, flown, (), is_leaf=lambda x: isinstance(x, tuple))
 
 
@@ -114,7 +116,7 @@ def starts_of_windows(
     nothing: tuple[np.ndarray, tuple] = np.zeros((0, 4)), ()
     if not there:
         return [nothing] * len(windows)
-    known = remembered_along(model, [flights[i] for i in there])
+    known = remembered_along(model, [not_none(flights[i]) for i in there])
     found = []
     for i, (speed, memory) in zip(there, known, strict=True):
         log, own = logs[i], windows[i]

@@ -52,7 +52,7 @@ def residual_angular_acceleration(model: Quadrotor, log: FlightLog) -> tuple[np.
     """
     log = with_gyro_in_time(log, float(model.parameters.gyro_delay))
     (said,) = replays(model, [Lane(*replay_inputs(log, delay_of(log, model.parameters), 0.0))])
-    said = said.angular_acceleration[: len(log)]
+    said = np.asarray(said.angular_acceleration)[: len(log)]
     time = np.arange(log.time[0], log.time[-1], 1 / RATE)
     rate, said, position = (_sampled(time, log.time, x) for x in (log.body_rate, said, log.position))
     low = butter(4, CORNER, fs=RATE, output="sos")
@@ -71,8 +71,8 @@ def repeated(model: Quadrotor, one: FlightLog, other: FlightLog) -> Repeated:
         raise CfbError(f"{one.name}, {other.name}: too short to compare; {SHORTEST:g} s are needed.")
     reach = int(min(LONGEST_SHIFT * RATE, shorter / 3))
     pairs = {shift: _overlap(len(a), len(b), shift) for shift in range(-reach, reach + 1)}
-    apart = {shift: np.mean((path_a[i] - path_b[j]) ** 2) for shift, (i, j) in pairs.items()}
-    best = min(apart, key=apart.get)
+    apart = {shift: float(np.mean((path_a[i] - path_b[j]) ** 2)) for shift, (i, j) in pairs.items()}
+    best = min(apart, key=apart.__getitem__)
     i, j = pairs[best]
     edge = int(EDGE * RATE)
     first, second = (x - x.mean(axis=0) for x in (a[i][edge:-edge], b[j][edge:-edge]))

@@ -8,7 +8,7 @@ a time: one compiled program serves flights of any number and length.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -30,7 +30,7 @@ from cfb_mjx.model.quadrotor import (
     prepare,
     remembering,
 )
-from cfb_mjx.model.state import State, unstack
+from cfb_mjx.model.state import AnyArray, State, unstack
 from cfb_mjx.model.vector import Vec, rotate
 from cfb_mjx.sysid.flight import ROWS, Flight
 
@@ -50,7 +50,7 @@ class Lane(NamedTuple):
     """One flight beside one model."""
 
     flight: Flight
-    driven: np.ndarray
+    driven: AnyArray
     """(n, 4) rotor speeds that drive the body where the flight's were measured (`smoothed_rotor_speed`), rad/s."""
     lead: float = 0.0
     """Share of the next row's command in the mean over an interval: commands sent between two rows are not in the log
@@ -62,11 +62,11 @@ class Lane(NamedTuple):
 class Replay(NamedTuple):
     """What a model predicts along a flight."""
 
-    rotor_speed: Float[np.ndarray, "n 4"]
+    rotor_speed: Float[AnyArray, "n 4"]
     """From the commands alone, at each row, rad/s."""
-    angular_acceleration: Float[np.ndarray, "n 3"]
+    angular_acceleration: Float[AnyArray, "n 3"]
     """Mean over the interval after a row, body axes, rad/s^2."""
-    specific_force: Float[np.ndarray, "n 3"]
+    specific_force: Float[AnyArray, "n 3"]
     """At the rotors' centre in the middle of that interval, body axes, m/s^2."""
 
 
@@ -167,14 +167,14 @@ def _rows(lanes: list[Lane], first: int, last: int) -> dict[str, np.ndarray]:
     return found | {"driven": np.stack([np.asarray(lane.driven)[rows[id(lane.flight)]] for lane in lanes])}
 
 
-def _state(rows: dict[str, Array]) -> State:
+def _state(rows: Mapping[str, AnyArray]) -> State:
     """The body in the middle of the intervals between rows."""
     names = ("position", "velocity", "quaternion", "body_rate", "driven")
     return State(*(0.5 * (rows[name][:-1] + rows[name][1:]) for name in names))
 
 
 @eqx.filter_jit
-def _begin(model: Quadrotor, effects: tuple[Effect, ...], rows: dict[str, Array]):
+def _begin(model: Quadrotor, effects: tuple[Effect, ...], rows: Mapping[str, AnyArray]):
     """Rotor speeds and memories at the first of two rows, as after long steady flight, of every lane."""
 
     def one(effects, rows):
@@ -197,8 +197,8 @@ def _with(model: Quadrotor, effects: tuple[Effect, ...]) -> Quadrotor:
 def _advance(model: Quadrotor, effects: tuple[Effect, ...], lead, measured, rows, carry, wanted: Wanted):
     """Along some rows of every lane: what is carried on, and what is wanted of each of them."""
 
-    def one(effects, *inputs):
-        return _along(_with(model, effects), *inputs, wanted)
+    def one(effects, lead, measured, rows, carry):
+        return _along(_with(model, effects), lead, measured, rows, carry, wanted)
 
     return jax.vmap(one)(effects, lead, measured, rows, carry)
 

@@ -177,7 +177,7 @@ class SensorFaults:
         pose = [times.index(self._instant(h, self.delay)) for h in horizons]
         gyro = [times.index(self._instant(h, self.gyro_lag)) for h in horizons]
         step = np.diff(times, prepend=0.0)
-        position, velocity = self.stretched(began, step, predicted.position, predicted.velocity)
+        position, velocity = self.stretched(began, step, np.asarray(predicted.position), np.asarray(predicted.velocity))
         return State(
             position[:, pose],
             velocity[:, pose],
@@ -220,8 +220,12 @@ class SensorFaults:
             known = ATTRIBUTES[name]
             for key in dict.fromkeys([SENSOR_FAULTS[name].parameter, *values]):
                 value = values.get(key)
-                number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-                if key not in known or not number:
+                if (
+                    key not in known
+                    or not isinstance(value, int | float)
+                    or isinstance(value, bool)
+                    or not math.isfinite(value)
+                ):
                     raise CfbError(
                         f"{where}: effects.{name}.parameters.{key} = {value!r} must be a number that makes sense"
                         f" ({name} has {' and '.join(known)})."

@@ -41,7 +41,7 @@ class _Seen:
     over: np.ndarray
     counts: np.ndarray
 
-    def missed(self, numbers: Sequence[float]) -> np.ndarray:
+    def missed(self, numbers: Sequence[float] | np.ndarray) -> np.ndarray:
         """Left of ``over`` by a band (share, rise, fade)."""
         share, rise, fade = numbers
         slow = _lagged(self.velocity, self.step, rise)
@@ -91,7 +91,7 @@ def _gain(others: list[_Seen], judged: _Seen) -> float:
     """By which share a band leaves less of a flight than a scale, both fitted to other flights."""
     along = [_slow(one.velocity, one.step)[one.counts].ravel() for one in others]
     over = [one.missed_by_scale(0.0) for one in others]
-    share = sum(x @ y for x, y in zip(along, over, strict=True)) / sum(x @ x for x in along)
+    share = float(sum(x @ y for x, y in zip(along, over, strict=True)) / sum(x @ x for x in along))
     even, band = judged.missed_by_scale(share), judged.missed(_fit(others))
     return float(1 - (band @ band) / (even @ even))
 

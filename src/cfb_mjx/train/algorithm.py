@@ -24,12 +24,15 @@ class Algorithm(Protocol):
 
     def begin(self, key: PRNGKeyArray, controller: NeuralController) -> Any:
         """The first state, from an initial controller."""
+        ...
 
     def update(self, state: Any) -> tuple[Any, dict]:
         """One update; metrics are scalars. Compiled."""
+        ...
 
     def controller(self, state: Any) -> NeuralController:
         """The controller as it stands."""
+        ...
 
 
 def in_progress(task: Task, nominal: Quadrotor, drones: int, key: PRNGKeyArray) -> Episode:

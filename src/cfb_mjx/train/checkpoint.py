@@ -23,7 +23,7 @@ def save_checkpoint(path: Path, state: Any, about: dict[str, Any]) -> None:
         CfbError: the file cannot be written.
     """
     leaves = jax.tree.leaves(eqx.filter(state, eqx.is_array))  # of jax or of numpy
-    arrays = {f"{i:05d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+    arrays: dict[str, Any] = {f"{i:05d}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     with replacing(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, about=np.frombuffer(json.dumps(about).encode(), np.uint8), **arrays)
 

@@ -50,7 +50,8 @@ class AnalyticSettings:
     learning_rate: float = 2e-3
     """At the start; it falls to zero along a cosine."""
     gradient_clip: float = 1.0
-    cost: SmoothCost = field(default_factory=SmoothCost)
+    cost: SmoothCost | FlipCost = field(default_factory=SmoothCost)
+    """Flips have `FlipAnalyticSettings`; here, a cost in a file is read as the target's."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +142,8 @@ class TrainingConfig:
     """One training. The defaults are those of ``configs/target.yaml``."""
 
     format: Literal["cfb_mjx training 1"] = FORMAT
-    task: Literal["target"] = "target"
+    task: Literal["target", "flip"] = "target"
+    """Flips have a `FlipTrainingConfig`; here, rewards and starts in a file are read as the target's."""
     description: str = ""
     model: str = "cfb-guards"
     """A preset or a model YAML."""
@@ -155,15 +157,18 @@ class TrainingConfig:
     """Whether the gyro is as late as the pose, as in the paper, or only by the model's ``gyro_delay``."""
     network: NetworkSettings = field(default_factory=NetworkSettings)
     observation: Layout = field(default_factory=Layout)
-    reward: TargetReward = field(default_factory=TargetReward)
-    starts: Starts = field(default_factory=Starts)
+    reward: TargetReward | FlipReward = field(default_factory=TargetReward)
+    starts: Starts | FlipStarts = field(default_factory=Starts)
     noise: Noise = field(default_factory=partial(Noise, pose_jitter_s=0.012))
     randomisation: RandomisationSettings = field(default_factory=RandomisationSettings)
     analytic: AnalyticSettings = field(default_factory=AnalyticSettings)
     ppo: PpoSettings = field(default_factory=PpoSettings)
 
-    def build_task(self) -> TargetTask:
+    def build_task(self) -> TargetTask | FlipTask:
         """The task that is trained on."""
+        # Flips have a class of their own.
+        assert isinstance(self.reward, TargetReward)
+        assert isinstance(self.starts, Starts)
         return TargetTask(reward=self.reward, starts=self.starts, **self._common())
 
     def _common(self) -> dict[str, Any]:
@@ -202,8 +207,7 @@ class FlipTrainingConfig(TrainingConfig):
 
     def build_task(self) -> FlipTask:
         """The task that is trained on."""
-        own = {"reward": self.reward, "starts": self.starts, "setpoints": self.setpoints}
-        return FlipTask(**own, **self._common())
+        return FlipTask(reward=self.reward, starts=self.starts, setpoints=self.setpoints, **self._common())
 
 
 _KINDS = {"target": TrainingConfig, "flip": FlipTrainingConfig}
@@ -357,7 +361,7 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
             pair = _at(config, key)
             if len(pair) != 2 or pair[0] > pair[1]:
                 raise CfbError(f"{where}: {key} must be two numbers, the smaller first, found {told(list(pair))}.")
-        if len(config.reward.axis_direction) != 3:
+        if isinstance(config.reward, FlipReward) and len(config.reward.axis_direction) != 3:
             raise CfbError(f"{where}: reward.axis_direction must be three numbers.")
     if len(config.observation.setpoint_scales) != (2 if config.task == "flip" else 0):
         raise CfbError(f"{where}: observation.setpoint_scales needs one number for each set-point of {config.task}.")

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.envs.flip import deviations
 from cfb_mjx.envs.observation import rotation_matrix
-from cfb_mjx.model.state import State
+from cfb_mjx.model.state import AnyArray, State
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,6 @@ class FlipCost:
         )
 
 
-def rounded(x: Float[Array, "3"], width: float) -> Float[Array, ""]:
+def rounded(x: Float[AnyArray, "3"], width: float) -> Float[Array, ""]:
     """s(x, width)."""
     return jnp.sqrt(jnp.sum(x**2) + width**2) - width

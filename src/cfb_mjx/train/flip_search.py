@@ -129,7 +129,7 @@ def search(
     mean, std = jnp.full(len(low), 0.5), jnp.full(len(low), 0.35)
     given = jnp.clip(jnp.stack([jnp.asarray(x, float) for x in manoeuvre.knobs]), low, high)
     best = jnp.where(high > low, (given - low) / jnp.where(high > low, high - low, 1.0), 0.0)
-    least, history = jnp.inf, []
+    least, history = jnp.asarray(jnp.inf), []
     for i in range(rounds):
         drawn = mean + std * jax.random.normal(jax.random.fold_in(of_draws, i), (candidates, len(low)))
         # The best so far flies again beside the others.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.control.controllers import Controller
-from cfb_mjx.envs.episode import reset, settled_command, step, with_room
+from cfb_mjx.envs.episode import Task, reset, settled_command, step, with_room
 from cfb_mjx.envs.observation import Layout
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
@@ -86,9 +86,11 @@ def fly(
         memory, command = controller.command(memory, episode.estimate)
         episode, outcome = step(task, episode, command)
         failed = failed | outcome.failed
-        at = episode.state
+        state = episode.state
+        moving = (state.position, state.velocity, state.quaternion, state.body_rate)
+        position, velocity, quaternion, body_rate = map(jnp.asarray, moving)
         watched = watch(memory) if target is None else target
-        row = Flight(at.position, at.velocity, at.quaternion, at.body_rate, command, failed, watched, at.rotor_speed)
+        row = Flight(position, velocity, quaternion, body_rate, command, failed, watched, state.rotor_speed)
         return (episode, memory, failed), row
 
     steps = round(seconds / dt) if targets is None else len(targets)
@@ -250,10 +252,13 @@ def _recovery(controller, task, nominal, keys, tilt_deg, speed):
     return Recovery(well, lost, distance, flown.failed[:, -1]), flown
 
 
-def nominal_task(task: TargetTask) -> TargetTask:
+_AnyTask = TypeVar("_AnyTask", bound=Task)
+
+
+def nominal_task(task: _AnyTask) -> _AnyTask:
     """The same task on the nominal drone."""
     return replace(task, randomisation=None)
 
 
-TESTS = {"hover": hover, "step": six_metres, "recover": recovery}
+TESTS: dict[str, Callable[..., tuple[Any, Flight]]] = {"hover": hover, "step": six_metres, "recover": recovery}
 """Each takes controller, task, nominal drone and keys, and returns what it measured and the flights."""

@@ -36,7 +36,7 @@ def measured(
     Returns:
         A function of the drone that gives the `summary`, and the flights, axes (drones, steps).
     """
-    flown_by = flips if test in FLIPS else TESTS[test]
+    flown_by = _flown_by(test)
     divided = over.divided(lambda controller, drone, keys: flown_by(controller, task, drone, keys), (None, None, 0), 0)
 
     def fly(drone: Quadrotor) -> tuple[dict[str, Any], Flight]:
@@ -46,10 +46,14 @@ def measured(
         else:
             numbers, flown = flown_by(controller, task, drone, keys)
         completed = np.asarray(numbers.completed(FLIPS[test])) if test in FLIPS else None
-        diverged = ~np.isfinite(np.asarray(flown.position)).all(axis=(1, 2))
+        diverged = ~np.all(np.isfinite(np.asarray(flown.position)), axis=(1, 2))
         return summary(test, {k: np.asarray(v) for k, v in numbers._asdict().items()}, completed, diverged), flown
 
     return fly
+
+
+def _flown_by(test: str) -> Callable[..., tuple[Any, Flight]]:
+    return flips if test in FLIPS else TESTS[test]
 
 
 def summary(
@@ -84,7 +88,9 @@ def summary(
         good = completed & ~diverged
     # A lost flip's numbers say nothing, and some are infinite.
     counted = good if completed is not None and good.any() else ~diverged
-    result = {key: _finite(np.mean(value[counted])) if counted.any() else None for key, value in values.items()}
+    result: dict[str, Any] = {
+        key: _finite(np.mean(value[counted])) if counted.any() else None for key, value in values.items()
+    }
     result["failed"] = bool(failed.any())
     if diverged.any():
         result["diverged"] = int(diverged.sum())
@@ -101,5 +107,5 @@ def summary(
     return result
 
 
-def _finite(number: float) -> float | None:
+def _finite(number: float | np.floating) -> float | None:
     return float(number) if math.isfinite(number) else None

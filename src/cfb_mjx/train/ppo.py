@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -101,7 +101,9 @@ class Ppo:
         critic = Network.random(of_critic, (inputs, *self.settings.value_hidden, 1), "swish")
         raw = jnp.log(jnp.expm1(jnp.full(4, self.first_std)))
         actor = Actor(controller.network, raw)
-        optimizer, rate = self.optimizer.init((actor, critic)), jnp.asarray(self.first_rate, raw.dtype)
+        # Optax's annotation knows no modules of equinox.
+        optimizer = self.optimizer.init(cast(Any, (actor, critic)))
+        rate = jnp.asarray(self.first_rate, raw.dtype)
         episodes = episodes, jnp.zeros(self.settings.drones, bool)
         return strong(PpoState(actor, critic, optimizer, rate, episodes, key, jnp.asarray(0)))
 
@@ -125,23 +127,23 @@ class Ppo:
         learning = jnp.where(state.count < self.warm_up, 0.0, 1.0)
         left = 1 - (1 - self.settings.last_entropy) * state.count / self.updates
         weights = learning, learning * self.settings.entropy_cost * left
-        learnt, losses = jax.lax.scan(
+        (actor, critic, optimizer, rate), losses = jax.lax.scan(
             partial(self._epoch, weights, data, last),
             (state.actor, state.critic, state.optimizer, state.rate),
             jax.random.split(of_learning, self.settings.epochs),
         )
-        (*learnt, rate), losses = learnt, jax.tree.map(jnp.mean, losses)
+        losses = jax.tree.map(jnp.mean, losses)
         # It falls within an update, and rises from one to the next: the first batches of each have no divergence yet.
         calm = (learning > 0) & (losses["kl"] < self.settings.largest_kl / 4)
         rate = jnp.minimum(jnp.where(calm, 1.5 * rate, rate), 1.0)
         metrics = {
             "reward": jnp.sum(outcome.reward * data["flown"]) / jnp.sum(data["flown"]),
             "failing": jnp.mean(data["failed"] * data["flown"]),
-            "std": jnp.mean(jax.nn.softplus(learnt[0].raw_std)),
+            "std": jnp.mean(jax.nn.softplus(actor.raw_std)),
             "rate": rate,
             **losses,
         }
-        return PpoState(*learnt, rate, episodes, key, state.count + 1), metrics
+        return PpoState(actor, critic, optimizer, rate, episodes, key, state.count + 1), metrics
 
     def _collect(self, actor: Actor, episodes: tuple[Episode, Array], key: PRNGKeyArray):
         """Fly ``unroll`` commands with every drone; data has axes (unroll, drones)."""
@@ -219,6 +221,7 @@ class Ppo:
             actor, critic, optimizer, rate = learnt
             gradient, metrics = jax.grad(self._loss, has_aux=True)((actor, critic), weights, *batch)
             changes, optimizer = self.optimizer.update(gradient, optimizer)
+            changes = cast(tuple[Actor, Network], changes)
             if most := self.settings.largest_kl:
                 # How far the steps before this one have led.
                 kl = metrics["kl"]

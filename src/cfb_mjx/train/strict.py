@@ -7,12 +7,15 @@ import sys
 import types
 import typing
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from cfb_mjx.documents import LARGEST_INT, told
 from cfb_mjx.errors import CfbError
 
-T = TypeVar("T")
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 
 
 def build(kind: type[T], raw: Mapping[str, Any], where: str, prefix: str = "") -> T:
@@ -39,7 +42,7 @@ def plain(value: Any) -> Any:
 
 
 def _value(kind: Any, raw: Any, where: str, key: str) -> Any:
-    if dataclasses.is_dataclass(kind):
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind):
         return build(kind, raw, where, f"{key}.")
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Literal:

@@ -212,7 +212,8 @@ def loop_figure(results: dict[str, Any], path: Path) -> None:
         from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
         plot = new_figure(9.6, 1.5 + 0.6 * len(rows))
-        for axis, measure in zip(plot.subplots(1, 2, sharey=True), MEASURES, strict=True):
+        panels = plot.subplots(1, 2, sharey=True)
+        for axis, measure in zip(panels, MEASURES, strict=True):
             for height, row in enumerate(rows):
                 own = [cell["trials"] for cell in cells if cell["effect"] == row.effect]
                 _draw_row(axis, height, row.spreads[measure], own, measure, height == 0)
@@ -225,7 +226,7 @@ def loop_figure(results: dict[str, Any], path: Path) -> None:
             axis.set_ylim(len(rows) - 0.5, -0.5)
         inches = plot.get_size_inches()[1]
         plot.subplots_adjust(left=0.16, right=0.98, bottom=0.55 / inches, top=1 - 0.62 / inches, wspace=0.06)
-        plot.legend(*axis.get_legend_handles_labels(), loc="upper center", ncols=3, fontsize=8)
+        plot.legend(*panels[-1].get_legend_handles_labels(), loc="upper center", ncols=3, fontsize=8)
         save(plot, check_path(path))
 
 

@@ -120,7 +120,8 @@ def _binned(drawn, panel: Panel, labels: tuple[str, str]) -> None:
     signal = panel.before.drivers[panel.signal]
     # Evenly spaced, or a flight that mostly hovers would have all its bins in the middle.
     count = 6 if len(signal) < FEW else 12
-    edges = np.linspace(*np.nanquantile(signal, [0.005, 0.995]), count + 1)
+    low, high = np.nanquantile(signal, [0.005, 0.995])
+    edges = np.linspace(low, high, count + 1)
     for pooled, colour, marker, label in (
         (panel.before, BEFORE, "s", labels[0]),
         (panel.after, AFTER, "o", labels[1]),

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.evaluation import Evaluation
 from cfb_mjx.sysid.metrics import QUANTITIES
 from cfb_mjx.sysid.tracing.diagnosis import Diagnosis, HeldOut, Reported, Unexplained
@@ -117,10 +118,11 @@ def _missing(diagnosis: Diagnosis, figures: Figures) -> Section:
 def _held(diagnosis: Diagnosis) -> str:
     """Which declared effects a fit of all at once left as they were, or within what drones of the type differ."""
     judged = {item.name for item in (*diagnosis.reported, *diagnosis.unconfirmed)}
-    present, typical = set(diagnosis.hypothesis.present), diagnosis.together.typical
+    together = not_none(diagnosis.together)
+    present, typical = set(diagnosis.hypothesis.present), together.typical
     declared = [item["name"] for item in diagnosis.base.effects if item["name"] in present - judged]
     held, moved = ([n for n in declared if (n in typical) == which] for which in (False, True))
-    fit = diagnosis.together.fit
+    fit = together.fit
     edge = [n.name for n in fit.numbers if n.effect in moved and fit.at_bound(n)]
     text = f" Held as the model declares them: {', '.join(held)}." if held else ""
     text += f" Moved within the spread of the type: {', '.join(moved)}." if moved else ""
@@ -191,16 +193,16 @@ def _numbers(diagnosis: Diagnosis) -> Section:
     rows = _rows(diagnosis.before, diagnosis.after, diagnosis.held_out.floor, diagnosis.held_out.random)
     head = ["error of", "ahead", "before", "after", "change", "hold", "noise floor", "noise and disturbances"]
     tables = [(caption, head, rows)]
-    speed = diagnosis.before.metrics("rotor_speed_in"), diagnosis.after.metrics("rotor_speed_in")
-    if all(speed):
-        tables.append(_speed_in(*speed))
+    before, after = diagnosis.before.metrics("rotor_speed_in"), diagnosis.after.metrics("rotor_speed_in")
+    if before and after:
+        tables.append(_speed_in(before, after))
     return Section("Held-out errors in numbers", tables=tables)
 
 
 def _rows(before: Evaluation, after: Evaluation, floor: dict, random: dict | None) -> list[list[str]]:
     found = []
-    spans = {name: e.intervals(v) for name, e, v in _kinds(before, after)}
-    middle = {name: e.metrics(v) for name, e, v in _kinds(before, after)}
+    spans = {name: not_none(e.intervals(v)) for name, e, v in _kinds(before, after)}
+    middle = {name: not_none(e.metrics(v)) for name, e, v in _kinds(before, after)}
     for quantity, unit in QUANTITIES.items():
         for horizon in before.horizons:
             key = f"{quantity}_rmse_{unit}@{horizon:g}s"
@@ -345,7 +347,7 @@ def _size(held_out: HeldOut, index: int) -> str:
 
 def _budget(diagnosis: Diagnosis) -> str:
     horizon = max(diagnosis.after.horizons)
-    errors = diagnosis.after.metrics("commands_in")
+    errors = not_none(diagnosis.after.metrics("commands_in"))
     sensors, wandering = [], []
     for quantity, unit in QUANTITIES.items():
         key = f"{quantity}_rmse_{unit}@{horizon:g}s"

@@ -9,6 +9,7 @@ import numpy as np
 
 from cfb_mjx import plugins
 from cfb_mjx.model.effects import CATALOGUE, KNOWN, SENSOR_FAULTS, CogOffset, Inertia, MotorTimeConstant, RotorDrag
+from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.tracing.diagnosis import Diagnosis, Reported
 
 FOLLOWS = {
@@ -174,7 +175,7 @@ def _many(diagnosis: Diagnosis, physics: list[Reported]) -> str:
     horizon = f"@{max(diagnosis.before.horizons):g}s"
     keys = {"attitude": ("attitude_mean_deg", "deg"), "velocity": ("velocity_mean_mps", "m/s")}
     before, after, still = (
-        found.metrics(variant)
+        not_none(found.metrics(variant))
         for found, variant in (
             (diagnosis.before, "commands_in"),
             (diagnosis.after, "commands_in"),
@@ -208,7 +209,7 @@ def _interval(item: Reported) -> str:
 
 def _bought(diagnosis: Diagnosis) -> str:
     """The largest drop of a held-out error at the longest horizon."""
-    before, after = diagnosis.before.metrics("commands_in"), diagnosis.after.metrics("commands_in")
+    before, after = (not_none(found.metrics("commands_in")) for found in (diagnosis.before, diagnosis.after))
     horizon = f"@{max(diagnosis.before.horizons):g}s"
     keys = [key for key in before if "_rmse_" in key and key.endswith(horizon)]
     key = min(keys, key=lambda k: after[k] / before[k])

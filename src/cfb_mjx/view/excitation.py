@@ -75,7 +75,8 @@ def _window(experiment: Experiment, start: int) -> tuple[np.ndarray, slice]:
 def _value(experiment: Experiment, name: str, start: int) -> np.ndarray:
     state = experiment.state
     if name == "tilt":
-        return tilt_deg(state.quaternion)
+        return tilt_deg(np.asarray(state.quaternion))
     if name == "body rate":
         return np.linalg.norm(state.body_rate, axis=1)
-    return state.position[:, 2] - state.position[start, 2]
+    height = np.asarray(state.position[:, 2])
+    return height - height[start]

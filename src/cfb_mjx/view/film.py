@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -105,7 +105,7 @@ def _pictures(path: Path, flight: Path3D, size, rate: float, azimuth_deg: float)
     return np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
 
 
-def _job(flight: Path3D, size, rate: float, azimuth_deg: float) -> dict[str, np.ndarray]:
+def _job(flight: Path3D, size, rate: float, azimuth_deg: float) -> dict[str, Any]:
     """What `render` needs."""
     duration = flight.time[-1] - flight.time[0]
     times = flight.time[0] + np.arange(int(duration * rate) + 1) / rate

@@ -32,7 +32,8 @@ def flight_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
     colours = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
     with context():
         figure = new_figure(6.4, 6.0)
-        for axis, (label, values, names) in zip(figure.subplots(3, 1, sharex=True), rows, strict=True):
+        panels = figure.subplots(3, 1, sharex=True)
+        for axis, (label, values, names) in zip(panels, rows, strict=True):
             for i, name in enumerate(names):
                 lines = axis.plot(
                     time, values[:_SHOWN, :, i].T, color=colours[i], linewidth=0.9, alpha=1.0 if count == 1 else 0.35
@@ -41,7 +42,7 @@ def flight_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
             axis.set_ylabel(label)
             if names[0]:
                 axis.legend(loc="upper right", ncols=len(names))
-        axis.set_xlabel("time, s")
+        panels[-1].set_xlabel("time, s")
         shown = "" if count <= _SHOWN else f" ({_SHOWN} of {count} flights)"
         figure.suptitle(title + shown, fontsize=10)
         figure.subplots_adjust(left=0.11, right=0.98, bottom=0.08, top=0.94, hspace=0.12)

@@ -55,7 +55,8 @@ def flip_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
                 axis.axvspan(turning[0] - dt, turning[-1], color=_GREY, linewidth=0)
             if i < 2:
                 axis.tick_params(labelbottom=False)
-        axis.set_xlabel("time, s")
+            else:
+                axis.set_xlabel("time, s")
         more = "" if count <= _SHOWN else f" ({_SHOWN} of {count} flights)"
         figure.suptitle(title + more, fontsize=10)
         figure.subplots_adjust(left=0.08, right=0.98, bottom=0.11, top=0.92, hspace=0.15, wspace=0.25)

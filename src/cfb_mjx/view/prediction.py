@@ -7,6 +7,7 @@ import os
 import numpy as np
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.evaluation import VARIANTS, Evaluation, LogEvaluation
 from cfb_mjx.sysid.metrics import QUANTITIES
 from cfb_mjx.view import style
@@ -52,7 +53,7 @@ def prediction_figure(
     path = style.check_path(path)
     chosen = _choose(evaluation, log_name)
     alone = Evaluation((chosen,), evaluation.horizons)
-    results = {v: (alone.metrics(v), alone.intervals(v)) for v in VARIANTS if alone.metrics(v) is not None}
+    results = {v: (m, not_none(alone.intervals(v))) for v in VARIANTS if (m := alone.metrics(v)) is not None}
     with style.context():
         figure = style.new_figure(15.0, 9.6)
         grid = figure.add_gridspec(4, 4, left=0.046, right=0.99, top=0.95, bottom=0.095, wspace=0.27, hspace=0.15)

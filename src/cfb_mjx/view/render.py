@@ -9,9 +9,13 @@ from __future__ import annotations
 
 import sys
 from itertools import pairwise
+from typing import Any, cast
 
-import mujoco
+import mujoco as _mujoco
 import numpy as np
+
+# Most of it is compiled, and nothing says what that holds.
+mujoco = cast(Any, _mujoco)
 
 WAY = np.array([0.0, 0.45, 0.7, 0.9], np.float32)
 ARROW = np.array([0.84, 0.37, 0.0, 0.9], np.float32)

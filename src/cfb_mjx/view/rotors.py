@@ -39,9 +39,11 @@ def rotor_figure(
         panels = figure.subplots(2, count, squeeze=False, sharex="col", height_ratios=(2.2, 1.0))
         columns = iter(panels.T)
         for item in replays:
-            _draw_replay(*next(columns), item)
+            top, bottom = next(columns)
+            _draw_replay(top, bottom, item)
         for name, fitted in maps.items():
-            _draw_map(*next(columns), name, fitted)
+            top, bottom = next(columns)
+            _draw_map(top, bottom, name, fitted)
         inches = figure.get_figwidth()
         figure.subplots_adjust(
             left=0.75 / inches, right=1 - 0.12 / inches, top=0.88, bottom=0.1, wspace=0.27, hspace=0.1

@@ -40,9 +40,8 @@ def spread_figure(
     panels.append(("tilt", "deg", tilt))
     with style.context():
         figure = style.new_figure(12.0, 3.7)
-        for index, (axes, (name, unit, values)) in enumerate(
-            zip(figure.subplots(1, 4, sharex=True), panels, strict=True)
-        ):
+        plots = figure.subplots(1, 4, sharex=True)
+        for index, (axes, (name, unit, values)) in enumerate(zip(plots, panels, strict=True)):
             for low, high, label, alpha in BANDS:
                 lower, upper = np.percentile(values, [low, high], axis=0)
                 axes.fill_between(
@@ -57,7 +56,7 @@ def spread_figure(
             axes.set_xlabel("time, s")
             axes.margins(x=0)
         figure.subplots_adjust(left=0.055, right=0.99, top=0.9, bottom=0.23, wspace=0.28)
-        figure.legend(*axes.get_legend_handles_labels(), loc="lower center", ncols=4)
+        figure.legend(*plots[-1].get_legend_handles_labels(), loc="lower center", ncols=4)
         if title:
             figure.suptitle(title, fontsize=11, y=0.985)
         style.save(figure, path)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from cfb_mjx.files import FIGURES, replacing, require_ending
+
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
 
 MEASURED = "#222222"
 # Okabe and Ito's palette.
@@ -18,7 +22,7 @@ LABELS = {
 }
 AXES = "xyz"
 
-_RC = {
+_RC: dict[RcKeyType, Any] = {
     "font.size": 9.0,
     "axes.titlesize": 9.5,
     "axes.labelsize": 9.0,

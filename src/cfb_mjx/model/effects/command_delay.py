@@ -17,9 +17,9 @@ from itertools import pairwise
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect, Memory
@@ -57,7 +57,7 @@ class CommandDelay(Effect):
 
     def begin(self, rotor_speed: Vec, parameters: Parameters, dt: float) -> Memory:
         longest = self.prior["delay"][1]
-        if not isinstance(self.delay, jax.core.Tracer):
+        if not isinstance(self.delay, Tracer):
             longest = max(longest, float(np.asarray(self.delay).max()))
         return self._steady(rotor_speed, parameters, max(ROWS, math.ceil(longest / dt - 1e-6) + 1))
 

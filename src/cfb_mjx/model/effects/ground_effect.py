@@ -60,7 +60,7 @@ class GroundEffect(Effect):
         parameters = condition.parameters
         w, x, y, z = condition.quaternion
         along, across = hub_positions(parameters)
-        center = condition.position[2] - rotate(condition.quaternion, parameters.center_of_gravity)[2]
+        center = condition.position[2] - rotate(condition.quaternion, Vec.unstack(parameters.center_of_gravity))[2]
         # The last row of the rotation matrix: how high a point beside the centre lies.
         above = along * (2 * (x * z - w * y)) + across * (2 * (y * z + w * x)) + center
         return RotorLoads(loads.thrust * beside_surface(above, self.strength, self.height), loads.torque, loads.rate)

@@ -47,15 +47,16 @@ class InertiaProducts(Effect):
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         parameters, omega = condition.parameters, condition.body_rate
-        (x, y, z), share = parameters.inertia, Vec.unstack(self.relative)
+        center, inertia = Vec.unstack(parameters.center_of_gravity), Vec.unstack(parameters.inertia)
+        (x, y, z), share = inertia, Vec.unstack(self.relative)
         xy, xz, yz = share * Vec(jnp.sqrt(x * y), jnp.sqrt(x * z), jnp.sqrt(y * z))
 
         def across(turning: Vec) -> Vec:
             a, b, c = turning
             return Vec(xy * b + xz * c, xy * a + yz * c, xz * a + yz * b)
 
-        about_center = wrench.torque - parameters.center_of_gravity.cross(wrench.force)
-        left = about_center - omega.cross(parameters.inertia * omega + across(omega))
+        about_center = wrench.torque - center.cross(wrench.force)
+        left = about_center - omega.cross(inertia * omega + across(omega))
         rows = Vec(x, xy, xz), Vec(xy, y, yz), Vec(xz, yz, z)
         minors = rows[1].cross(rows[2]), rows[2].cross(rows[0]), rows[0].cross(rows[1])
         inverse_determinant = 1 / rows[0].dot(minors[0])

@@ -73,7 +73,8 @@ class Jet(Effect):
         return cls(speed=0.0)
 
     def air(self, condition: Condition) -> Vec:
-        center = condition.position - rotate(condition.quaternion, condition.parameters.center_of_gravity)
+        lever = Vec.unstack(condition.parameters.center_of_gravity)
+        center = condition.position - rotate(condition.quaternion, lever)
         axis = Vec.unstack(self.direction)
         axis = axis * (1 / jnp.sqrt(axis.dot(axis)))
         away = center - Vec.unstack(self.origin)

@@ -83,7 +83,8 @@ class RegressionDilution(Effect):
         ((turned,),) = condition.memory
         known = 1 + (x * x + y * y) / self.knee**2 + turned / self.turning**2
         unanswered = self.dilution / known
-        returning = condition.parameters.inertia.map(lambda i, rate: self.reversion * i * rate, condition.body_rate)
+        inertia = Vec.unstack(condition.parameters.inertia)
+        returning = inertia.map(lambda i, rate: self.reversion * i * rate, condition.body_rate)
         x, y = (torque - unanswered * (torque + back) for torque, back in ((x, returning[0]), (y, returning[1])))
         return Wrench(wrench.force, Vec(x, y, z))
 

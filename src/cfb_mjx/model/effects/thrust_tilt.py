@@ -19,6 +19,7 @@ from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.cog_offset import CogOffset
 from cfb_mjx.model.effects.fields import hub_positions, number, vector
 from cfb_mjx.model.vector import Vec
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters.limits import Limits
 
 
@@ -52,7 +53,8 @@ class ThrustTilt(Effect):
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         x, y = hub_positions(condition.parameters)
         along_x, along_y = Vec.unstack(self.tilt)
-        thrust = condition.loads.thrust
+        # `Effect.body` is always told.
+        thrust = not_none(condition.loads).thrust
         round_ = self.twist / (condition.parameters.rotor_spacing * 0.5**0.5)
         force_x, force_y = thrust * (along_x + -round_ * y), thrust * (along_y + round_ * x)
         turn = (x * force_y - y * force_x).sum()

@@ -75,6 +75,6 @@ class WallEffect(Effect):
         normal = normal * (1 / jnp.sqrt(normal.dot(normal)))
         in_body = rotate_inverse(condition.quaternion, normal)
         along, across = hub_positions(parameters)
-        center = condition.position - rotate(condition.quaternion, parameters.center_of_gravity)
+        center = condition.position - rotate(condition.quaternion, Vec.unstack(parameters.center_of_gravity))
         away = -(along * in_body[0] + across * in_body[1]) + (self.distance - center.dot(normal))
         return RotorLoads(loads.thrust * beside_surface(away, self.strength, self.reach), loads.torque, loads.rate)

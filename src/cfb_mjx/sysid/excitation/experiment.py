@@ -41,6 +41,7 @@ class Stabiliser(Protocol):
 
     def command(self, memory: Any, measurement: State, position: Array, yaw: Array) -> tuple[Any, Array]:
         """New memory and command (4,) to hold ``position`` [m, world] and ``yaw`` [rad]."""
+        ...
 
 
 @dataclass(frozen=True)

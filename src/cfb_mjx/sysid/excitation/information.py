@@ -18,7 +18,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import thrust
-from cfb_mjx.model.state import State
+from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.sysid.excitation.manoeuvres import STEP
 from cfb_mjx.sysid.identification.fitting import fit_noise, fit_slopes, in_blocks
 from cfb_mjx.sysid.identification.flight_data import Segments, prepare
@@ -171,12 +171,12 @@ def per_relative_change(unknowns: Unknowns) -> np.ndarray:
     return np.linalg.inv(unknowns.slope(unknowns.start))
 
 
-def log_determinant(information: Float[Array, "k k"]) -> Float[Array, ""]:
+def log_determinant(information: Float[AnyArray, "k k"]) -> Float[Array, ""]:
     """D-optimality: log det of the information, with the little known before (50 %, where a fit gives up)."""
     return jnp.linalg.slogdet(information + jnp.eye(len(information)) / LOOSEST**2)[1]
 
 
-def marginal_std(information: Float[Array, "k k"]) -> np.ndarray:
+def marginal_std(information: Float[AnyArray, "k k"]) -> np.ndarray:
     """(k,) standard deviations with everything else unknown, of relative changes (offsets: cm)."""
-    information = np.asarray(information)
-    return np.sqrt(np.diag(np.linalg.inv(information + np.eye(len(information)) / LOOSEST**2)))
+    known = np.asarray(information)
+    return np.sqrt(np.diag(np.linalg.inv(known + np.eye(len(known)) / LOOSEST**2)))

@@ -14,7 +14,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rollout import rollout
 from cfb_mjx.model.rotors import TORQUE_SIGNS
-from cfb_mjx.model.state import State
+from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.model.vector import Vec, up_axis
 
 STEP = 0.004
@@ -72,14 +72,14 @@ class Limits:
 class Demand(eqx.Module):
     """What a sequence asks of the undisturbed drone, or the share of every limit that is (`Limits.shares`)."""
 
-    rate: Float[Array, "*n"]
+    rate: Float[AnyArray, "*n"]
     """Norm of the body rate, rad/s."""
-    lean: Float[Array, "*n"]
+    lean: Float[AnyArray, "*n"]
     """1 - cos of the tilt: the angle itself has no derivative at zero."""
-    altitude_loss: Float[Array, "*n"]
+    altitude_loss: Float[AnyArray, "*n"]
     """Below the start, with the way needed to stop sinking, m."""
-    end_rate: Float[Array, "*k"]
-    end_lean: Float[Array, "*k"]
+    end_rate: Float[AnyArray, "*k"]
+    end_lean: Float[AnyArray, "*k"]
 
 
 def flown(model: Quadrotor, commands: Float[Array, "n 4"]) -> State:

@@ -28,7 +28,13 @@ def _there_and_back(time: np.ndarray, reach: float, speeds: tuple[float, ...]) -
     return np.interp(time, corners, ends)
 
 
-def _level(time: np.ndarray, x=0.0, y=0.0, z=HEIGHT, yaw=0.0) -> Path:
+def _level(
+    time: np.ndarray,
+    x: float | np.ndarray = 0.0,
+    y: float | np.ndarray = 0.0,
+    z: float | np.ndarray = HEIGHT,
+    yaw: float | np.ndarray = 0.0,
+) -> Path:
     return np.stack([np.broadcast_to(np.asarray(a, float), time.shape) for a in (x, y, z, yaw)], axis=1)
 
 

@@ -51,7 +51,7 @@ def _one(experiment: Experiment, start: int) -> Attained:
     catch = round(CATCH / TICK)
     rows = slice(start, start + experiment.length + catch)
     position, velocity = experiment.state.position[rows], experiment.state.velocity[rows]
-    _, x, y, _ = np.moveaxis(experiment.state.quaternion[rows], -1, 0)
+    _, x, y, _ = np.moveaxis(np.asarray(experiment.state.quaternion[rows]), -1, 0)
     tilt = np.degrees(2 * np.arcsin(np.clip(np.hypot(x, y), 0.0, 1.0)))
     restless = (tilt > SETTLED_TILT_DEG) | (np.linalg.norm(velocity, axis=1) > SETTLED_SPEED)
     last = np.flatnonzero(restless[experiment.length :])
@@ -69,7 +69,7 @@ def _one(experiment: Experiment, start: int) -> Attained:
     )
 
 
-def worst_of(repetitions: list[Attained], limits: Limits) -> dict[str, float | int]:
+def worst_of(repetitions: list[Attained], limits: Limits) -> dict[str, float | int | None]:
     """Extremes over repetitions, as JSON terms, and how many kept the limits and were caught."""
     return {
         "max_tilt_deg": max(a.tilt_deg for a in repetitions),

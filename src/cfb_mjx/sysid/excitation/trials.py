@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from cfb_mjx.control import FirmwarePid, PositionHold
 from cfb_mjx.model import Quadrotor
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.excitation.conditions import Conditions
 from cfb_mjx.sysid.excitation.design import Problem, optimise
@@ -142,12 +143,14 @@ def excite(
     if parameters is not None:
         choose(parameters, nominal)  # refuses unknown names before the work
     names = [manoeuvre] if manoeuvre in PAPER else [*PAPER, manoeuvre]
-    problem, trials = None, {}
+    problem: Problem | None = None
+    trials: dict[str, Trial] = {}
     for index, name in enumerate(names):
         if name in PAPER:
             commands = scaled(model, PAPER[name](duration), limits)
         else:
-            commands = optimise(problem, duration, ITERATIONS, progress=designing).commands
+            # The paper's manoeuvres came first and made it.
+            commands = optimise(not_none(problem), duration, ITERATIONS, progress=designing).commands
         calm = fly(model, stabiliser, commands, repetitions, conditions.calm, name=name)
         flown = [fly(model, stabiliser, commands, repetitions, conditions, seed=i, name=name) for i in range(FLIGHTS)]
         progress(2 * index + 1, 2 * len(names))

@@ -10,10 +10,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from cfb_mjx.devices import Devices
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import with_gyro_in_time
 from cfb_mjx.sysid.identification.feedback import detect
@@ -121,7 +123,11 @@ def fit(
         if over is not None:  # placed as the rounds return it, or the second would compile anew
             vector, noise, ridge = over.whole((vector, noise, ridge))
         vector, noise = _settled(unknowns, vector, noise, segments, use_measured, robust, ridge, progress)
-        if not contradicted and "command_hold" not in asked and float(unknowns.hold(vector)) > NEARLY * interval:
+        if (
+            not contradicted
+            and "command_hold" not in asked
+            and float(not_none(unknowns.hold(vector))) > NEARLY * interval
+        ):
             # A free hold takes every step of a command for uncertain, and so the rotors' own readings for better than
             # they are: where commands come in time with the rows, all motor constants lean by several deviations.
             timed = replace(unknowns, timed=jnp.ones(()))
@@ -147,7 +153,7 @@ def fit(
     priors = {"command_hold": PRIORS["command_hold"]} | stated
     blur = np.array([_blur(name, float(v)) for name, v in zip(unknowns.names, unknowns.values(vector), strict=True)])
     # Only where some commands were not logged, and nothing else says how fast the rotors turned.
-    missing = 1 - min(max(float(unknowns.hold(vector)) / interval, 0.0), 1.0) ** 2
+    missing = 1 - min(max(float(not_none(unknowns.hold(vector))) / interval, 0.0), 1.0) ** 2
     blur *= (interval / 0.01) ** 2 * missing * (use_measured is False or not np.all(np.asarray(data.segments.measured)))
     uncertainty = assess(blocks[0], blocks[1][..., columns], judged, priors, blur[columns])
     axes = set(GROUPS["inertia"]) & set(fitted)
@@ -186,7 +192,9 @@ def _playing(asked: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for name in UNITS if name not in left)
 
 
-def _settled(unknowns, vector, noise: Noise, segments: Segments, use_measured, robust, ridge, progress):
+def _settled(
+    unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured, robust, ridge, progress
+) -> tuple[Array, Noise]:
     """Vector and noise levels of largest likelihood, found in turns."""
     for done in range(ROUNDS):
         before, levels = vector, noise

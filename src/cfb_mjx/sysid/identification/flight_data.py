@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import equinox as eqx
+import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from cfb_mjx.devices import Devices, last_repeated
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.model.state import AnyArray
 
 ROWS_PER_SEGMENT = 641
 """Long flights are cut into overlapping segments of this many rows, which run side by side. One shape for all flights:
@@ -20,24 +22,24 @@ _COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 class Segments(eqx.Module):
     """S contiguous pieces of flight, N rows each; the last row of a short piece is repeated with zero time between."""
 
-    interval: Float[Array, "s n"]
+    interval: Float[AnyArray, "s n"]
     """Time from the previous row, s; 0 at the first row and in the padding."""
-    valid: Float[Array, "s n"]
+    valid: Float[AnyArray, "s n"]
     """1 for rows that are measured, 0 for the padding."""
-    command: Float[Array, "s n 4"]
-    doubt: Float[Array, "s n 4"]
+    command: Float[AnyArray, "s n 4"]
+    doubt: Float[AnyArray, "s n 4"]
     """Of a command's step to the next row, the part that the steps about it do not foretell: what may have been sent
     between the rows is uncertain by a share of it."""
-    excess: Float[Array, "s n 4"]
+    excess: Float[AnyArray, "s n 4"]
     """Mean of what is commanded until the next row, less ``command``: 0 as logged, see `innovation.as_held`."""
-    rotor_speed: Float[Array, "s n 4"]
+    rotor_speed: Float[AnyArray, "s n 4"]
     """Measured, rad/s; what it holds where ``measured`` is 0 means nothing."""
-    measured: Float[Array, " s"]
+    measured: Float[AnyArray, " s"]
     """1 where every rotor speed of the piece was measured."""
-    warm_up: Float[Array, "s n"]
+    warm_up: Float[AnyArray, "s n"]
     """1 for rows used to find the rotor speed and the filter's state only."""
-    body_rate: Float[Array, "s n 3"]
-    specific_force: Float[Array, "s n 3"]
+    body_rate: Float[AnyArray, "s n 3"]
+    specific_force: Float[AnyArray, "s n 3"]
     over: Devices | None = eqx.field(static=True, default=None)
     """What they are divided over."""
 
@@ -46,7 +48,8 @@ class Segments(eqx.Module):
 class FlightData:
     """Segments of several logs together."""
 
-    segments: Segments
+    segments: Segments | None
+    """None where no stretch of any log is long enough."""
     log_of_segment: np.ndarray
     """(pieces,) index of the log each segment comes from; segments beyond are empty."""
     rate_noise: np.ndarray
@@ -59,7 +62,7 @@ class FlightData:
     @property
     def rows(self) -> int:
         """Measured rows."""
-        return int(np.sum(np.asarray(self.segments.valid)))
+        return 0 if self.segments is None else int(np.sum(np.asarray(self.segments.valid)))
 
 
 def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
@@ -70,7 +73,8 @@ def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
         warm_up: time at the start of each segment in which the motor model forgets its guessed start, s (eight motor
             time constants).
     """
-    pieces, owners = [], []
+    pieces: list[tuple[FlightLog, int, int, int]] = []
+    owners: list[int] = []
     for index, log in enumerate(logs):
         lead = min(max(2, round(warm_up / log.nominal_interval)), ROWS_PER_SEGMENT // 2)
         for stretch in log.segments():
@@ -83,10 +87,9 @@ def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
                 if last == end:
                     break
     built = [_segment(*piece, ROWS_PER_SEGMENT) for piece in pieces]
-    stacked = _padded({key: np.stack([b[key] for b in built]) for key in built[0]}) if built else None
     noise = [_noise(log) for log in logs]
     return FlightData(
-        segments=Segments(**stacked) if stacked else None,
+        segments=_padded(jax.tree.map(lambda *x: np.stack(x), *built)) if built else None,
         log_of_segment=np.array(owners, dtype=int),
         rate_noise=np.median([n[0] for n in noise], axis=0),
         specific_force_noise=np.median([n[1] for n in noise], axis=0),
@@ -94,17 +97,16 @@ def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
     )
 
 
-def _padded(stacked: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _padded(stacked: Segments) -> Segments:
     """Append segments that count for nothing up to the next count of `_COUNTS` (beyond, a multiple of the last)."""
-    count = len(stacked["valid"])
+    count = len(stacked.valid)
     wanted = next((n for n in _COUNTS if n >= count), -(-count // _COUNTS[-1]) * _COUNTS[-1])
     # Copies of a real segment: zeros would divide by zero.
-    more = {key: np.concatenate([v, np.repeat(v[:1], wanted - count, axis=0)]) for key, v in stacked.items()}
-    more["valid"][count:] = 0.0
-    return more
+    more = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[:1], wanted - count, axis=0)]), stacked)
+    return replace(more, valid=more.valid * (np.arange(wanted) < count)[:, None])
 
 
-def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> dict[str, np.ndarray]:
+def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> Segments:
     rows = slice(first, last)
     count = last - first
     speed = np.zeros((count, 4)) if log.rotor_speed is None else log.rotor_speed[rows].copy()
@@ -122,18 +124,18 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> di
     doubt = _unforetold(log.time[rows], np.clip(log.command[rows], 0, 1))
 
     padding = np.arange(width) >= count
-    return {
-        "interval": np.where(padding, 0.0, last_repeated(np.concatenate([[0.0], np.diff(log.time[rows])]), width)),
-        "valid": (~padding).astype(float),
-        "command": last_repeated(np.clip(log.command[rows], 0, 1), width),
-        "doubt": np.concatenate([doubt, np.zeros((1 + width - count, 4))]),
-        "excess": np.zeros((width, 4)),
-        "rotor_speed": last_repeated(speed, width),
-        "measured": np.array(float(measured)),
-        "warm_up": (np.arange(width) < lead).astype(float),
-        "body_rate": last_repeated(log.body_rate[rows], width),
-        "specific_force": last_repeated(log.specific_force[rows], width),
-    }
+    return Segments(
+        interval=np.where(padding, 0.0, last_repeated(np.concatenate([[0.0], np.diff(log.time[rows])]), width)),
+        valid=(~padding).astype(float),
+        command=last_repeated(np.clip(log.command[rows], 0, 1), width),
+        doubt=np.concatenate([doubt, np.zeros((1 + width - count, 4))]),
+        excess=np.zeros((width, 4)),
+        rotor_speed=last_repeated(speed, width),
+        measured=np.array(float(measured)),
+        warm_up=(np.arange(width) < lead).astype(float),
+        body_rate=last_repeated(log.body_rate[rows], width),
+        specific_force=last_repeated(log.specific_force[rows], width),
+    )
 
 
 def _unforetold(time: np.ndarray, command: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.devices import mapped
 from cfb_mjx.model import rotors
 from cfb_mjx.model.quadrotor import at_rotor_center, wrench_of
+from cfb_mjx.model.state import AnyArray
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.identification.filters import (
@@ -147,7 +148,7 @@ def _unlogged(parameters: Parameters, noise: Noise, piece: Segments, use_measure
     """Rotor errors that the filters must allow for: of the first row, and of commands that were not logged."""
     interval, lag = piece.interval[1:], jnp.mean(parameters.motor_time_constant)
     decay = jnp.exp(-interval / lag)
-    counts = 1.0 - piece.measured * use_measured
+    counts = 1.0 - jnp.asarray(piece.measured) * use_measured
     missed = noise.command * (parameters.motor_gain * piece.doubt[:-1]) * (1 - decay)[:, None]
     speed = jnp.mean(parameters.motor_gain * piece.command + parameters.motor_speed_offset, axis=0)
     lift, drag = (
@@ -191,11 +192,11 @@ def as_held(parameters: Parameters, hold: Float[Array, ""] | None, segments: Seg
     ratio = jnp.concatenate([jnp.ones_like(safe[:, :1]), safe[:, :-1] / safe[:, 1:]], axis=1)
     bend = (step - jnp.concatenate([step[:, :1], step[:, :-1]], axis=1) / ratio) / (1 + ratio)
     between = share * step - (1 - held**2) / 6 * bend
-    command = segments.command.at[:, :-1].add(jnp.where(interval > 0, between, 0.0))
+    command = jnp.asarray(segments.command).at[:, :-1].add(jnp.where(interval > 0, between, 0.0))
     # Later ones count for more in the rotors' speed at the next row, and for no more in their mean on the way there.
-    excess = segments.excess.at[:, :-1].set(jnp.where(interval > 0, -later * step, 0.0))
+    excess = jnp.asarray(segments.excess).at[:, :-1].set(jnp.where(interval > 0, -later * step, 0.0))
     unsure = jnp.sqrt(jnp.clip(1 - held**2, 0.0, 1.0)) * segments.doubt[:, :-1]
-    doubt = segments.doubt.at[:, :-1].set(jax.lax.stop_gradient(unsure))
+    doubt = jnp.asarray(segments.doubt).at[:, :-1].set(jax.lax.stop_gradient(unsure))
     return eqx.tree_at(lambda s: (s.command, s.excess, s.doubt), segments, (command, excess, doubt))
 
 
@@ -207,7 +208,7 @@ class Weights(NamedTuple):
     """
 
     parameters: Parameters
-    doubt: Float[Array, "s n 4"]
+    doubt: Float[AnyArray, "s n 4"]
     """Of the commands (`Segments.doubt`)."""
     variance: Float[Array, "s n 8"]
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -80,7 +79,7 @@ class Noise(eqx.Module):
     def first(data: FlightData) -> Noise:
         """Where a fit starts: sensors as their third differences show, the rest as seen on real flights."""
         rotor = data.rotor_speed_noise if np.isfinite(data.rotor_speed_noise) else 10.0
-        levels = Noise(
+        levels = dict(
             gyro=np.maximum(data.rate_noise, 1e-3),
             rate_walk=np.full(3, 0.3),
             disturbance=np.full(3, 4.0),
@@ -94,4 +93,4 @@ class Noise(eqx.Module):
             command=2 * UNTIMED,
         )
         # An explicit type: weakly typed numbers would compile every program twice.
-        return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), levels)
+        return Noise(**{name: jnp.asarray(level, jnp.result_type(float)) for name, level in levels.items()})

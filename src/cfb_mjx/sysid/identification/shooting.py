@@ -79,6 +79,7 @@ def shoot(
     body = RigidBody() if body is None else body
     # Placed as the rounds return it, or the second would compile anew.
     vector = unknowns.start if over is None else over.whole(unknowns.start)
+    whiten: list[Array] = []
     for done in range(ROUNDS):
         before = vector
         if delayed and done:

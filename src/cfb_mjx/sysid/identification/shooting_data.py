@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.devices import Devices
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.state import State
+from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.identification.flight_data import white_noise
 from cfb_mjx.sysid.windows import Windows, find_windows
 
@@ -85,7 +86,7 @@ def _divided(batch: Batch, over: Devices) -> Batch:
 
 
 def _arrays(log: FlightLog, windows: Windows, chosen: np.ndarray, measured: bool) -> dict:
-    lead = [_lead(log, windows.start[i], windows.row[i]) for i in chosen]
+    lead = [_lead(log, float(windows.start[i]), int(windows.row[i])) for i in chosen]
     width = max(len(step) for step, _ in lead)
     speed = windows.rotor_speed[chosen]
     names = ("position", "velocity", "quaternion", "body_rate")
@@ -167,4 +168,4 @@ def _noise(log: FlightLog) -> np.ndarray:
 
 
 def _rotor_noise(log: FlightLog) -> float:
-    return max(float(np.nanmean(white_noise(log.rotor_speed))), 1e-3)
+    return max(float(np.nanmean(white_noise(not_none(log.rotor_speed)))), 1e-3)

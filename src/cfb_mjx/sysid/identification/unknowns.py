@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 
 UNITS = {
@@ -148,13 +149,14 @@ def _inertia(nominal: Float[Array, "3"], change: tuple[Array | None, ...]) -> Fl
     if not free:
         return nominal
     if len(free) == 3:
-        moments = moments * jnp.exp(jnp.stack(change))
+        moments = moments * jnp.exp(jnp.stack([not_none(x) for x in change]))
     elif len(free) == 2:
         # The fixed axis k holds m_i + m_j: the ratio of these two is one unknown, m_k the other. The unknowns are
         # turned so that each moves its own axis first.
         i, j = free
         k = 3 - i - j
-        split, rest = change[j] - change[i], change[i] + change[j]
+        own, other = not_none(change[i]), not_none(change[j])
+        split, rest = other - own, own + other
         share = jax.nn.sigmoid(jnp.log(moments[i] / moments[j]) + split)
         moments = moments.at[i].set(nominal[k] * share).at[j].set(nominal[k] * (1 - share))
         moments = moments.at[k].multiply(jnp.exp(rest))
@@ -163,7 +165,7 @@ def _inertia(nominal: Float[Array, "3"], change: tuple[Array | None, ...]) -> Fl
         i = free[0]
         j, k = (n for n in range(3) if n != i)
         most = jnp.minimum(nominal[j], nominal[k])
-        own = most * jax.nn.sigmoid(jnp.log(moments[i] / (most - moments[i])) - change[i])
+        own = most * jax.nn.sigmoid(jnp.log(moments[i] / (most - moments[i])) - not_none(change[i]))
         moments = moments.at[i].set(own).at[j].set(nominal[k] - own).at[k].set(nominal[j] - own)
     return jnp.sum(moments) - moments
 

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -207,7 +206,7 @@ def refine(
     Raises:
         CfbError: no numbers, no 64-bit numbers, or no log that allows a window.
     """
-    if not jax.config.jax_enable_x64:
+    if jnp.result_type(float) != np.float64:
         raise CfbError('refine needs 64-bit numbers: jax.config.update("jax_enable_x64", True) before anything else.')
     if not numbers:
         raise CfbError("refine needs at least one number to fit; name an effect.")
@@ -217,17 +216,17 @@ def refine(
     data = Predictions.of(model, [faults.repaired(log) for log in logs], shares / shares.mean(), most_windows)
     low, high, scale = bounds(numbers)
     values = np.clip([n.of(model) for n in numbers], low, high)
-    trims = np.array([(trims or {}).get(log.name, np.zeros(3)) for log in logs])
+    turns = np.array([(trims or {}).get(log.name, np.zeros(3)) for log in logs])
     start, damping = values.copy(), 1e-2
     model = with_values(model, numbers, values)
     data = data.started(model)
-    first = cost = data.cost(model, trims)
+    first = cost = data.cost(model, turns)
     for step in range(iterations):
-        normal = data.normal_equations(model, numbers, values, trims, trimmed)
+        normal = data.normal_equations(model, numbers, values, turns, trimmed)
         better = None
         while damping < 1e6:
-            change, turn = normal.step(damping, (values - start) / scale, trims / TRIM, values, low, high)
-            tried, other = np.clip(values + change * scale, low, high), trims + turn * TRIM
+            change, turn = normal.step(damping, (values - start) / scale, turns / TRIM, values, low, high)
+            tried, other = np.clip(values + change * scale, low, high), turns + turn * TRIM
             moved = with_values(model, numbers, tried)
             began = data.started(moved)
             reached = began.cost(moved, other)
@@ -238,14 +237,14 @@ def refine(
         if better is None:
             break
         gained, damping = cost - better[2], damping / 4
-        values, trims, cost, model, data = better
+        values, turns, cost, model, data = better
         progress(f"step {step + 1}: mean loss {cost:.4f}")
         if gained < 1e-4 * cost:
             break
-    normal = data.normal_equations(model, numbers, values, trims, trimmed)
+    normal = data.normal_equations(model, numbers, values, turns, trimmed)
     deviations = normal.deviations(values, low, high, scale)
     found = Quadrotor(model.parameters, model.effects[:-1], body=model.body)
-    named = {log.name: trim for log, trim in zip(logs, trims, strict=True)}
+    named = {log.name: trim for log, trim in zip(logs, turns, strict=True)}
     return Refinement(found, numbers, values, deviations, named, (first, cost), normal, data)
 
 

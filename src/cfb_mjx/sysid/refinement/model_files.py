@@ -47,7 +47,9 @@ def by_innovations(
     rows, mappings = {}, _mappings(found.effects, _kept(base, names) | found.uncertainty)
     for mapping in mappings:
         std = mapping.get("uncertainty")
-        for field, value in mapping["parameters"].items() if std and mapping["name"] in names else ():
+        if not std or mapping["name"] not in names:
+            continue
+        for field, value in mapping["parameters"].items():
             low, high = bounds(mapping["name"], field)
             for name, (v, s) in _pairs(f"{mapping['name']}.{field}", value, std.get(field)).items():
                 rows[name] = {"value": v, "std": s, "at_bound": not low < v < high}

@@ -17,6 +17,7 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.model.effects import Condition, Effect, Wrench
 from cfb_mjx.model.effects.base import overrides
+from cfb_mjx.model.state import AnyArray
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.sysid.flight import MEASURED_SHARE, Flight, delay_of, prepare_flight
 from cfb_mjx.sysid.metrics import BLOCK, errors
@@ -335,7 +336,7 @@ def _norms(predicted: State, windows: Windows) -> np.ndarray:
     return np.stack([np.radians(found["attitude"]), found["velocity"]], axis=-1)
 
 
-def _rotation_vector(frm: Array, to: Array) -> Array:
+def _rotation_vector(frm: AnyArray, to: AnyArray) -> Array:
     """(..., 3) rotation that turns one attitude into another, rad."""
     scalar = jnp.sum(frm * to, axis=-1)
     vector = frm[..., :1] * to[..., 1:] - to[..., :1] * frm[..., 1:] - jnp.cross(frm[..., 1:], to[..., 1:])

@@ -39,6 +39,7 @@ def common_lag(full: Optimum, data: MotorData) -> tuple[float, float]:
     vector = np.array(full.vector)
     motor = full.motor
     vector[2:4], vector[4] = np.log(max(0.5 * (motor.spin_up + motor.spin_down) + motor.dead_time, 2e-3)), 0.0
+    slope = np.zeros_like(goal)
     for _ in range(12):
         found, slope = (np.asarray(x) for x in _response(jnp.asarray(vector), tracks))
         slope = slope[..., 2] + slope[..., 3]

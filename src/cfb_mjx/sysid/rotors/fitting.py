@@ -20,7 +20,7 @@ from cfb_mjx.sysid.identification.result import Estimate, numbers_of
 from cfb_mjx.sysid.rotors.motors import ENTRIES, MotorFit
 from cfb_mjx.sysid.rotors.rotor_maps import MapFit
 from cfb_mjx.sysid.rotors.steady import SteadyFit, fit_steady
-from cfb_mjx.sysid.rotors.supply import fit_under_supply
+from cfb_mjx.sysid.rotors.supply import Extras, fit_under_supply
 from cfb_mjx.sysid.rotors.tables import fit_maps, require_one_rotor
 from cfb_mjx.sysid.rotors.thrust_in_flight import ThrustInFlight, thrust_in_flight
 
@@ -49,9 +49,8 @@ class RotorFit:
     def entries(self) -> dict[str, tuple[np.ndarray, np.ndarray | None]]:
         """What a model file takes over, with standard deviations where known."""
         found: dict[str, tuple[np.ndarray, np.ndarray | None]] = {}
-        for name in ENTRIES if self.motors else ():
-            if (told := self.motors.values(name)) is not None:
-                found[name] = told
+        if self.motors is not None:
+            found |= {name: told for name in ENTRIES if (told := self.motors.values(name)) is not None}
         if self.steady is not None:
             found["motor_gain"] = np.asarray(self.steady.gain), np.asarray(self.steady.gain_std)
             found["motor_speed_offset"] = np.asarray(self.steady.offset), np.asarray(self.steady.offset_std)
@@ -139,7 +138,7 @@ def fit_rotors(
     nominal, notes = base.parameters(), list(files.notes)
     motors = steady = None
     if files.records:
-        extras = {"offset": offset, "asymmetric": asymmetric, "dead_time": dead_time}
+        extras = Extras(offset=offset, asymmetric=asymmetric, dead_time=dead_time)
         motors, said = fit_under_supply(files.records, nominal, per_motor=per_motor, progress=progress, **extras)
         notes += said
     if files.points and not files.records:

@@ -11,6 +11,7 @@ import numpy as np
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.bench_tables import MotorRecord, record_of
 from cfb_mjx.model.effects import BatterySag, CommandDelay, Effect
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Entry, Parameters
 from cfb_mjx.sysid.rotors.motors import ENTRIES
 from cfb_mjx.sysid.rotors.supply import SURE, fit_with_sag
@@ -110,7 +111,6 @@ def _middle(log: FlightLog, rows: int) -> MotorRecord:
     skipped = max(0, (len(log) - rows) // 2)
     part = log.rows(np.arange(skipped, len(log) - skipped))
     voltage = part.battery_voltage
-    known = None if voltage is None else np.isfinite(voltage)
-    if known is not None and known.any():
+    if voltage is not None and (known := np.isfinite(voltage)).any():
         voltage = np.interp(part.time, part.time[known], voltage[known])
-    return replace(record_of(part), battery_voltage=voltage)
+    return replace(not_none(record_of(part)), battery_voltage=voltage)

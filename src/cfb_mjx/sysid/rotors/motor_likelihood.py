@@ -69,14 +69,15 @@ class Optimum:
     def value(self, name: str) -> float:
         """A constant, SI."""
         motor = self.motor
-        return {
+        found = {
             "motor_gain": motor.gain,
             "motor_speed_offset": motor.offset,
             "motor_time_constant": motor.spin_up,
             "spin_up_time_constant": motor.spin_up,
             "spin_down_time_constant": motor.spin_down,
             "dead_time": motor.dead_time,
-        }[name]
+        }
+        return float(found[name])
 
     def std(self, name: str) -> float:
         """Standard deviation of a free constant, SI."""

@@ -48,10 +48,11 @@ def replay(fit: MotorFit) -> list[Replay]:
         error = (tracks.rotor_speed - simulated)[judged]
         # A scrap of a flight shows little, however much the command moves in it.
         enough = judged.sum(axis=1) >= 0.5 * judged.sum(axis=1).max()
-        moves = [np.std(c[j]) if ok else -1.0 for c, j, ok in zip(tracks.command, judged, enough, strict=True)]
+        moves = [float(np.std(c[j])) if ok else -1.0 for c, j, ok in zip(tracks.command, judged, enough, strict=True)]
         shown = int(np.argmax(moves))
         rows = slice(0, int(np.flatnonzero(judged[shown])[-1]) + 1)
         measured = np.where(tracks.measured[shown] > 0, tracks.rotor_speed[shown], np.nan)
         columns = (tracks.time[shown], tracks.command[shown], measured, simulated[shown])
-        found.append(Replay(number, *(c[rows] for c in columns), float(np.sqrt(np.mean(error**2)))))
+        time, command, measured, alone = (np.asarray(column)[rows] for column in columns)
+        found.append(Replay(number, time, command, measured, alone, float(np.sqrt(np.mean(error**2)))))
     return found

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from cfb_mjx.logs.bench_tables import MotorRecord
+from cfb_mjx.model.state import AnyArray
 from cfb_mjx.sysid.identification.flight_data import white_noise
 
 ROWS = 512
@@ -23,14 +24,14 @@ FEWEST_ROWS = 24
 class Tracks(eqx.Module):
     """S pieces, each of one motor, N rows; the last row of a short piece is repeated."""
 
-    time: Float[Array, "s n"]
+    time: Float[AnyArray, "s n"]
     """Since the piece's first row, s."""
-    command: Float[Array, "s n"]
-    rotor_speed: Float[Array, "s n"]
+    command: Float[AnyArray, "s n"]
+    rotor_speed: Float[AnyArray, "s n"]
     """rad/s; 0 where not measured."""
-    measured: Float[Array, "s n"]
+    measured: Float[AnyArray, "s n"]
     """1 where a rotor speed was measured; 0 elsewhere, in the padding and at the first row, which starts the filter."""
-    judged: Float[Array, "s n"]
+    judged: Float[AnyArray, "s n"]
     """1 for measured rows behind the warm-up."""
 
 

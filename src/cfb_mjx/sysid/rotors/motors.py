@@ -142,8 +142,9 @@ class MotorFit:
         A motor that was not fitted, or whose own data do not tell the constant, gets the common one.
         """
         groups = [self.motors.get(i, self.common) for i in range(1, 5)]
-        found = [g.estimates.get(name, self.common.estimates.get(name)) for g in groups]
-        if any(e is None for e in found):
+        each = (g.estimates.get(name, self.common.estimates.get(name)) for g in groups)
+        found = [e for e in each if e is not None]
+        if len(found) < len(groups):
             return None
         return np.array([e.value for e in found]), np.array([e.std for e in found])
 

@@ -8,6 +8,7 @@ its own on the common curve (mean one), and outliers are weighed down (Huber, Ro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -154,12 +155,12 @@ def fit_map(
     while True:
         weight, noise = np.ones(len(speed)), unit
         design = np.concatenate([powers(speed, sigma), np.ones((len(speed), int(shared)))], axis=1)
-        theta, scale = np.zeros(design.shape[1]), np.ones(len(motors))
+        theta, scale, residual = np.zeros(design.shape[1]), np.ones(len(motors)), value
+        free = len(speed) - design.shape[1] - max(len(motors) - 1, 0)
         for _ in range(_ITERATIONS):
             before = np.concatenate([theta, scale])
             theta, scale = _least_squares(design, member, value, np.sqrt(weight) / unit, scale)
             residual = value - _slopes(design, member, scale) @ theta
-            free = len(speed) - design.shape[1] - max(len(motors) - 1, 0)
             noise = given if given is not None else np.full(len(speed), _spread(residual, free, robust))
             if robust:
                 ratio = np.abs(residual) / noise
@@ -240,7 +241,15 @@ def _spread(residual: np.ndarray, free: int, robust: bool) -> float:
     return max(float(np.sqrt(residual @ residual / free)), 1e-12)
 
 
-def _covariance(design, member, theta, scale, residual, noise, robust: bool) -> np.ndarray:
+def _covariance(
+    design: np.ndarray,
+    member: np.ndarray,
+    theta: np.ndarray,
+    scale: np.ndarray,
+    residual: np.ndarray,
+    noise: np.ndarray,
+    robust: bool,
+) -> np.ndarray:
     """Of the coefficients, the offset if there is one, and the factors, whose mean is fixed."""
     count, k = member.shape[1], design.shape[1]
     curve = (design[:, :3] @ theta[:3])[:, None]
@@ -250,7 +259,7 @@ def _covariance(design, member, theta, scale, residual, noise, robust: bool) -> 
     if count:
         within = np.linalg.svd(np.ones((1, count)))[2][1:].T
         basis = np.block([[np.eye(k), np.zeros((k, count - 1))], [np.zeros((count, k)), within]])
-    triangle = np.linalg.qr((slopes / noise[:, None]) @ basis, mode="r")
+    triangle = cast(np.ndarray, np.linalg.qr((slopes / noise[:, None]) @ basis, mode="r"))
     inverse = np.linalg.inv(triangle)
     covariance = basis @ (inverse @ inverse.T) @ basis.T
     if not robust:

@@ -7,6 +7,7 @@ bench where the battery sags by a volt that leaves 10 rad/s where a line in u al
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 
@@ -74,8 +75,8 @@ def fit_steady(tables: list[SteadyPoints]) -> SteadyFit:
         raise CfbError(
             f"{label}: {len(u)} steady points at {levels} different commands; a line needs {_FEWEST} at {_LEVELS}."
         )
-    known = all(t.battery_voltage is not None for t in tables)
-    voltage = np.concatenate([t.battery_voltage for t in tables]) if known else None
+    voltages = [t.battery_voltage for t in tables if t.battery_voltage is not None]
+    voltage = np.concatenate(voltages) if len(voltages) == len(tables) else None
     plain = _line(u, omega, u)
     scaled = None if voltage is None or np.std(voltage) < VARIES else _line(u * voltage, omega, u)
     if scaled is None or scaled[2] > plain[2]:  # a controller that keeps the speed does not follow the voltage
@@ -106,9 +107,8 @@ def _line(x: np.ndarray, y: np.ndarray, setting: np.ndarray) -> tuple[np.ndarray
     design = np.stack([np.ones_like(x), x], axis=1)
     size = np.array([1000.0, 1000.0 / max(float(np.abs(x).max()), 1e-9)])
     start = np.linalg.lstsq(design, y, rcond=None)[0]
-    theta = least_squares(
-        lambda t: design @ t - y, start, jac=lambda t: design, loss="soft_l1", f_scale=1.0, x_scale=size
-    ).x
+    slopes = cast(Any, lambda t: design)
+    theta = least_squares(lambda t: design @ t - y, start, jac=slopes, loss="soft_l1", f_scale=1.0, x_scale=size).x
     good = np.ones(len(y), dtype=bool)
     for _ in range(20):
         residual = y - design @ theta

@@ -5,11 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TypedDict, Unpack
 
 import numpy as np
 
 from cfb_mjx.logs.bench_tables import MotorRecord
 from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE, BatterySag
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.rotors.motors import MotorFit, each_motor, fit_again, fit_motors
 from cfb_mjx.sysid.rotors.steady import VARIES
@@ -18,12 +20,20 @@ SURE = 3.0
 """Standard deviations a slope must be away from nothing."""
 
 
+class Extras(TypedDict, total=False):
+    """What `fit_motors` may be asked for beside lag and gain."""
+
+    offset: bool
+    asymmetric: bool
+    dead_time: bool
+
+
 def fit_under_supply(
     records: Sequence[MotorRecord],
     nominal: Parameters,
     per_motor: bool = False,
     progress: Callable[[int, int], None] | None = None,
-    **extras: bool,
+    **extras: Unpack[Extras],
 ) -> tuple[MotorFit, list[str]]:
     """Motors from commands, or from commands times voltage where all records have one that changes and it is likelier.
 
@@ -45,9 +55,10 @@ def fit_under_supply(
         return each_motor(fit, nominal, progress) if per_motor else fit
 
     plain = fit_motors(records, nominal, **extras)
-    if not _voltage_tells(records):
+    if (voltages := _telling_voltages(records)) is None:
         return finished(plain), []
-    scaled = [replace(r, command=r.command * r.battery_voltage[:, None] / NOMINAL_VOLTAGE) for r in records]
+    pairs = zip(records, voltages, strict=True)
+    scaled = [replace(r, command=r.command * voltage[:, None] / NOMINAL_VOLTAGE) for r, voltage in pairs]
     followed = fit_motors(scaled, nominal, **extras)
     gained = plain.common.optimum.loss - followed.common.optimum.loss
     if gained <= 0:
@@ -76,7 +87,9 @@ LAGS = (0.02, 3.0)
 """Of what the rotors feel behind the battery's voltage, s: every dip under load, or how empty it is."""
 
 
-def fit_with_sag(records: Sequence[MotorRecord], nominal: Parameters, **extras: bool) -> tuple[MotorFit, Sag | None]:
+def fit_with_sag(
+    records: Sequence[MotorRecord], nominal: Parameters, **extras: Unpack[Extras]
+) -> tuple[MotorFit, Sag | None]:
     """Every motor on its own, and how far all follow the battery's voltage (``battery_sag``).
 
     A speed that follows the voltage is, divided by ``1 + slope (V - 3.7 V) / 3.7 V``, that of a motor that does not.
@@ -94,7 +107,7 @@ def fit_with_sag(records: Sequence[MotorRecord], nominal: Parameters, **extras: 
         CfbError: as `fit_motors`.
     """
     fit = fit_motors(records, nominal, **extras)
-    if not _voltage_tells(records):
+    if _telling_voltages(records) is None:
         return each_motor(fit, nominal), None
 
     def divided(slope: float, lag: float) -> tuple[MotorFit, float]:
@@ -121,18 +134,19 @@ def fit_with_sag(records: Sequence[MotorRecord], nominal: Parameters, **extras: 
     return each_motor(best[0], nominal), best[1]
 
 
-def _voltage_tells(records: Sequence[MotorRecord]) -> bool:
-    """Whether all records have a voltage, and it changes enough."""
-    voltages = [r.battery_voltage for r in records]
-    known = all(v is not None and np.isfinite(v).all() for v in voltages)
-    return bool(known and np.std(np.concatenate(voltages)) >= VARIES)
+def _telling_voltages(records: Sequence[MotorRecord]) -> list[np.ndarray] | None:
+    """The voltages of all records; None unless all have one and it changes enough."""
+    voltages = [v for r in records if (v := r.battery_voltage) is not None and np.isfinite(v).all()]
+    tells = len(voltages) == len(records) and np.std(np.concatenate(voltages)) >= VARIES
+    return voltages if tells else None
 
 
 def _felt(record: MotorRecord, lag: float) -> np.ndarray:
     """(n,) voltage through a first-order filter, V, from the first reading on."""
+    voltage = not_none(record.battery_voltage)
     felt = np.empty(len(record.time))
-    felt[0] = record.battery_voltage[0]
+    felt[0] = voltage[0]
     kept = np.exp(-np.diff(record.time) / lag)
-    for i, (now, share) in enumerate(zip(record.battery_voltage[1:], kept, strict=True)):
+    for i, (now, share) in enumerate(zip(voltage[1:], kept, strict=True)):
         felt[i + 1] = now + (felt[i] - now) * share
     return felt

@@ -8,6 +8,7 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.bench_tables import MapTable
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import ModelFile, load_model_file, preset_names
 from cfb_mjx.sysid.rotors.rotor_maps import MapFit, fit_map, powers
 
@@ -28,14 +29,15 @@ def require_one_rotor(tables: Sequence[MapTable], base: ModelFile) -> None:
         if ratio is None:
             continue
         top = int(np.argmax(table.rotor_speed))
-        point = f"{table.force[top]:.3g} N at {table.rotor_speed[top]:.0f} rad/s"
+        point = f"{not_none(table.force)[top]:.3g} N at {table.rotor_speed[top]:.0f} rad/s"
         if ratio > _FOUR_LEAST:
             raise CfbError(
                 f"{table.name}: {point} is {ratio:.1f} times what one rotor of {base.name} pulls, so it is the thrust "
                 "of four; give --rotors 4."
             )
-        others = {name: _pull(table, load_model_file(name)) for name in preset_names() if ratio < 1 / _FOUR_LEAST}
-        like = min((n for n, r in others.items() if r), key=lambda n: abs(np.log(others[n])), default=None)
+        asked = preset_names() if ratio < 1 / _FOUR_LEAST else ()
+        others = {name: pull for name in asked if (pull := _pull(table, load_model_file(name)))}
+        like = min(others, key=lambda n: abs(np.log(others[n])), default=None)
         if like is not None and 1 / _FOUR_LEAST < others[like] < _FOUR_LEAST:
             raise CfbError(
                 f"{table.name}: {point} is {ratio:.2f} of what a rotor of {base.name} pulls and {others[like]:.2f} of "

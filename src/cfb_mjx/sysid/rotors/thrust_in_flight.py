@@ -16,6 +16,7 @@ from scipy.signal import butter, sosfiltfilt
 
 from cfb_mjx.logs import FlightLog, rotation
 from cfb_mjx.model import rotors
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 
 _CUT = 4.0  # Hz: above it vibration and the blades' unevenness outweigh what the drone does
@@ -71,10 +72,11 @@ def thrust_in_flight(logs: Sequence[FlightLog], parameters: Parameters) -> Thrus
 
 def _parts(log: FlightLog, parameters: Parameters) -> list[tuple[np.ndarray, np.ndarray]]:
     """Columns (n, 3) and force (n,) N of every part of `_BLOCK` s, below `_CUT` Hz."""
-    known = np.isfinite(log.rotor_speed).all(axis=1)
+    measured = not_none(log.rotor_speed)
+    known = np.isfinite(measured).all(axis=1)
     if known.sum() < 2:
         return []
-    speed = np.stack([np.interp(log.time, log.time[known], s[known]) for s in log.rotor_speed.T], axis=1)
+    speed = np.stack([np.interp(log.time, log.time[known], s[known]) for s in measured.T], axis=1)
     velocity = rotation.to_body(rotation.tidy(log.quaternion), log.velocity)
     thrust = np.asarray(rotors.thrust(parameters, jnp.asarray(speed))).sum(axis=1)
     signals = np.stack(
@@ -109,7 +111,7 @@ def _fitted(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, flo
     """Huber's fit, and the rms of what it leaves."""
     columns, force = (np.concatenate(x) for x in zip(*parts, strict=True))
     weight = np.ones(len(force))
-    values = np.zeros(3)
+    values, left = np.zeros(3), force
     for _ in range(_ROUNDS):
         root = np.sqrt(weight)
         new = np.linalg.lstsq(columns * root[:, None], force * root, rcond=None)[0]

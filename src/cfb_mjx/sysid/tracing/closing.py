@@ -9,6 +9,7 @@ import numpy as np
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
 from cfb_mjx.sysid.flight import usual_delay
@@ -118,7 +119,7 @@ def _whole(
 
 def _stands(entry: Reported, part: Part, rules: Rules = RULES) -> bool:
     """Whether held-out flights bear an effect out; one that the rotor speeds tell must only not be refuted by them."""
-    return entry.verdict.t >= (-rules.doubtful if part.told else rules.doubtful)
+    return not_none(entry.verdict).t >= (-rules.doubtful if part.told else rules.doubtful)
 
 
 def _reported(search: Search, part: Part, after: Evaluation, held_out: list[FlightLog]) -> Reported:

@@ -21,6 +21,7 @@ import numpy as np
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import SENSOR_FAULTS, effect_to_mapping
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Entry, ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, before_and_after
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
@@ -258,7 +259,7 @@ class Diagnosis:
 
     def without(self, item: Reported) -> Hypothesis | None:
         """The best model without an effect; None for a fault of pose or gyro."""
-        if item.found is None or item.found.without is None:
+        if item.found is None:
             return None
         if self.unexplained is not None and self.unexplained.proposal is not None:
             # That was fitted before the formula; beside it only this effect may go.
@@ -326,10 +327,11 @@ class Diagnosis:
 
     def _moved(self, item: Mapping[str, Any]) -> Mapping[str, Any]:
         """A declared effect as the drone has it: where the type's spread let it move, with its own numbers."""
-        if item["name"] not in self.together.typical:
+        together = not_none(self.together)
+        if item["name"] not in together.typical:
             return item
         own = effect_to_mapping(self.hypothesis.effect(item["name"]))
-        return {**item, "parameters": own["parameters"], "uncertainty": self.together.fit.uncertainty(item["name"])}
+        return {**item, "parameters": own["parameters"], "uncertainty": together.fit.uncertainty(item["name"])}
 
 
 def _per_log(evaluation: Evaluation) -> list[dict[str, float] | None]:

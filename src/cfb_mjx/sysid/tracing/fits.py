@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array
 from scipy.stats import norm
 
+from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.evaluation import Evaluation, evaluate
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.tracing.hypothesis import Fit, Hypothesis
@@ -33,7 +34,7 @@ def predicted(search: Search, hypothesis: Hypothesis) -> Evaluation:
 
 def errors_of(evaluation: Evaluation) -> np.ndarray:
     """(8,) `ERRORS` over all flights."""
-    metrics = evaluation.metrics("commands_in")
+    metrics = not_none(evaluation.metrics("commands_in"))
     return np.array([metrics[key] for key in ERRORS])
 
 
@@ -44,7 +45,7 @@ def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
 
 def beside_hold(evaluation: Evaluation) -> float:
     """The larger of attitude and velocity error at the last horizon (means), over what hold errs there."""
-    model, still = (evaluation.metrics(variant) for variant in ("commands_in", "hold"))
+    model, still = (not_none(evaluation.metrics(variant)) for variant in ("commands_in", "hold"))
     keys = [f"{quantity}@{max(evaluation.horizons):g}s" for quantity in ("attitude_mean_deg", "velocity_mean_mps")]
     found = max(model[key] / still[key] for key in keys)
     return float(found) if np.isfinite(found) else np.inf
@@ -126,4 +127,5 @@ def _matched(search: Search, poorer: Hypothesis, richer: Hypothesis) -> Iterator
     for log in search.logs:
         logs = [hypothesis.faults.repaired(log) for hypothesis in (poorer, richer)]
         both = np.intersect1d(logs[0].time, logs[1].time)
-        yield tuple(prepare_flight(one.rows(np.isin(one.time, both)), *search.delays) for one in logs)
+        one, other = (prepare_flight(log.rows(np.isin(log.time, both)), *search.delays) for log in logs)
+        yield one, other

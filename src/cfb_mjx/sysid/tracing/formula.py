@@ -110,13 +110,19 @@ class _Axis:
         return picked
 
 
+def _place(column: Column) -> tuple[int, int]:
+    """Axis and signal of a term, as numbers."""
+    assert isinstance(column.index, tuple), "every term of the library has an axis and a signal"
+    return column.index
+
+
 def _square(column: Column) -> bool:
     """Whether it is the square of a coordinate: alone it would say that the origin of the room means something."""
-    return column.field == "place" and list(PLACES)[column.index[1]].endswith("^2")
+    return column.field == "place" and list(PLACES)[_place(column)[1]].endswith("^2")
 
 
 def _coordinate(column: Column) -> str | None:
-    return list(PLACES)[column.index[1]].removesuffix("^2") if column.field == "place" else None
+    return list(PLACES)[_place(column)[1]].removesuffix("^2") if column.field == "place" else None
 
 
 def _families(library: list[Column]) -> list[list[Column]]:
@@ -124,7 +130,7 @@ def _families(library: list[Column]) -> list[list[Column]]:
     found = []
     for name, groups in FAMILIES.items():
         signals = list(TERMS if name == "body_terms" else PLACES)
-        named = {signals[c.index[1]]: c for c in library if c.field == name}
+        named = {signals[_place(c)[1]]: c for c in library if c.field == name}
         found += [[named[s] for s in group] for group in groups if set(group) <= set(named)]
     return found
 
@@ -147,7 +153,7 @@ class Term:
 
 def describe(column: Column) -> tuple[str, str, str]:
     """Axis, signal and unit of the coefficient of a term."""
-    i, j = column.index
+    i, j = _place(column)
     if column.field == "place":
         signal, unit = list(PLACES.items())[j]
         return f"world force_{'xyz'[i]}", signal, _per("N", unit)
@@ -161,13 +167,16 @@ def _per(unit: str, signal: str) -> str:
 
 def fit_formula(search: Search, hypothesis: Hypothesis, terms: list[Column]) -> tuple[Hypothesis, np.ndarray]:
     """Fit the terms together with everything found; the hypothesis and the terms' standard deviations."""
-    richer = replace(hypothesis, terms=tuple(terms))
-    for _ in range(2):
-        own = search.own_columns(richer)
-        linear = search.linearise(richer, own)
+
+    def step(at: Hypothesis) -> tuple[Hypothesis, list[Column], Linear, list[int], np.ndarray]:
+        own = search.own_columns(at)
+        linear = search.linearise(at, own)
         index = linear.index(own)
         values = solve(linear.blocks.sum(0), index, linear.scale)
-        richer = search.moved(richer, own, np.concatenate([[0.0], values * linear.scale[index]]))
+        return search.moved(at, own, np.concatenate([[0.0], values * linear.scale[index]])), own, linear, index, values
+
+    first, *_ = step(replace(hypothesis, terms=tuple(terms)))
+    richer, own, linear, index, values = step(first)
     prior = Prior.weak(1 + len(index)).pulled(0, 0.0, 1 / LEAD_SPREAD**2)
     spread = covariance(linear.blocks, [1, *index], linear.scale, np.concatenate([[0.0], values]), prior)
     deviation = np.sqrt(np.diag(spread))[1:] * linear.scale[index]
@@ -277,9 +286,9 @@ def only_there(held_out: Search, hypothesis: Hypothesis) -> list[Term]:
         return []
     plain, _ = fit_formula(widened, base, [])
     richer, deviation = fit_formula(widened, base, chosen.sure)
-    three = [prediction_errors(widened, each) for each in (plain, richer, widened.nothing())]
+    before, after, first = (prediction_errors(widened, each) for each in (plain, richer, widened.nothing()))
     alone = held_out.rules.there_alone
-    return terms_of(richer, deviation, chosen.gains) if enough(*three, alone, alone) else []
+    return terms_of(richer, deviation, chosen.gains) if enough(before, after, first, alone, alone) else []
 
 
 def _material(
@@ -322,4 +331,4 @@ def _with_rare(
 def _constant_forces(terms: list[Column]) -> list[Column]:
     """Constant forces along the world's axes that are not among the terms."""
     places = [c for axis in (3, 4, 5) for c in term_columns(axis) if c.field == "place"]
-    return [c for c in places if c.index[1] == 0 and c not in terms]
+    return [c for c in places if _place(c)[1] == 0 and c not in terms]

@@ -5,6 +5,7 @@ Strengths and shapes of every effect of the catalogue are one column each.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
@@ -40,7 +41,7 @@ class Column:
     field: str
     index: int | tuple[int, int] | None
     probe: tuple[tuple[str, float], ...] = ()
-    scale: float = field(default=1.0, compare=False)
+    scale: float = dataclasses.field(default=1.0, compare=False)
     """Half the prior range: the unit in which the search counts."""
 
 

@@ -24,8 +24,9 @@ from cfb_mjx.logs.rotation import to_world
 from cfb_mjx.model.effects import Condition, Effect, Wrench
 from cfb_mjx.model.effects.formula import body_signals, place_signals
 from cfb_mjx.model.quadrotor import Quadrotor, at_rotor_center, in_still_air, prepare
-from cfb_mjx.model.state import State, unstack
+from cfb_mjx.model.state import AnyArray, State, unstack
 from cfb_mjx.model.vector import Vec, rotate_inverse
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import ROWS, Flight, lengthened
 from cfb_mjx.sysid.identification.flight_data import white_noise
@@ -74,7 +75,7 @@ def predicted(flight: Flight, said: Replay, gravity: float) -> Signals:
     dt = flight.interval[:, None]
     middle = between(flight.quaternion)
     middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)
-    world = to_world(middle, said.specific_force)
+    world = to_world(middle, np.asarray(said.specific_force))
     up = np.array([0.0, 0.0, gravity])
 
     def summed(rate):
@@ -89,7 +90,7 @@ def predicted(flight: Flight, said: Replay, gravity: float) -> Signals:
 
 def measured(flight: Flight) -> Signals:
     """What the sensors read."""
-    world = to_world(flight.quaternion, flight.specific_force)
+    world = to_world(np.asarray(flight.quaternion), np.asarray(flight.specific_force))
     return Signals(np.concatenate([flight.body_rate, flight.velocity, flight.rotor_speed], axis=1), world)
 
 
@@ -97,9 +98,9 @@ class Blocks(eqx.Module):
     """Signals cut into B blocks of `ROWS` rows, with what the filters need to know of each row."""
 
     signals: Signals
-    interval: Float[Array, "b r"]
+    interval: Float[AnyArray, "b r"]
     """From the row before, s."""
-    valid: Float[Array, "b r 10"]
+    valid: Float[AnyArray, "b r 10"]
 
 
 def cut(flight: Flight, signals: Signals) -> Blocks:
@@ -191,8 +192,8 @@ def levels_from(vector: Array, noise: dict[str, np.ndarray]) -> Levels:
     return Levels(
         reading=reading,
         accelerometer=jnp.asarray(noise["accelerometer"]),
-        walk=_LOWEST + x[:7][spread],
-        disturbance=10 * _LOWEST + x[7:14][spread],
+        walk=jnp.asarray(_LOWEST) + x[:7][spread],
+        disturbance=jnp.asarray(10 * _LOWEST) + x[7:14][spread],
         correlation_time=jnp.clip(x[14:17][times], 0.05, 3.0),
     )
 
@@ -316,7 +317,7 @@ def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, 
     """The parameters, and the flight condition in the middle of every interval."""
     prepared = prepare(model)
     read = (flight.position, flight.velocity, flight.quaternion, flight.body_rate, driven)
-    at = unstack(State(*map(between, read)), prepared.parameters.center_of_gravity)
+    at = unstack(State(*map(between, read)), Vec.unstack(prepared.parameters.center_of_gravity))
     return prepared.parameters, in_still_air(prepared, at, at.rotor_speed)
 
 
@@ -329,7 +330,7 @@ def term_squares(model: Quadrotor, flight: Flight, driven: np.ndarray) -> Float[
 def _term_squares(model: Quadrotor, flight: Flight, driven: Array) -> Array:
     _, seen = _seen(model, flight, driven)
     signals = jnp.stack([*body_signals(seen), *place_signals(seen)], axis=-1)
-    return flight.valid @ signals**2 / jnp.maximum(jnp.sum(flight.valid), 1.0)
+    return jnp.asarray(flight.valid) @ signals**2 / jnp.maximum(jnp.sum(flight.valid), 1.0)
 
 
 def term_slopes(model: Quadrotor, flight: Flight, driven: np.ndarray, axis: int) -> Signals:
@@ -405,8 +406,8 @@ def sensor_noise(logs: list[FlightLog], least_gyro: float = 1e-3) -> dict[str, n
 
     speed = level(lambda log: log.rotor_speed)
     return {
-        "gyro": np.maximum(level(lambda log: log.body_rate), least_gyro),
-        "velocity": np.maximum(np.mean(level(lambda log: log.velocity)), 1e-3),
-        "accelerometer": np.maximum(np.mean(level(lambda log: log.specific_force)), 1e-2),
+        "gyro": np.maximum(not_none(level(lambda log: log.body_rate)), least_gyro),
+        "velocity": np.maximum(np.mean(not_none(level(lambda log: log.velocity))), 1e-3),
+        "accelerometer": np.maximum(np.mean(not_none(level(lambda log: log.specific_force))), 1e-2),
         "rotor": np.array(10.0) if speed is None else np.maximum(np.nanmean(speed), 1.0),
     }

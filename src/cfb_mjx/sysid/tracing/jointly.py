@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cfb_mjx.model.effects import CATALOGUE
+from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, evidence, solve
 from cfb_mjx.sysid.tracing.fits import ERRORS, as_it_is, confirm
 from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Column, Fit, Hypothesis, Linear, sensible
@@ -115,7 +116,7 @@ def look_by_look(
             say(f"fitting {', '.join(more)} beside {', '.join(there) or 'nothing'}")
             with np.errstate(over="ignore", invalid="ignore"):
                 richer = _with(search, hypothesis, linear, chosen)
-                gain = confirm(search, hypothesis, richer).gain
+                gain = not_none(confirm(search, hypothesis, richer).gain)
             if not gain > 0:
                 # Too far for slopes, if not beyond all numbers: those that matter most first.
                 richer, chosen = None, chosen[: len(chosen) // 2]
@@ -158,7 +159,7 @@ def borne_out(search: Search, fit: Fit, say: Callable[[str], None] = lambda _: N
                 worth[name] = _total(less)
         if not worth:
             return fit
-        least = sorted(worth, key=worth.get)[:2]
+        least = sorted(worth, key=worth.__getitem__)[:2]
         say(f"leaving out {' or '.join(least)}")
         tried = [search.settled(fit.hypothesis.without(name), search.rules.look_steps, shrunk=True) for name in least]
         fit = min((as_it_is(search, each, whole=False) for each in tried), key=_total)

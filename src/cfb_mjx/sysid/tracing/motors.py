@@ -15,6 +15,7 @@ import numpy as np
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.rotors.flown_motors import Motors, Told, evenly_spread, flown_motors
 from cfb_mjx.sysid.tracing.evidence import alike
@@ -61,7 +62,7 @@ def motors_of(
     beside = replace(plain, parameters=started.parameters, declared=started.effects)
     # Fitted with the constants, to pieces of more flights: few flights hardly tell a battery's slope from its level.
     held = (*IN_CONSTANTS, *(told.name for told in anew.effects))
-    rows = sum(int(np.isfinite(log.rotor_speed).sum()) for log in parts)
+    rows = sum(int(np.isfinite(not_none(log.rotor_speed)).sum()) for log in parts)
     named, named_cost = _found(plain, plain.nothing(), (), rows, say)
     rest, rest_cost = _found(beside, beside.nothing(), held, rows, say)
     constants = sum(np.size(entry.value) for entry in anew.entries.values()) + len(anew.effects)

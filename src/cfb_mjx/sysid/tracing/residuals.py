@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import comb
+from typing import Any, cast
 
 import numpy as np
 from scipy.ndimage import median_filter
@@ -208,6 +209,8 @@ def spectra(rows: list[Residuals]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     from scipy.signal import welch
 
     found: dict[str, list] = {}
+    # Flights are sampled at about the same rate; one grid lets them be averaged.
+    common = np.arange(1, HIGHEST * SPAN + 1) / SPAN
     for flight in rows:
         step = float(np.median(np.diff(flight.time)))
         edges = np.flatnonzero(np.diff(np.concatenate([[0], flight.valid.astype(int), [0]])))
@@ -221,9 +224,7 @@ def spectra(rows: list[Residuals]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
                 if name.startswith("world") or not np.isfinite(values[begin:end]).all():
                     continue
                 even = np.interp(grid, time, values[begin:end])
-                frequency, density = welch(even, 1 / step, nperseg=int(SPAN / step), detrend=False)
-                # Flights are sampled at about the same rate; one grid lets them be averaged.
-                common = np.arange(1, HIGHEST * SPAN + 1) / SPAN
+                frequency, density = welch(even, 1 / step, nperseg=int(SPAN / step), detrend=cast(Any, False))
                 key = "rotor" if name.startswith("rotor") else name
                 found.setdefault(key, []).append((np.interp(common, frequency, density), len(grid)))
     return {

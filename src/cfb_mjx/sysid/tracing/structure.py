@@ -8,6 +8,7 @@ import numpy as np
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.rotation import to_body
+from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.evaluation import Evaluation, LogEvaluation
 from cfb_mjx.sysid.identification.flight_data import white_noise
 from cfb_mjx.sysid.metrics import QUANTITIES
@@ -195,7 +196,7 @@ def where_it_shows(less: Pooled, more: Pooled, bins: int = BINS, count: int = 3)
             continue
         difference = less.axes[axis] - more.axes[axis]
         shares = {name: explained(difference, signal, less.block, bins)[0] for name, signal in less.drivers.items()}
-        best = max(shares, key=shares.get)
+        best = max(shares, key=shares.__getitem__)
         # A constant follows nothing; over time it shows as well as over any other signal.
         found.append((axis, best if shares[best] > 0.1 else "time"))
     return found
@@ -216,7 +217,7 @@ def pool_predictions(evaluation: Evaluation, rows: list[Residuals], horizon: flo
     for log, flight in zip(evaluation.logs, rows, strict=True):
         if not len(log.windows):
             continue
-        windows, said = log.windows, log.predictions["commands_in"]
+        windows, said = log.windows, not_none(log.predictions["commands_in"])
         velocity = to_body(windows.quaternion, windows.true_velocity[:, index] - np.asarray(said.velocity)[:, index])
         rate = windows.true_body_rate[:, index] - np.asarray(said.body_rate)[:, index]
         found.append(np.concatenate([velocity, rate], axis=1))

@@ -27,6 +27,7 @@ from scipy.stats import norm
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import CATALOGUE, Effect
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Entry, ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, LogEvaluation, evaluate
 from cfb_mjx.sysid.metrics import BLOCK
@@ -260,6 +261,7 @@ def asked(search: Search, model: Quadrotor, names: Collection[str]) -> dict[str,
         return np.array([v if c.index is None else v[c.index] for c, v in zip(columns, every, strict=True)])
 
     predicted, scale = values(hypothesis), np.array([c.scale for c in columns])
+    others, deviations = predicted, np.full(len(columns), np.inf)
     for step in range(ASKED_STEPS):
         linear = search.linearise(hypothesis, columns)
         index = linear.index(columns)
@@ -294,7 +296,7 @@ def _surely(gains: Sequence[np.ndarray]) -> tuple[float, float]:
 
 def _losses(one: LogEvaluation) -> np.ndarray:
     """(W,) of each window: errors of attitude and velocity at the last horizon over the flight's mean of hold."""
-    errors, still = one.errors["commands_in"], one.errors["hold"]
+    errors, still = not_none(one.errors["commands_in"]), not_none(one.errors["hold"])
     parts = [errors[q][:, -1] / still[q][:, -1].mean() for q in ("attitude", "velocity")]
     return np.minimum(np.nan_to_num(np.sum(parts, axis=0), nan=1e3), 1e3)
 
@@ -349,7 +351,7 @@ def _lean(
         gone: list[str] = []
         while rest := [name for name in _fitted(found) if name not in gone and name not in typical]:
             growth = {name: found.growth([*gone, name]) for name in rest}
-            least = min(rest, key=growth.get)
+            least = min(rest, key=growth.__getitem__)
             if growth[least] > rules.worth * found.cost[1] * (1 + len(gone)):
                 break
             gone.append(least)

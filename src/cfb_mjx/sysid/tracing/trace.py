@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import KNOWN, Effect
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint, Progress
@@ -33,8 +34,8 @@ class Found:
     """Largest share by which a prediction error of the fit flights grows without it."""
     parameters: dict[str, float | list[float]]
     uncertainty: dict[str, float | list[float]]
-    confusable: list[str] = field(default_factory=list)
-    without: Hypothesis | None = None
+    confusable: list[str]
+    without: Hypothesis
     """The best model without this effect, for judging it on other flights."""
     lowers: float = 0.0
     """Sum of the logarithms by which the prediction errors of the fit flights grow without it: the order goes by that,
@@ -55,7 +56,7 @@ class Trace:
     """`prediction_errors` of the declared model."""
     errors: np.ndarray
     """Of the hypothesis."""
-    fit: Fit | None = None
+    fit: Fit
     """Of the hypothesis, with derivatives by the whole catalogue."""
 
     @property
@@ -114,13 +115,14 @@ def trace(
     saved = checkpoint.restore(nothing.hypothesis)
     fit, refused, tried, vain = nothing, set(), [], 0
     # Without which effects was a model fitted (None: it can be again), and which.
-    left_out: dict[str, LeftOut | None] = {}
+    left_out: Mapping[str, LeftOut | None] = {}
     judged = nothing.hypothesis
     # Of many taken in together: near to where a fit without one of them ends.
     starts: dict[str, Hypothesis] = {}
     if saved is not None:
         progress(f"going on with {', '.join(saved.hypothesis.present) or 'no effect'} found before the interruption")
-        fit, judged = as_it_is(search, saved.hypothesis), saved.judged
+        fit = as_it_is(search, saved.hypothesis)
+        judged = fit.hypothesis if saved.judged is None else saved.judged
         refused, tried, vain, left_out = (
             set(saved.refused),
             list(saved.tried),
@@ -179,7 +181,7 @@ def lacks_many(search: Search, fit: Fit, progress: Callable[[str], None]) -> Fit
 
     It begins with the declared model again, for what was taken in first has taken on what others explain.
     """
-    standing = beside_each_other(search, fit.hypothesis, fit.linear)
+    standing = beside_each_other(search, fit.hypothesis, not_none(fit.linear))
     if sum(each.found.t > search.rules.clear for each in standing) < search.rules.many:
         return None
     whole = told_apart(search, everything(search, progress), progress)
@@ -190,7 +192,7 @@ def lacks_many(search: Search, fit: Fit, progress: Callable[[str], None]) -> Fit
 
 def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, list[Column]]]:
     """Every absent effect at its best probe, the largest gain first."""
-    best = search.probes(fit.hypothesis, fit.linear)
+    best = search.probes(fit.hypothesis, not_none(fit.linear))
     return sorted((pair for name, pair in best.items() if name not in refused), key=lambda pair: -pair[0].gain)
 
 
@@ -264,7 +266,7 @@ def re_examined(
             continue
         seen[name] = less
         rival, variant = less.ranking[0]
-        if variant[0].effect != name and rival.gain > less.own.gain + search.rules.least_gain:
+        if variant[0].effect != name and rival.gain > not_none(less.own).gain + search.rules.least_gain:
             other = fitted(search, search.with_candidate(less.fit.hypothesis, variant, rival), whole=False)
             if np.log(other.errors / fit.errors).sum() < 0:
                 fit, seen = other, {}
@@ -283,7 +285,7 @@ def simplified(
         ranking: of the first round.
         progress: told what happens.
     """
-    candidates = search.probes(nothing.hypothesis, nothing.linear)
+    candidates = search.probes(nothing.hypothesis, not_none(nothing.linear))
     rivals = [item["name"] for item in ranking if item["name"] not in fit.hypothesis.present][: search.rules.rivals]
     for name in rivals:
         if name not in KNOWN or name not in candidates:
@@ -317,6 +319,7 @@ def numbers_of(hypothesis: Hypothesis, stds: Mapping[Column, float], name: str) 
     """Values and standard deviations of one effect, by field; ``stds`` are of all numbers (`deviations`)."""
     parameters: dict[str, float | list[float]] = {}
     uncertainty: dict[str, float | list[float]] = {}
+    several: dict[str, list[float]] = {}
     for column, std in stds.items():
         if column.effect != name:
             continue
@@ -325,19 +328,21 @@ def numbers_of(hypothesis: Hypothesis, stds: Mapping[Column, float], name: str) 
             parameters[column.field], uncertainty[column.field] = float(value), std
         else:
             parameters[column.field] = value.tolist()
-            uncertainty.setdefault(column.field, []).append(std)
+            uncertainty[column.field] = several.setdefault(column.field, [])
+            several[column.field].append(std)
     return parameters, uncertainty
 
 
 def summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
     """What is reported of an effect, from a fit and what is left of it without the effect."""
-    parameters, uncertainty = numbers_of(fit.hypothesis, deviations(search, fit.hypothesis, fit.linear), name)
+    stds = deviations(search, fit.hypothesis, not_none(fit.linear))
+    parameters, uncertainty = numbers_of(fit.hypothesis, stds, name)
     gain, p_value = (less.own.gain, less.own.p_value) if less.own else (0.0, 1.0)
     close = 1 - search.rules.close
     rivals = {v[0].effect: e.gain for e, v in less.ranking if v[0].effect != name and e.gain > close * gain}
     if rivals:
         # Slopes at neutral understate an effect whose shape was fitted; what it explains as it is counts.
-        explained = max(gain, confirm(search, less.fit.hypothesis, fit.hypothesis).gain)
+        explained = max(gain, not_none(confirm(search, less.fit.hypothesis, fit.hypothesis).gain))
         rivals = {rival: its for rival, its in rivals.items() if its > close * explained}
     buys = float(np.max(1 - fit.errors / less.fit.errors))
     lowers = float(np.log(less.fit.errors / fit.errors).sum())
@@ -370,8 +375,10 @@ def contenders(
         progress(f"trying {name} beside {', '.join(fit.hypothesis.present) or 'nothing'}")
         fits[name] = fitted(search, search.with_candidate(fit.hypothesis, variant, found), whole=False)
     plausible = [name for name, richer in fits.items() if not rules.stretched(richer.hypothesis, name)]
+    gains: dict[str, float] = {}
     if len(plausible) > 1:
-        gains = {name: confirm(search, fit.hypothesis, fits[name].hypothesis).gain for name in plausible}
+        verdicts = {name: confirm(search, fit.hypothesis, fits[name].hypothesis) for name in plausible}
+        gains = {name: not_none(verdict.gain) for name, verdict in verdicts.items()}
         plausible = [name for name in plausible if np.isfinite(gains[name])]
     stretched = set(fits) - set(plausible)
     if len(plausible) < 2:
@@ -386,7 +393,7 @@ def contenders(
         rivals = [name for name in rivals if errors[name] <= min(errors.values()) + rules.same_errors]
     most = max(gains[name] for name in rivals)
     close = [name for name in rivals if _near(gains[name], most, rules.parsimony)]
-    first = min(close, key=numbers.get)
+    first = min(close, key=numbers.__getitem__)
     delayed = "command_delay"
     if first == SHIFT and fits[first].hypothesis.shift < 0 and delayed in plausible:
         # Commands logged early and commands that act late look the same unless rotor speeds were logged: the
