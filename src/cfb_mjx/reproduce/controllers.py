@@ -169,7 +169,7 @@ def randomisation(folder: Path, real: Path | None) -> Result:
                     f"magnitude {magnitude:g}, {title}: mean distance, mm: nominal; with effects",
                     f"{mm:g}",
                     ours,
-                    _less(algorithm),
+                    _less(algorithm, files[0]),
                 )
             )
             ours = f"{_mean(of['nominal_std'], '.4f')}; {_mean(of['away_std'], '.4f')}"
@@ -187,8 +187,12 @@ def randomisation(folder: Path, real: Path | None) -> Result:
     )
 
 
-def _less(algorithm: str) -> str:
-    return "32 M commands each, still learning" if algorithm == "ppo" else "not the paper's algorithm"
+def _less(algorithm: str, policy: Path) -> str:
+    from cfb_mjx.control.policy_file import load_policy
+
+    if algorithm != "ppo":
+        return "not the paper's algorithm"
+    return f"{load_policy(policy).training['config']['ppo']['steps'] / 1e6:.0f} M commands each; another reward"
 
 
 def _mean(values: list, digits: str) -> str:
