@@ -137,6 +137,9 @@ def test_a_search_never_does_worse_than_what_it_is_given():
     np.testing.assert_allclose(fixed.knobs.rate_radps, 19.0, rtol=1e-6)
     with pytest.raises(CfbError, match="randomised drones"):
         search(given, TargetTask(), DRONE, margin, key)
+    # Who must stay within a height where none can is as good as lost.
+    none = search(given, WILD, DRONE, Goal(2, "within", extent_m=0.1), key, rounds=1, **sizes)
+    assert float(none.cost) > float(found.cost) + 0.5
 
 
 @pytest.mark.parametrize("name", ["flip", "flip-analytic"])

@@ -85,8 +85,8 @@ class Fly(Command):
             a YAML file; the task's own by default.
         set: changes to the knobs of a flip, for instance rate_radps=18 climb_s=0.4; a search leaves these alone.
         holder: the target policy that climbs and catches in a flip; by default the one its knobs were found with.
-        search: look for the knobs of a flip first: least height on the model, or largest margin on drones of the
-            randomisation.
+        search: look for the knobs of a flip first: least height on the model; largest margin on drones of the
+            randomisation; or the most of these that complete it within 1.8 m.
         keep: write the knobs that were flown here, for --knobs.
         devices: of this machine that share the flights of many plants.
         gyro: late: as late as the pose, the model's pose_delay, as in the paper; local: on the drone, gyro_delay late.
@@ -110,7 +110,7 @@ class Fly(Command):
     knobs: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     set: Pairs = ()
     holder: Annotated[str | None, tyro.conf.arg(metavar="CONTROLLER")] = None
-    search: Literal["height", "margin"] | None = None
+    search: Literal["height", "margin", "within"] | None = None
     keep: File = None
     devices: Devices = 1
     gyro: Literal["late", "local"] | None = None

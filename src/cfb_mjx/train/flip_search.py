@@ -29,11 +29,12 @@ class Goal:
 
     ``height``: the least vertical extent on the nominal drone. ``margin``: the most drones of the task's randomisation
     that complete the flip, and those as far above the floor as they can, while the nominal one keeps within
-    ``extent_m``. Both: turned ``rotations`` times, stopped and back within the limits below on the nominal drone.
+    ``extent_m``. ``within``: the most drones of the randomisation that complete it within ``extent_m`` themselves. All:
+    turned ``rotations`` times, stopped and back within the limits below on the nominal drone.
     """
 
     rotations: int = 2
-    aim: Literal["height", "margin"] = "height"
+    aim: Literal["height", "margin", "within"] = "height"
     extent_m: float = 1.8
     rate_stop_s: float = 0.35
     vertical_stop_s: float = 0.6
@@ -104,21 +105,21 @@ def search(
 
     Args:
         manoeuvre: what to improve: what is found serves no less than its knobs, where these lie within the bounds.
-        task: with the randomisation that ``margin`` is about.
+        task: with the randomisation that ``margin`` and ``within`` are about.
         nominal: the drone.
         goal: what to look for.
         key: decides candidates, drones and noise.
         within: where to look; `bounds` of the goal's rotations by default.
         rounds: of the search.
         candidates: per round.
-        plants: randomised drones per candidate, for ``margin``.
+        plants: randomised drones per candidate, for ``margin`` and ``within``.
         report: called after every round with its number and the cost of its best candidate.
 
     Raises:
-        CfbError: a margin is looked for where nothing is randomised.
+        CfbError: ``margin`` or ``within`` is looked for where nothing is randomised.
     """
-    if goal.aim == "margin" and task.randomisation is None:
-        raise CfbError("A flip's margin is looked for on randomised drones; give the task a randomisation.")
+    if goal.aim != "height" and task.randomisation is None:
+        raise CfbError(f"A flip's {goal.aim} is looked for on randomised drones; give the task a randomisation.")
     within = bounds(goal.rotations) if within is None else within
     task = with_room(task, nominal)
     low, high = (jnp.stack([jnp.asarray(x, float) for x in side]) for side in within)
@@ -187,10 +188,16 @@ def _cost(manoeuvre, task, nominal, goal, few, many) -> Float[Array, ""]:
     if goal.aim == "height":
         return jnp.minimum(extent, 20.0) + 10 * missed
     away = flips(manoeuvre, task, nominal, many)[0]
-    lost = 1 - jnp.mean(away.completed(goal.rotations, goal.floor_m))
+    completed = away.completed(goal.rotations, goal.floor_m)
+    high = jnp.nan_to_num(away.vertical_extent_m, nan=9.0)
+    if goal.aim == "within":
+        completed &= high <= goal.extent_m
+    lost = 1 - jnp.mean(completed)
     # Where nearly all of them complete it, what tells candidates apart is how much they have left.
     deep = jnp.nan_to_num(-away.lowest_m, nan=9.0) / goal.floor_m
     near = jnp.mean(jnp.clip(deep - 0.5, 0.0, 0.5))
+    if goal.aim == "within":
+        near = jnp.mean(jnp.clip(high - 0.9 * goal.extent_m, 0.0, 2.0))
     turned = jnp.mean(jnp.minimum(1.0, jnp.abs(jnp.nan_to_num(away.rotations, nan=9.0) - goal.rotations)))
     wide = jnp.clip(extent - 0.97 * goal.extent_m, 0.0, 5.0)
     return lost + 0.3 * near + 0.3 * turned + 3 * missed + wide
