@@ -14,8 +14,26 @@ import importlib
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    from cfb_mjx.commands.bench import Bench
+    from cfb_mjx.commands.benchmark_nanodrone import BenchmarkNanodrone
+    from cfb_mjx.commands.check import Check
+    from cfb_mjx.commands.close_loop import CloseLoop
     from cfb_mjx.commands.command import Command, Result
+    from cfb_mjx.commands.demo import Demo
+    from cfb_mjx.commands.demo_loop import DemoLoop
     from cfb_mjx.commands.evaluate import Evaluate
+    from cfb_mjx.commands.excite import Excite
+    from cfb_mjx.commands.export import Export
+    from cfb_mjx.commands.fit import Fit
+    from cfb_mjx.commands.fit_rotors import FitRotors
+    from cfb_mjx.commands.fly import Fly
+    from cfb_mjx.commands.import_log import Import
+    from cfb_mjx.commands.refine import Refine
+    from cfb_mjx.commands.reproduce import Reproduce
+    from cfb_mjx.commands.sweep import Sweep
+    from cfb_mjx.commands.train import Train
+    from cfb_mjx.commands.version import Version
+    from cfb_mjx.commands.view import View
 
 
 class Entry(NamedTuple):

@@ -1,5 +1,7 @@
 """The simulated drone: rotors, bodies, delay, effects and rollouts."""
 
+from typing import TYPE_CHECKING
+
 from cfb_mjx.model.bodies import Body, RigidBody
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.effects import CATALOGUE, Condition, Effect, ParasiticDrag, Wrench, register
@@ -8,6 +10,9 @@ from cfb_mjx.model.randomised import require_possible, sample_drone
 from cfb_mjx.model.rollout import in_chunks, rollout, rollout_final
 from cfb_mjx.model.rotors import hover_command, hover_rotor_speed, rotor_speed_history, thrust, torque
 from cfb_mjx.model.state import State
+
+if TYPE_CHECKING:
+    from cfb_mjx.model.mjx_body import MjxBody
 
 __all__ = [
     "CATALOGUE",
