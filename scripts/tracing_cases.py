@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cfb_mjx.labelled_plants import EFFECTS, Case, fly_campaigns
+from cfb_mjx.reference_simulator import EFFECTS, Case, fly_campaigns
 from cfb_mjx.sysid.tracing.fits import ERRORS
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -1,10 +1,10 @@
-"""Trace labelled plants nobody tuned to, and write docs/tracing.md: confusion, false positives, recovered improvement.
+"""Trace drones of the reference simulator that nobody tuned to, and write docs/tracing.md: confusion, recovered error.
 
     python scripts/tracing_sweep.py [--null 100] [--results benchmarks/tracing.jsonl] [--page-only] [--from-end]
     python scripts/tracing_sweep.py --only esc_rate_limit --again
     python scripts/tracing_sweep.py --null 10 --seed 98000 --results benchmarks/tracing-98000.jsonl
 
-The plants (cfb_mjx.labelled_plants) are an independent simulator with effects of other functional forms than the
+The plants (cfb_mjx.reference_simulator) are an independent simulator with effects of other functional forms than the
 catalogue's. Results are kept campaign by campaign: an interrupted sweep goes on where it was. What lies beside
 benchmarks/tracing.jsonl as tracing-SEED.jsonl is the same on other seeds; the page sums it up.
 """
@@ -19,8 +19,8 @@ import numpy as np
 from tracing_cases import LEAST, MOST, SEED, achievable, alone, cases
 
 from cfb_mjx.files import write_text
-from cfb_mjx.labelled_plants import Case, fly_campaigns, label
 from cfb_mjx.parameters import load_model_file
+from cfb_mjx.reference_simulator import Case, fly_campaigns, label
 from cfb_mjx.runtime import configure_jax, environment
 from cfb_mjx.sysid.tracing.fits import ERRORS
 
@@ -120,7 +120,7 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
     lines = read(results)
     _, outside, single, mixed = _sorts(lines)
     text = [
-        "# Tracing labelled plants",
+        "# Tracing on the reference simulator",
         "",
         "Written by `python scripts/tracing_sweep.py`; do not edit. "
         + ", ".join(f"{name} {value}" for name, value in environment().items()),
@@ -132,7 +132,7 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
         *_traced_by(lines),
         *_traced_again(lines),
         "",
-        "Campaigns of 10 to 11 flights by an independent simulator (`cfb_mjx.labelled_plants`, NumPy, closed loop)",
+        "Campaigns of 10 to 11 flights by an independent simulator (`cfb_mjx.reference_simulator`, NumPy, closed loop)",
         "whose effects have other functional forms than the catalogue's. The search was developed on other seeds.",
         "*Buys* is the largest share by which a perfect model would lower one of eight held-out errors (position,",
         "velocity, attitude, rate; 0.2 and 0.5 s), measured on the same flights flown without the effect; *recovered*",

@@ -8,12 +8,12 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from cfb_mjx.labelled_plants import EFFECTS, OUTSIDE, Case, effects, fly_campaigns, physics
-from cfb_mjx.labelled_plants import constants as c
-from cfb_mjx.labelled_plants.airframe import PLAIN_ROWS, SPEED, P, Q, V, W, advance, derivative
-from cfb_mjx.labelled_plants.manoeuvres import MANOEUVRES
-from cfb_mjx.labelled_plants.sensors import QUIET, row_ticks
-from cfb_mjx.labelled_plants.simulation import Lane, simulate
+from cfb_mjx.reference_simulator import EFFECTS, OUTSIDE, Case, effects, fly_campaigns, physics
+from cfb_mjx.reference_simulator import constants as c
+from cfb_mjx.reference_simulator.airframe import PLAIN_ROWS, SPEED, P, Q, V, W, advance, derivative
+from cfb_mjx.reference_simulator.manoeuvres import MANOEUVRES
+from cfb_mjx.reference_simulator.sensors import QUIET, row_ticks
+from cfb_mjx.reference_simulator.simulation import Lane, simulate
 
 # They share fixtures and compiled programs.
 pytestmark = pytest.mark.xdist_group("plants")

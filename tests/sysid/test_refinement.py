@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.labelled_plants import EFFECTS, Case, fly_campaigns
-from cfb_mjx.labelled_plants.effects import put
 from cfb_mjx.logs import read_log, resample
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import Inertia, PayloadSwing, RotorDrag, Wind
 from cfb_mjx.parameters import load_model_file
+from cfb_mjx.reference_simulator import EFFECTS, Case, fly_campaigns
+from cfb_mjx.reference_simulator.effects import put
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.refinement import Number, free_numbers, plausible_numbers, refine
 from cfb_mjx.sysid.refinement.fitting import _prepared

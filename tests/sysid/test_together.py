@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import BatterySag
 from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE
 from cfb_mjx.parameters import Entry, load_model_file, save_model_file
+from cfb_mjx.reference_simulator import Case, fly_campaigns
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.refinement.numbers import PLANT
 from cfb_mjx.sysid.rotors.flown_motors import Told, flown_motors

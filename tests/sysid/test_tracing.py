@@ -1,4 +1,4 @@
-"""Tracing on labelled plants (cfb_mjx.labelled_plants), and the pieces it is made of."""
+"""Tracing on drones of the reference simulator (cfb_mjx.reference_simulator), and the pieces it is made of."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import pytest
 from scipy.stats import norm
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS, Inertia, RateDamping, RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file
+from cfb_mjx.reference_simulator import Case, fly_campaigns
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults

@@ -6,8 +6,8 @@ import pytest
 from scipy.signal import lsim
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.labelled_plants import Case, fly_campaigns
 from cfb_mjx.model import State
+from cfb_mjx.reference_simulator import Case, fly_campaigns
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.velocity_band import with_band
 from cfb_mjx.sysid.velocity_stretch import VelocityStretch

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.xdist_group("training")
 DRONE = Quadrotor.from_file("cfb-guards")
 
 
-def pilot_of(name: str) -> NeuralController:
+def controller_of(name: str) -> NeuralController:
     policy = load_policy(name)
     assert policy.training["config"]["seed"] == 0
     return policy.controller
@@ -28,7 +28,7 @@ def pilot_of(name: str) -> NeuralController:
 
 @pytest.mark.parametrize("name", ["target", "target-adaptive"])
 def test_it_hovers_on_the_nominal_drone(name):
-    measured, _ = hover(pilot_of(name), TargetTask(), DRONE, jax.random.split(jax.random.PRNGKey(3), 8))
+    measured, _ = hover(controller_of(name), TargetTask(), DRONE, jax.random.split(jax.random.PRNGKey(3), 8))
     assert not np.any(measured.failed)
     assert np.mean(measured.mean_distance_m) < 0.025
     assert np.mean(measured.command_std) < 0.02
@@ -37,7 +37,7 @@ def test_it_hovers_on_the_nominal_drone(name):
 @pytest.mark.parametrize(("name", "within_m"), [("target-adaptive", 0.06), ("target", 0.075)])
 def test_random_drones_are_held_within_centimetres(name, within_m):
     task = TargetTask(randomisation=load_randomisation("paper"))
-    measured, _ = hover(pilot_of(name), task, DRONE, jax.random.split(jax.random.PRNGKey(3), 32))
+    measured, _ = hover(controller_of(name), task, DRONE, jax.random.split(jax.random.PRNGKey(3), 32))
     assert not np.any(measured.failed)
     assert np.median(measured.mean_distance_m) < within_m
 
@@ -54,7 +54,7 @@ def test_the_policy_of_ppo_begins_with_the_defaults():
 
 @pytest.mark.parametrize("name", ["target", "target-adaptive"])
 def test_it_does_not_swing_where_sensors_are_later_or_noisier(name):
-    found = Judge(plants=None, random_drones=0).with_sensors(pilot_of(name))
+    found = Judge(plants=None, random_drones=0).with_sensors(controller_of(name))
     assert [there["failed"] for there in found.values()] == [0, 0, 0]
     late, all_late, noisy = (there["command_std"] for there in found.values())
     assert max(late, all_late) < 0.04
@@ -72,7 +72,7 @@ def test_the_firmware_needs_its_gyro_on_the_drone_and_not_its_pose():
 
 
 def test_six_metres_in_two_seconds():
-    measured, _ = six_metres(pilot_of("target"), TargetTask(), DRONE, jax.random.split(jax.random.PRNGKey(3), 4))
+    measured, _ = six_metres(controller_of("target"), TargetTask(), DRONE, jax.random.split(jax.random.PRNGKey(3), 4))
     assert np.all(np.asarray(measured.arrival_s) <= 2.0)
     assert np.all(np.asarray(measured.peak_speed_mps) >= 5.0)
     assert not np.any(measured.failed)

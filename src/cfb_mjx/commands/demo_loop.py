@@ -43,7 +43,7 @@ class DemoLoop(Command):
 
     Attributes:
         output: folder to write to.
-        effects: of the labelled plants, one drone each: payload, cog_offset, wind ...; by default payload.
+        effects: of the reference simulator, one drone each: payload, cog_offset, wind ...; by default payload.
         seeds: drones of each effect; every seed has policies of its own.
         seed: the first.
     """

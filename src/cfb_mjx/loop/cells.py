@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.labelled_plants import EFFECTS, Case
+from cfb_mjx.reference_simulator import EFFECTS, Case
 
 FIRST_SEED, BETWEEN_SEEDS = 61_000, 100
 

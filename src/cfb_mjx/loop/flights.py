@@ -1,8 +1,9 @@
 """The flights a policy makes for the sake of tracing: it follows set-points that excite, and its logs are kept.
 
 A policy holds a target. Shown its position and velocity relative to a target that moves, it follows: the set-points are
-those of the labelled plants' own manoeuvres, `RAISE` higher, for a policy that does not know its drone sinks. Rates
-cannot be asked of it; in place of that manoeuvre its target jumps. Two of the flights have a dither on the commands.
+those of the reference simulator's own manoeuvres, `RAISE` higher, for a policy that does not know its drone sinks.
+Rates cannot be asked of it; in place of that manoeuvre its target jumps. Two of the flights have a dither on the
+commands.
 """
 
 from __future__ import annotations
@@ -14,15 +15,15 @@ import numpy as np
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.errors import CfbError
-from cfb_mjx.labelled_plants import Case
-from cfb_mjx.labelled_plants import constants as c
-from cfb_mjx.labelled_plants.campaigns import draw_drone, recorded
-from cfb_mjx.labelled_plants.controller import DITHER, POSITION, SETPOINT_COLUMNS
-from cfb_mjx.labelled_plants.manoeuvres import MANOEUVRES, STEP
-from cfb_mjx.labelled_plants.sensors import Instruments, row_ticks
-from cfb_mjx.labelled_plants.simulation import Lane, simulate
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.loop.pilots import pilot_of
+from cfb_mjx.loop.controllers import controller_of
+from cfb_mjx.reference_simulator import Case
+from cfb_mjx.reference_simulator import constants as c
+from cfb_mjx.reference_simulator.campaigns import draw_drone, recorded
+from cfb_mjx.reference_simulator.controller import DITHER, POSITION, SETPOINT_COLUMNS
+from cfb_mjx.reference_simulator.manoeuvres import MANOEUVRES, STEP
+from cfb_mjx.reference_simulator.sensors import Instruments, row_ticks
+from cfb_mjx.reference_simulator.simulation import Lane, simulate
 
 FIT = ("lateral", "jumps", "vertical", "low_altitude", "motor_excitation", "long_hover")
 HELD_OUT = ("figure8", "waypoints", "climb_dive")
@@ -75,7 +76,8 @@ def fly_campaign(
             break
         progress(f"flying {', '.join(names[i] for i in waiting)}")
         lanes = [_lane(case, i, names[i], attempt, drone, instruments, duration_scale) for i in waiting]
-        for i, lane, flight in zip(waiting, lanes, simulate(lanes, pilot_of([controller] * len(lanes))), strict=True):
+        flights = simulate(lanes, controller_of([controller] * len(lanes)))
+        for i, lane, flight in zip(waiting, lanes, flights, strict=True):
             tries[i] = attempt + 1
             if not flight.crashed:
                 logs[i] = recorded(lane, flight, _logging(case, i, attempt), f"log_{i + 1:02d}")

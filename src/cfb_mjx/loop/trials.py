@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.labelled_plants import Case
-from cfb_mjx.labelled_plants import constants as c
-from cfb_mjx.labelled_plants.airframe import P
-from cfb_mjx.labelled_plants.campaigns import draw_drone
-from cfb_mjx.labelled_plants.controller import POSITION, SETPOINT_COLUMNS, VELOCITY
-from cfb_mjx.labelled_plants.simulation import Flight, Lane, simulate
-from cfb_mjx.loop.pilots import pilot_of
+from cfb_mjx.loop.controllers import controller_of
+from cfb_mjx.reference_simulator import Case
+from cfb_mjx.reference_simulator import constants as c
+from cfb_mjx.reference_simulator.airframe import P
+from cfb_mjx.reference_simulator.campaigns import draw_drone
+from cfb_mjx.reference_simulator.controller import POSITION, SETPOINT_COLUMNS, VELOCITY
+from cfb_mjx.reference_simulator.simulation import Flight, Lane, simulate
 
 HEIGHT = 1.2
 """m"""
@@ -78,7 +78,7 @@ def fly_trials(case: Case, policies: Mapping[str, NeuralController], twin: str) 
     for controller, body in crews.values():
         lanes += [_lane(case, i, body, instruments) for i in range(HOVERS + TRACKS)]
         controllers += [controller] * (HOVERS + TRACKS)
-    flights = simulate(lanes, pilot_of(controllers))
+    flights = simulate(lanes, controller_of(controllers))
     each = [flights[i : i + HOVERS + TRACKS] for i in range(0, len(flights), HOVERS + TRACKS)]
     return {name: _judged(own) for name, own in zip(crews, each, strict=True)}
 

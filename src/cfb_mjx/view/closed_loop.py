@@ -111,7 +111,7 @@ def _story(settings: dict[str, Any]) -> list[str]:
     further = dict(change.split("=") for change in settings["further"])
     more = dict(change.split("=") for change in settings["randomised"])
     return [
-        "The drones are labelled plants (cfb_mjx.labelled_plants): a simulator in plain NumPy that shares no line with "
+        "The drones are of the reference simulator (cfb_mjx.reference_simulator): plain NumPy that shares no line with "
         "the model, with effects of other functional forms than the catalogue's, sensor noise, gusts of force and "
         "torque, and a battery that drains. The effects were chosen for what they should do to a flight, before any "
         "corrected policy had flown; flights and training were developed on other seeds.",

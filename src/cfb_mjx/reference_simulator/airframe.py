@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from cfb_mjx.labelled_plants import constants as c
-from cfb_mjx.labelled_plants.rotors import motor_rates, rotor_wrench
+from cfb_mjx.reference_simulator import constants as c
+from cfb_mjx.reference_simulator.rotors import motor_rates, rotor_wrench
 
 P, V, Q, W, SPEED = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13), slice(13, 17)
 PLAIN_ROWS = 17

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from cfb_mjx.labelled_plants import constants as c
+from cfb_mjx.reference_simulator import constants as c
 
 # One drone's parameters. An effect edits a copy; whatever differs from here in any lane is simulated.
 NOMINAL: dict[str, object] = {

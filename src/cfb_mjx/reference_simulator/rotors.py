@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from cfb_mjx.labelled_plants import constants as c
 from cfb_mjx.optional import not_none
+from cfb_mjx.reference_simulator import constants as c
 
 HUB_EFFECTS = frozenset({"inflow", "rotor_drag", "flapping", "ground"})
 DISC = np.pi * c.BLADE_RADIUS**2

@@ -9,8 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cfb_mjx.labelled_plants import constants as c
-from cfb_mjx.labelled_plants.physics import attach
+from cfb_mjx.reference_simulator import constants as c
+from cfb_mjx.reference_simulator.physics import attach
 
 Drone = dict[str, np.ndarray]
 Drawn = dict[str, object]

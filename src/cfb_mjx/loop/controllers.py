@@ -1,4 +1,4 @@
-"""Trained policies as pilots of labelled plants: jax on one side, NumPy on the other."""
+"""Trained policies in the reference simulator: jax on one side, NumPy on the other."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.envs.observation import Estimate
 from cfb_mjx.errors import CfbError
-from cfb_mjx.labelled_plants.constants import TICK
-from cfb_mjx.labelled_plants.pilot import Pilot, Seen
+from cfb_mjx.reference_simulator.constants import TICK
+from cfb_mjx.reference_simulator.other_controller import OtherController, Seen
 
 
-def pilot_of(controllers: Sequence[NeuralController]) -> Pilot:
-    """One pilot for as many lanes as there are controllers, each flown by its own.
+def controller_of(controllers: Sequence[NeuralController]) -> OtherController:
+    """One controller for as many lanes as there are controllers, each flown by its own.
 
     Raises:
         CfbError: the controllers differ in more than their weights, or their control step is no multiple of a tick.
@@ -37,7 +37,7 @@ def pilot_of(controllers: Sequence[NeuralController]) -> Pilot:
         memory, command = _command(stacked, memory, *shown)
         return memory, np.asarray(command, float).T
 
-    return Pilot(round(every), fly)
+    return OtherController(round(every), fly)
 
 
 @eqx.filter_jit

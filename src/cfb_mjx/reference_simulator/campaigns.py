@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cfb_mjx.labelled_plants import constants as c
-from cfb_mjx.labelled_plants import effects, physics
-from cfb_mjx.labelled_plants.controller import POSITION
-from cfb_mjx.labelled_plants.manoeuvres import MANOEUVRES
-from cfb_mjx.labelled_plants.sensors import Instruments, draw_instruments, row_ticks
-from cfb_mjx.labelled_plants.simulation import Flight, Lane, simulate
 from cfb_mjx.logs import FlightLog
+from cfb_mjx.reference_simulator import constants as c
+from cfb_mjx.reference_simulator import effects, physics
+from cfb_mjx.reference_simulator.controller import POSITION
+from cfb_mjx.reference_simulator.manoeuvres import MANOEUVRES
+from cfb_mjx.reference_simulator.sensors import Instruments, draw_instruments, row_ticks
+from cfb_mjx.reference_simulator.simulation import Flight, Lane, simulate
 
 FIT = ("lateral", "roll_pitch_excitation", "vertical", "low_altitude", "motor_excitation", "long_hover")
 SECONDS = {"hover": (10.0, 13.0), "long_hover": (24.0, 30.0)}

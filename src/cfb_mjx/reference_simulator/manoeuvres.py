@@ -1,7 +1,7 @@
 """Set-point generators with random parameters.
 
 Each takes a Generator, a duration (s) and ``vigour`` (1; less after a crash) and returns set-points at 100 Hz, (n, 17):
-columns as in `cfb_mjx.labelled_plants.controller`.
+columns as in `cfb_mjx.reference_simulator.controller`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from cfb_mjx.labelled_plants.constants import SETPOINT_TICKS, TICK
-from cfb_mjx.labelled_plants.controller import (
+from cfb_mjx.reference_simulator.constants import SETPOINT_TICKS, TICK
+from cfb_mjx.reference_simulator.controller import (
     ACCELERATION,
     DITHER,
     POSITION,

@@ -1,4 +1,4 @@
-"""Labelled plants flown by others than their own controller, and what is measured of such flights."""
+"""Drones of the reference simulator flown by others than their own controller, and what is measured of such flights."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from scipy.spatial.transform import Rotation
 
 from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.errors import CfbError
-from cfb_mjx.labelled_plants import Case, physics
-from cfb_mjx.labelled_plants import constants as c
-from cfb_mjx.labelled_plants.airframe import P, Q, V
-from cfb_mjx.labelled_plants.controller import POSITION, SETPOINT_COLUMNS, VELOCITY, YAW_ANGLE, YAW_RATE
-from cfb_mjx.labelled_plants.manoeuvres import MANOEUVRES
-from cfb_mjx.labelled_plants.pilot import Pilot, relative
-from cfb_mjx.labelled_plants.sensors import QUIET, draw_instruments
-from cfb_mjx.labelled_plants.simulation import Lane, simulate
 from cfb_mjx.loop import flights, trials
+from cfb_mjx.loop.controllers import controller_of
 from cfb_mjx.loop.flights import FIT, HELD_OUT, fly_campaign
-from cfb_mjx.loop.pilots import pilot_of
 from cfb_mjx.loop.trials import figure_eight, fly_trials
+from cfb_mjx.reference_simulator import Case, physics
+from cfb_mjx.reference_simulator import constants as c
+from cfb_mjx.reference_simulator.airframe import P, Q, V
+from cfb_mjx.reference_simulator.controller import POSITION, SETPOINT_COLUMNS, VELOCITY, YAW_ANGLE, YAW_RATE
+from cfb_mjx.reference_simulator.manoeuvres import MANOEUVRES
+from cfb_mjx.reference_simulator.other_controller import OtherController, relative
+from cfb_mjx.reference_simulator.sensors import QUIET, draw_instruments
+from cfb_mjx.reference_simulator.simulation import Lane, simulate
 
 pytestmark = pytest.mark.xdist_group("loop")
 
@@ -72,7 +72,7 @@ def still(seconds):
     return setpoints
 
 
-def test_the_built_in_controller_flies_as_it_did_before_there_were_pilots():
+def test_the_built_in_controller_flies_as_it_did_before_there_were_others():
     setpoints = MANOEUVRES["lateral"](np.random.default_rng(5), 3.0, 1.0)
     flight = simulate([lane(setpoints, noisy=True)])[0]
     np.testing.assert_allclose(flight.pose[-1], BEFORE_POSE, rtol=0, atol=1e-7)
@@ -86,7 +86,7 @@ def test_constant_hover_commands_hold_a_quiet_drone(short_warm_up):
         asked.append(seen)
         return (memory or 0) + 1, np.full((4, 1), HOVER)
 
-    flight = simulate([lane(still(1.0))], Pilot(4, fly))[0]
+    flight = simulate([lane(still(1.0))], OtherController(4, fly))[0]
     assert not flight.crashed
     assert np.abs(flight.pose[:, P] - [0.3, -0.2, 1.0]).max() < 0.01
     assert len(asked) == -(-(c.WARM_UP_TICKS + 500 + 1) // 4)
@@ -98,13 +98,13 @@ def test_commands_are_held_and_memory_is_carried(short_warm_up):
         memory = 0 if memory is None else memory + 1
         return memory, np.full((4, 1), HOVER + 0.01 * (-1) ** memory)
 
-    flight = simulate([lane(still(0.5))], Pilot(4, fly))[0]
+    flight = simulate([lane(still(0.5))], OtherController(4, fly))[0]
     command = flight.motors[:, 0]
     changes = np.flatnonzero(np.diff(command)) + 1
     np.testing.assert_array_equal(changes, np.arange(4, len(command), 4))
 
 
-def test_what_a_pilot_sees_is_relative_to_a_target_that_moves_and_turns():
+def test_what_a_controller_sees_is_relative_to_a_target_that_moves_and_turns():
     rng = np.random.default_rng(0)
     goal, late, gyro = np.zeros((SETPOINT_COLUMNS, 1)), rng.normal(size=(10, 1)), rng.normal(size=(3, 1))
     goal[POSITION, 0], goal[VELOCITY, 0] = rng.normal(size=3), rng.normal(size=3)
@@ -121,14 +121,14 @@ def test_what_a_pilot_sees_is_relative_to_a_target_that_moves_and_turns():
 
 
 def test_a_shipped_policy_flies_the_nominal_plant(target):
-    flight = simulate([lane(still(2.0), noisy=True)], pilot_of([target]))[0]
+    flight = simulate([lane(still(2.0), noisy=True)], controller_of([target]))[0]
     assert not flight.crashed
     assert np.linalg.norm(flight.pose[:, P] - [0.3, -0.2, 1.0], axis=1).mean() < 0.03
 
 
 def test_only_like_policies_fly_side_by_side(target):
     with pytest.raises(CfbError, match="same observation"):
-        pilot_of([target, load_policy("target-adaptive").controller])
+        controller_of([target, load_policy("target-adaptive").controller])
 
 
 def test_a_campaign_holds_what_tracing_needs(target, short_warm_up):
@@ -148,7 +148,7 @@ def test_a_campaign_holds_what_tracing_needs(target, short_warm_up):
 def test_a_drone_that_cannot_be_kept_in_the_air_is_said_so(target, monkeypatch):
     monkeypatch.setattr(flights, "TRIES", 2)
     dropped = SimpleNamespace(crashed=True)
-    monkeypatch.setattr(flights, "simulate", lambda lanes, pilot: [dropped] * len(lanes))
+    monkeypatch.setattr(flights, "simulate", lambda lanes, controller: [dropped] * len(lanes))
     with pytest.raises(CfbError, match=r"lost-cause: .*in the air .*long_hover"):
         fly_campaign(Case("lost-cause", 61_991), target, duration_scale=0.1)
 

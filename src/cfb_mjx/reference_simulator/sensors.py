@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cfb_mjx.labelled_plants import constants as c
+from cfb_mjx.reference_simulator import constants as c
 
 
 @dataclass(frozen=True)

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from cfb_mjx.labelled_plants import constants as c
-from cfb_mjx.labelled_plants import physics
-from cfb_mjx.labelled_plants.airframe import BOB, BOB_V, ESC, LAGGED, PLAIN_ROWS, ROWS, SPEED, P, Q, V, W, advance
-from cfb_mjx.labelled_plants.controller import DITHER, POSITION, YAW_ANGLE, Controller
-from cfb_mjx.labelled_plants.pilot import Pilot, relative
-from cfb_mjx.labelled_plants.sensors import Instruments, LowPass, Recorder
+from cfb_mjx.reference_simulator import constants as c
+from cfb_mjx.reference_simulator import physics
+from cfb_mjx.reference_simulator.airframe import BOB, BOB_V, ESC, LAGGED, PLAIN_ROWS, ROWS, SPEED, P, Q, V, W, advance
+from cfb_mjx.reference_simulator.controller import DITHER, POSITION, YAW_ANGLE, Controller
+from cfb_mjx.reference_simulator.other_controller import OtherController, relative
+from cfb_mjx.reference_simulator.sensors import Instruments, LowPass, Recorder
 
 CHUNK = 250  # ticks of noise drawn at a time
 # Columns of the noise: position, velocity, quaternion, gyro, then what drives push, twist and gust.
@@ -62,14 +62,14 @@ class Flight:
     motors: np.ndarray
 
 
-def simulate(lanes: list[Lane], pilot: Pilot | None = None) -> list[Flight]:
+def simulate(lanes: list[Lane], other: OtherController | None = None) -> list[Flight]:
     """Fly all lanes side by side; nothing drawn or computed in one depends on the others.
 
     Args:
         lanes: the flights.
-        pilot: flies them all in place of the built-in controller; it sees what is late, as a policy on board would.
+        other: flies them all in place of the built-in controller; it sees what is late, as a policy on board would.
     """
-    loop = _Loop(lanes, pilot)
+    loop = _Loop(lanes, other)
     for tick in range(loop.ticks):
         loop.step(tick)
     return [
@@ -81,9 +81,9 @@ def simulate(lanes: list[Lane], pilot: Pilot | None = None) -> list[Flight]:
 class _Loop:
     """State of all lanes."""
 
-    def __init__(self, lanes: list[Lane], pilot: Pilot | None):
+    def __init__(self, lanes: list[Lane], other: OtherController | None):
         count = len(lanes)
-        self.lanes, self.pilot, self.memory = lanes, pilot, None
+        self.lanes, self.other, self.memory = lanes, other, None
         self.p = p = physics.stack([lane.drone for lane in lanes])
         self.goals = _padded([lane.setpoints for lane in lanes])
         self.ends = np.array([c.WARM_UP_TICKS + len(lane.setpoints) * c.SETPOINT_TICKS for lane in lanes])
@@ -138,14 +138,14 @@ class _Loop:
             self._check(tick)
 
     def _decide(self, tick, goal, late, gyro):
-        """Commands (4, F): the built-in controller's, or the pilot's, who is asked now and then and held in between."""
-        if self.pilot is None:
+        """Commands (4, F): the built-in controller's, or the other's, who is asked now and then and held in between."""
+        if self.other is None:
             return self.controller(goal, SimpleNamespace(position=late[P], velocity=late[V], quaternion=late[Q]), gyro)
         self.past_gyro.append(gyro)
         late_gyro = self.past_gyro.pop(0)
-        if tick % self.pilot.every:
+        if tick % self.other.every:
             return self.commands[(tick - 1) % DELAY_RING]
-        self.memory, command = self.pilot.fly(self.memory, relative(goal, late, late_gyro))
+        self.memory, command = self.other.fly(self.memory, relative(goal, late, late_gyro))
         return np.rint(np.clip(command + goal[DITHER], 0.0, 1.0) * 65535) / 65535
 
     def _played(self, command):

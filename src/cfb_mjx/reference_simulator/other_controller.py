@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from cfb_mjx.labelled_plants.airframe import P, Q, V
-from cfb_mjx.labelled_plants.controller import POSITION, VELOCITY, YAW_ANGLE, YAW_RATE
+from cfb_mjx.reference_simulator.airframe import P, Q, V
+from cfb_mjx.reference_simulator.controller import POSITION, VELOCITY, YAW_ANGLE, YAW_RATE
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
-class Pilot:
+class OtherController:
     """A controller of F lanes.
 
     Attributes:
@@ -41,7 +41,7 @@ class Pilot:
 
 
 def relative(goal: np.ndarray, late: np.ndarray, gyro: np.ndarray) -> Seen:
-    """What a pilot is shown.
+    """What a controller is shown.
 
     Args:
         goal: (17, F) set-point.

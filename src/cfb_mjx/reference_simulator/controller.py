@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from cfb_mjx.labelled_plants import constants as c
-from cfb_mjx.labelled_plants.airframe import rotation_of, turn_back
+from cfb_mjx.reference_simulator import constants as c
+from cfb_mjx.reference_simulator.airframe import rotation_of, turn_back
 
 # Columns of a set-point.
 POSITION, VELOCITY, ACCELERATION = slice(0, 3), slice(3, 6), slice(6, 9)
