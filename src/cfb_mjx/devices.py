@@ -68,7 +68,7 @@ class Devices:
             CfbError: there are fewer.
         """
         if count < 1:
-            raise CfbError(f"{count} devices: at least one has to work.")
+            raise CfbError(f"--devices must be at least 1, found {count}.")
         if count > jax.local_device_count():
             raise CfbError(f"{count} devices were asked for, {jax.local_device_count()} are here; ask for fewer.")
         chosen = [d for process in range(jax.process_count()) for d in jax.local_devices(process)[:count]]
