@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -86,7 +86,7 @@ class Program:
         return _run(self.traced.jaxpr, self.traced.consts, arguments)
 
 
-def trace(function: Callable, *examples, elementwise: frozenset[str] = ELEMENTWISE) -> Program | None:
+def trace(function: Callable, *examples: Any, elementwise: frozenset[str] = ELEMENTWISE) -> Program | None:
     """The program of ``function``, which takes arrays and returns a sequence of them; None if parts are unknown here.
 
     Args:
