@@ -302,8 +302,8 @@ class _Gpu:
     ],
 )
 def test_which_devices_suit(changed, suits, monkeypatch):
-    gpu = {"default_backend": lambda: "gpu", "device_count": lambda: 1, "devices": lambda: [_Gpu]}
-    for name, value in (gpu | changed).items():
+    suiting = {"default_backend": lambda: "gpu", "device_count": lambda: 1, "devices": lambda: [_Gpu]}
+    for name, value in (suiting | changed).items():
         monkeypatch.setattr(jax, name, value)
     assert gpu._suits_kernel() is suits
 

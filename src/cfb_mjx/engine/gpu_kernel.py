@@ -40,7 +40,7 @@ def fly(
     constants: Sequence[Array],
     own: Sequence[bool],
     start: Sequence[Float[Array, " drones"]],
-    commands: Float[Array, "rows 4"] | Float[Array, "rows 4 drones"],
+    commands: Float[Array, "rows inputs"] | Float[Array, "rows inputs drones"],
     *,
     hold: int,
     every: int,
@@ -50,7 +50,7 @@ def fly(
     """Every drone's state after each ``every`` commands, all held for ``hold`` steps.
 
     Args:
-        step: from the constants, the numbers of the state and a command (4,) to the new numbers of the state.
+        step: from the constants, the numbers of the state and a row of inputs to the new numbers of the state.
         constants: (...) for all drones or (drones, ...), float32.
         own: which of the constants are each drone's own.
         start: the numbers of the state.
