@@ -50,13 +50,13 @@ def tried(monkeypatch):
         monkeypatch.setattr(trace, "confirm", lambda *_: SimpleNamespace(t=statistic))
         monkeypatch.setattr(trace, "prediction_errors", errors)
         monkeypatch.setattr(trace, "leave_out", left_out)
-        monkeypatch.setattr(trace, "summary", lambda s, f, name, less: Found(name, 0.01, 9.0, 0.1, {}, {}))
+        monkeypatch.setattr(trace, "summary", lambda s, f, name, less: Found(name, 0.01, 9.0, 0.1, {}, {}, [], base))
         search = SimpleNamespace(with_candidate=richer, rules=rules)
         judging = SimpleNamespace(
             rare_sure=rules.rare_sure, lowered=rules.lowered, stretched=lambda _, name: name in impossible
         )
         judge = SimpleNamespace(nothing=lambda: base.without("rotor_drag"), rules=judging)
-        first = Found("rotor_drag", 1e-9, 99.0, 0.4, {}, {})
+        first = Found("rotor_drag", 1e-9, 99.0, 0.4, {}, {}, [], base)
         found = Trace(base, None, [first], [], search, np.ones(8), np.ones(8), fit_of(base))
         result = trace.with_rare(found, judge)
         assert set(result.hypothesis.present) == {item.name for item in result.found}

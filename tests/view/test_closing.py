@@ -67,7 +67,7 @@ def diagnosis(logs):
         Reported("rotor_drag", 1e-7, values, stds, found),
     ]
     return Diagnosis(
-        Trace(hypothesis, sensors, [found], tried, search, np.ones(8), np.ones(8)),
+        Trace(hypothesis, sensors, [found], tried, search, np.ones(8), np.ones(8), fit=None),
         base,
         reported,
         [],
