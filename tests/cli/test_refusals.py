@@ -259,7 +259,13 @@ def test_flags_in_messages_are_flags_of_the_commands():
     from cfb_mjx.commands import COMMANDS, load
 
     options = {f"--{name.replace('_', '-')}" for command in COMMANDS for name in signature(load(command)).parameters}
-    options |= {"--help", "--version", "--no", "--head"}  # every command's, cfb's, a switch's, ray's
+    options |= {
+        "--help",
+        "--version",
+        "--install-completion",
+        "--no",
+        "--head",
+    }  # every command's, cfb's, a switch's, ray's
     package = Path(cfb_mjx.__file__).parent
     named = {
         (flag, str(source.relative_to(package)))

@@ -122,7 +122,7 @@ def test_a_dry_run_lists_the_tasks_and_writes_nothing(sweep):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--workers", "0"], "--workers 0: at least one"),
+        (["--workers", "0"], "--workers 0: must be at least 1."),
         (["--retries", "-1"], "--retries -1: must be"),
         (["--part", "3"], "--part 3: write I/N"),
         (["--part", "0/2"], "--part 0/2: write I/N"),
@@ -140,7 +140,7 @@ def test_an_argument_of_the_wrong_type_is_found_before_anything_starts(sweep):
     status, said = sweep(over={"seed": [0, "one"]})
     assert status == 2
     assert "s.yaml: task seed=one: " in said
-    assert "--seed" in said
+    assert "seed must be a whole number, found 'one'" in said
     assert not Path("out").exists()
 
 
