@@ -22,7 +22,7 @@ from cfb_mjx.engine.gpu_kernel import Tuning
 from cfb_mjx.model import CATALOGUE, Effect, ParasiticDrag, Quadrotor, rollout, rollout_final
 from cfb_mjx.model.effects.formula import ResidualFormula
 from cfb_mjx.model.quadrotor import prepare
-from cfb_mjx.model.rollout import SYSTEM, in_components
+from cfb_mjx.model.rollout import SYSTEM, _rows, in_components
 from cfb_mjx.model.state import stack
 from cfb_mjx.model.vector import Vec
 
@@ -270,12 +270,12 @@ def test_nothing_changes_on_a_cpu(model, flight):
 
     def before(model, state, commands):
         prepared = prepare(model)
-        final = primitive.fly(SYSTEM, model, in_components(prepared, state, commands), commands, 2)
+        final = primitive.fly(SYSTEM, model, in_components(prepared, state, commands), _rows(commands), 2)
         return stack(final, prepared.parameters.center_of_gravity)
 
     def before_kept(model, state, commands):
         prepared = prepare(model)
-        kept = primitive.fly(SYSTEM, model, in_components(prepared, state, commands), commands, 2, every=4)
+        kept = primitive.fly(SYSTEM, model, in_components(prepared, state, commands), _rows(commands), 2, every=4)
         return stack(kept, prepared.parameters.center_of_gravity)
 
     now = functools.partial(rollout_final, hold=2), functools.partial(rollout, hold=2, every=4)
