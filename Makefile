@@ -13,7 +13,7 @@ INSTALLED = $(VENV)/.installed
 help:
 	@echo "make demo      set up and run the main job; the page is out/demo/index.html"
 	@echo "make test      set up and run the tests"
-	@echo "make test-fast half of the tests, in two minutes, for while you edit"
+	@echo "make test-fast the tests that need little compiling, for while you edit"
 	@echo "make test-long the few tests that take minutes each"
 	@echo "make bench     measure speed beside crazyflow, write docs/performance.md"
 	@echo "make gpu       measure speed on a GPU, write docs/performance-gpu.md"
@@ -31,7 +31,7 @@ test: $(INSTALLED)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
-# What needs little compiling, for while one edits: half of the tests in two minutes.
+# What needs little compiling, for while one edits.
 FAST = tests/bench tests/commands tests/logs tests/parameters tests/engine/test_scalars.py \
   tests/sweep/test_sweep_config.py tests/test_documents.py tests/test_files.py tests/test_readme.py
 
