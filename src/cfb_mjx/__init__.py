@@ -51,22 +51,6 @@ _FUNCTIONS = {
     "rollout_final": "model",
     "sample_drone": "model",
 }
-_COMMANDS = (
-    "Check",
-    "CloseLoop",
-    "Evaluate",
-    "Excite",
-    "Export",
-    "Fit",
-    "FitRotors",
-    "Fly",
-    "Import",
-    "Refine",
-    "Sweep",
-    "Train",
-    "View",
-)
-
 if TYPE_CHECKING:
     from cfb_mjx import (
         bench,
@@ -162,7 +146,7 @@ def __getattr__(name: str):
         return importlib.import_module(f"cfb_mjx.{name}")
     if name == "load":
         return importlib.import_module("cfb_mjx.model").Quadrotor.from_file
-    if name in _FUNCTIONS or name in _COMMANDS:
+    if name in __all__:
         return getattr(importlib.import_module(f"cfb_mjx.{_FUNCTIONS.get(name, 'commands')}"), name)
     raise AttributeError(f"module 'cfb_mjx' has no attribute {name!r}")
 

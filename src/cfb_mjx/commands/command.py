@@ -15,6 +15,7 @@ from typing import (
     TYPE_CHECKING,
     Annotated,
     Any,
+    ClassVar,
     Literal,
     TypeVar,
     Union,
@@ -25,6 +26,7 @@ from typing import (
 )
 
 import tyro
+import yaml
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import FIGURES, require_ending
@@ -116,6 +118,10 @@ def lines_of(files: Mapping[str, Path | None]) -> list[str]:
 class Command:
     """What every command has."""
 
+    lists_in_yaml: ClassVar[bool] = False
+    """Whether a list on the right side of NAME=VALUE is YAML, as in trainings, and not numbers with commas, as in
+    models."""
+
     plugin: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="FILE.py", help=_PLUGIN)] = (
         field(default=(), kw_only=True)
     )
@@ -123,7 +129,11 @@ class Command:
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
         for one in fields(self):
-            value = _taken(getattr(self, one.name), hints[one.name], f"--{one.name.replace('_', '-')}")
+            value, hint = getattr(self, one.name), hints[one.name]
+            if _nested(hint):
+                value = self._pairs(value)
+            else:
+                value = _taken(value, hint, f"--{one.name.replace('_', '-')}")
             object.__setattr__(self, one.name, value)
 
     def run(self) -> Result:
@@ -133,6 +143,21 @@ class Command:
             CfbError: bad input, in one sentence; nothing is written then.
         """
         raise NotImplementedError
+
+    @classmethod
+    def changed(cls, value: Any) -> str:
+        """The right side of NAME=VALUE."""
+        if isinstance(value, list | tuple) and not cls.lists_in_yaml:
+            return ",".join(map(text, value))
+        return text(value)
+
+    @classmethod
+    def _pairs(cls, value: Any) -> tuple[str, ...]:
+        if isinstance(value, str):
+            return (value,)
+        if isinstance(value, Mapping):
+            return tuple(f"{name}={cls.changed(one)}" for name, one in value.items())
+        return tuple(chain.from_iterable((one,) if isinstance(one, str) else one for one in value))
 
     def words(self) -> list[str]:
         """The words of a command line that mean the same, without ``cfb`` and the command's name."""
@@ -167,6 +192,16 @@ def command(cls: _Class) -> _Class:
 
     cls.run = plugged_run
     return dataclass(frozen=True)(cls)
+
+
+def text(value: Any) -> str:
+    """A value as it is typed."""
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    if isinstance(value, list | tuple | dict):
+        value = list(value) if isinstance(value, tuple) else value
+        return yaml.safe_dump(value, default_flow_style=True, width=10**6).strip()
+    return repr(value) if isinstance(value, int | float) else str(value)
 
 
 def default_of(one: Field) -> Any:
@@ -235,14 +270,12 @@ def _plain(kind: Any) -> Any:
 
 
 def _taken(value: Any, hint: Any, option: str) -> Any:
-    """A value as a command holds it: one path for a path's name, a tuple for one of several, words for pairs.
+    """A value as a command holds it: one path for a path's name, a tuple for one of several.
 
     Raises:
         CfbError: a number out of its range, or a choice that there is not.
     """
     kind = held(hint)
-    if _nested(hint):
-        return _words(value)
     if get_origin(kind) is tuple:
         several = (value,) if isinstance(value, str | Path) or not isinstance(value, Sequence) else tuple(value)
         one_of = get_args(kind)[0]
@@ -260,15 +293,3 @@ def _taken(value: Any, hint: Any, option: str) -> Any:
         if isinstance(mark, Within) and not mark.least <= value <= mark.most:
             raise CfbError(f"{option} {value:g}: must be {mark}.")
     return value
-
-
-def _words(value: Any) -> tuple[str, ...]:
-    if isinstance(value, str):
-        return (value,)
-    if isinstance(value, Mapping):
-        return tuple(f"{name}={_text(one)}" for name, one in value.items())
-    return tuple(chain.from_iterable((one,) if isinstance(one, str) else one for one in value))
-
-
-def _text(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)

@@ -191,10 +191,6 @@ class FitRotors(Command):
         if not self.files:
             raise CfbError("fit-rotors needs at least one file; see 'cfb fit-rotors --help'.")
         require_folder(self.output, self.json, self.figure)
-        if self.figure is not None:
-            from cfb_mjx.view.style import check_path
-
-            check_path(self.figure)
         read = read_rotor_files(self.files, self.rotors)  # before jax loads: a bad file is refused at once
         configure_jax(x64=True)
         from cfb_mjx.parameters import load_model_file, save_model_file

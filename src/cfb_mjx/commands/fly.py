@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from cfb_mjx.commands.command import Command, Devices, File, Model, Pairs, Result, Within, command, lines_of
+from cfb_mjx.commands.command import Command, Devices, Figure, File, Model, Pairs, Result, Within, command, lines_of
 from cfb_mjx.documents import require_seed
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, together, write_json
@@ -103,7 +103,7 @@ class Fly(Command):
     noise: bool = True
     seed: int = 0
     json: File = None
-    figure: File = None
+    figure: Figure = None
     recording: File = None
     video: File = None
     log: File = None

@@ -71,6 +71,8 @@ class Train(Command):
         tensorboard: write the numbers of every update and checkpoint for TensorBoard too, into the folder's events.
     """
 
+    lists_in_yaml = True
+
     task: Annotated[Literal["target", "flip"], tyro.conf.Positional]
     output: OutputFolder
     config: Annotated[str | None, tyro.conf.arg(metavar="CONFIG")] = None

@@ -8,7 +8,7 @@ from hashlib import sha256
 from pathlib import PurePath
 from typing import Any
 
-from cfb_mjx.sweep.parameters import text
+from cfb_mjx.commands.command import text
 
 LONGEST = 120
 """Characters of a name; file systems allow 255, and files are named after it."""

@@ -8,9 +8,7 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml
-
-from cfb_mjx.commands.command import Command, default_of, held
+from cfb_mjx.commands.command import Command, default_of, held, text
 from cfb_mjx.documents import told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.sweep.kinds import CHOSEN_HERE, REPEATED, Kind
@@ -89,7 +87,7 @@ class Parameters:
             value = values.get(name)
             if shape == "pairs":
                 changes = {k.partition(".")[2]: v for k, v in values.items() if k.startswith(f"{name}.")}
-                pairs = [f"{k}={self._changed(v)}" for k, v in sorted(changes.items())]
+                pairs = [f"{k}={self.made.changed(v)}" for k, v in sorted(changes.items())]
                 rest += [f"--{_dashed(name)}", *pairs] if pairs else []
             elif value is None:
                 continue
@@ -111,21 +109,6 @@ class Parameters:
         if isinstance(value, list | dict) and shape not in ("files", "texts"):
             raise CfbError(f"{where} takes one value, found {told(value)}; what varies belongs under 'over' or 'each'.")
         return [option, *_texts(value, where)]
-
-    def _changed(self, value: Any) -> str:
-        """The right side of NAME=VALUE: trainings take YAML there, models numbers with commas."""
-        if isinstance(value, list) and self.command != "train":
-            return ",".join(text(v) for v in value)
-        return text(value)
-
-
-def text(value: Any) -> str:
-    """A value as it is typed."""
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, list | dict):
-        return yaml.safe_dump(value, default_flow_style=True, width=10**6).strip()
-    return repr(value) if isinstance(value, int | float) else str(value)
 
 
 def _texts(value: Any, where: str) -> list[str]:
