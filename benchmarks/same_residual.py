@@ -20,6 +20,7 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.bodies import RigidBody
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.identification import fitting, flight_data, shooting, shooting_data
+from cfb_mjx.sysid.identification.solver import RIDGE
 from cfb_mjx.sysid.identification.unknowns import Unknowns, choose
 
 
@@ -30,8 +31,8 @@ class Problem:
     unknowns: Unknowns
     residual: Callable[[np.ndarray], np.ndarray]
     """Compiled: the optimiser's vector to all residuals, flat NumPy."""
-    solve: Callable[[], np.ndarray]
-    """The library's optimiser on this residual, compiled, from the start."""
+    solve: Callable[..., np.ndarray]
+    """A solver of optimistix (none: the library's own) on this residual, compiled, from the start."""
 
 
 def of_shooting(logs: list[FlightLog], nominal: Parameters, names, use_measured: bool = True) -> Problem:
@@ -48,7 +49,7 @@ def of_shooting(logs: list[FlightLog], nominal: Parameters, names, use_measured:
     return Problem(
         unknowns,
         lambda x: np.asarray(residual(jnp.asarray(x), data, whiten)),
-        lambda: np.asarray(shooting._solve(unknowns, unknowns.start, data, body, whiten, False)),
+        lambda solver=None: np.asarray(shooting._solve(unknowns, unknowns.start, data, body, whiten, False, solver)),
     )
 
 
@@ -64,7 +65,9 @@ def of_innovations(logs: list[FlightLog], found: fitting.Fit, nominal: Parameter
     return Problem(
         unknowns,
         lambda x: np.asarray(residual(jnp.asarray(x), found.noise, segments)),
-        lambda: np.asarray(fitting._fit_vector(unknowns, unknowns.start, found.noise, segments, True, False)),
+        lambda solver=None: np.asarray(
+            fitting._fit_vector(unknowns, unknowns.start, found.noise, segments, True, False, RIDGE, solver)
+        ),
     )
 
 

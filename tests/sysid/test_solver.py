@@ -3,11 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from scipy.optimize import least_squares as scipys
 from scipy.optimize import minimize
 
-from cfb_mjx.sysid.identification.solver import RIDGE, least_squares, most_likely
+from cfb_mjx.sysid.identification.solver import RIDGE, GaussNewton, least_squares, most_likely
 
 TIME = np.linspace(0.0, 2.0, 200)
 DATA = 3.0 * np.exp(-2.0 * TIME) + 0.5 + 0.01 * np.random.default_rng(0).normal(size=TIME.shape)
@@ -35,6 +36,32 @@ def test_it_finds_what_scipy_finds(residual, start):
     theirs = scipys(whole, start, xtol=1e-12, ftol=1e-12, gtol=1e-12)
     spread = np.sqrt(np.diag(np.linalg.inv(theirs.jac.T @ theirs.jac)))
     assert np.abs((np.asarray(found) - theirs.x) / spread).max() < 2e-3
+
+
+@pytest.mark.parametrize("name", ["LevenbergMarquardt", "Dogleg"])
+@pytest.mark.parametrize(("residual", "start"), [(decay, [1.0, 0.0, 0.0]), (valley, [-1.2, 1.0])])
+def test_solvers_of_optimistix_take_its_place(name, residual, start):
+    start = jnp.asarray(start, float)
+    theirs = least_squares(residual, start, solver=getattr(optx, name)(rtol=1e-9, atol=1e-9))
+    assert np.asarray(least_squares(residual, start)) == pytest.approx(np.asarray(theirs), abs=1e-4)
+
+
+def test_it_is_a_solver_for_anybody():
+    """With optimistix's own arguments: auxiliary output, the number of steps, and a derivative through the solution."""
+
+    def residual(x, truth):
+        error = decay(x)[0] - decay(jnp.asarray([truth, 0.7, 0.5]))[0]
+        return error, {"worst": jnp.max(jnp.abs(error))}
+
+    def solved(truth):
+        return optx.least_squares(residual, GaussNewton(), jnp.asarray([1.0, 0.0, 0.0]), truth, has_aux=True)
+
+    solution = solved(3.0)
+    assert solution.result == optx.RESULTS.successful
+    assert np.asarray(solution.value) == pytest.approx([3.0, 0.7, 0.5], abs=1e-6)
+    assert float(solution.aux["worst"]) < 1e-3
+    assert 1 < int(solution.stats["num_steps"]) < 20
+    assert np.asarray(jax.jacfwd(lambda t: solved(t).value)(3.0)) == pytest.approx([1.0, 0.0, 0.0], abs=1e-4)
 
 
 def test_a_start_without_a_cost_is_left_alone():

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array
 
 from cfb_mjx.devices import Devices
@@ -76,6 +77,7 @@ def fit(
     progress: Callable[[int, int], None] | None = None,
     over: Devices | None = None,
     mass_std: float | None = None,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
 ) -> Fit:
     """Fit parameters to flights; what the flights cannot tell gets no number.
 
@@ -95,6 +97,8 @@ def fit(
         over: devices to divide the segments of the flights over.
         mass_std: standard deviation of the nominal mass, kg, which the intervals of all that scales with it take up
             (innovation only); None takes `MASS_STD` of the mass, 0 an exact one. Without meaning if the mass is fitted.
+        solver: least-squares solver of optimistix, such as ``optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)``; None
+            takes `GaussNewton`.
 
     Raises:
         CfbError: unknown parameters, or logs without enough contiguous data.
@@ -104,7 +108,8 @@ def fit(
     if estimator == "auto":
         estimator = "shooting" if "pose_delay" in asked else "innovation"
     if estimator == "shooting":
-        return shoot(logs, nominal, asked, use_measured=use_measured, robust=robust, progress=progress, over=over)
+        how = {"use_measured": use_measured, "robust": robust, "progress": progress, "over": over, "solver": solver}
+        return shoot(logs, nominal, asked, **how)
     data = prepare(list(logs))
     if data.segments is None or data.rows < 100:
         names = ", ".join(log.name for log in logs)
@@ -122,7 +127,7 @@ def fit(
         ridge = jnp.asarray([1 / PRIORS.get(n, 1 / RIDGE) if n in free else HELD for n in unknowns.names])
         if over is not None:  # placed as the rounds return it, or the second would compile anew
             vector, noise, ridge = over.whole((vector, noise, ridge))
-        vector, noise = _settled(unknowns, vector, noise, segments, use_measured, robust, ridge, progress)
+        vector, noise = _settled(unknowns, vector, noise, segments, use_measured, robust, ridge, solver, progress)
         if (
             not contradicted
             and "command_hold" not in asked
@@ -131,7 +136,7 @@ def fit(
             # A free hold takes every step of a command for uncertain, and so the rotors' own readings for better than
             # they are: where commands come in time with the rows, all motor constants lean by several deviations.
             timed = replace(unknowns, timed=jnp.ones(()))
-            other = _settled(timed, vector, noise, segments, use_measured, robust, ridge, progress)
+            other = _settled(timed, vector, noise, segments, use_measured, robust, ridge, solver, progress)
             fits = (unknowns, vector, noise), (timed, *other)
             free_hold, in_time = (float(_surprise(*each, segments, use_measured, robust)) for each in fits)
             if in_time <= free_hold:
@@ -193,13 +198,13 @@ def _playing(asked: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _settled(
-    unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured, robust, ridge, progress
+    unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured, robust, ridge, solver, progress
 ) -> tuple[Array, Noise]:
     """Vector and noise levels of largest likelihood, found in turns."""
     for done in range(ROUNDS):
         before, levels = vector, noise
         noise = fit_noise(unknowns, vector, noise, segments, use_measured, robust)
-        vector = _fit_vector(unknowns, vector, noise, segments, use_measured, robust, ridge)
+        vector = _fit_vector(unknowns, vector, noise, segments, use_measured, robust, ridge, solver)
         if progress is not None:
             progress(min(done + 1, ROUNDS - 1), ROUNDS)
         # A vector that the flights hardly tell may creep for ever; what creeps under the same noise is of no matter.
@@ -268,10 +273,12 @@ def _surprise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_
 
 
 @eqx.filter_jit
-def _fit_vector(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool, ridge):
+def _fit_vector(
+    unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool, ridge, solver=None
+):
     fixed = (noise, segments, use_measured, robust)
     weighed = _weights(unknowns, vector, *fixed)
-    return least_squares(lambda x: _residual(x, unknowns, *fixed, weighed), vector, ridge)
+    return least_squares(lambda x: _residual(x, unknowns, *fixed, weighed), vector, ridge, solver)
 
 
 @eqx.filter_jit

@@ -20,6 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array, Float
 
 from cfb_mjx.devices import Devices, mapped
@@ -52,6 +53,7 @@ def shoot(
     body: Body | None = None,
     progress: Callable[[int, int], None] | None = None,
     over: Devices | None = None,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
 ) -> Fit:
     """Least squares on the prediction errors every 20 ms up to 200 ms, weighted by the sensors' noise.
 
@@ -67,6 +69,7 @@ def shoot(
         body: the body to predict with, `RigidBody()` or `MjxBody(floor=False)`.
         progress: called with (done, total).
         over: devices to divide the windows over.
+        solver: least-squares solver of optimistix; None takes `GaussNewton`.
 
     Raises:
         CfbError: unknown parameters, or no window in any log.
@@ -86,7 +89,7 @@ def shoot(
             data = batches(logs, float(unknowns.apply(vector).pose_delay), 0.0, use_measured, over)
         whiten = _whitening(unknowns, vector, data, body, free_start)
         whiten = whiten if over is None else over.along(whiten)
-        vector = _solve(unknowns, vector, data, body, whiten, robust)
+        vector = _solve(unknowns, vector, data, body, whiten, robust, solver)
         if progress is not None:
             progress(done + 1, ROUNDS)
         # With measured starts and a known delay there is nothing to repeat.
@@ -209,9 +212,9 @@ def _residual(vector, unknowns: Unknowns, data: list[Batch], body: Body, whiten:
 
 
 @eqx.filter_jit
-def _solve(unknowns: Unknowns, vector, data: list[Batch], body: Body, whiten: list[Array], robust: bool):
+def _solve(unknowns: Unknowns, vector, data: list[Batch], body: Body, whiten: list[Array], robust: bool, solver=None):
     residual = partial(_residual, unknowns=unknowns, data=data, body=body, whiten=whiten, robust=robust)
-    return least_squares(residual, vector)
+    return least_squares(residual, vector, solver=solver)
 
 
 @eqx.filter_jit

@@ -1,17 +1,21 @@
-"""The fits' one solver: Gauss-Newton and Fisher's scoring, damped only where a step fails.
+"""Gauss-Newton and Fisher's scoring, damped only where a step fails.
 
-Residuals come by the hundred thousand and unknowns by the ten, so that one linearisation costs as much as all else
-together: a library's Levenberg-Marquardt, which starts damped and stops on the size of a step, spends twice as many.
-Its BFGS, which knows nothing of how errors and variances make the likelihood, took 150 to 270 steps to noise levels.
+`GaussNewton` is an optimistix solver: `least_squares` takes any other in its place, and
+``optx.least_squares(residual, GaussNewton(), start)`` works on anybody's residual. Residuals come by the hundred
+thousand and unknowns by the ten, so that one linearisation costs as much as all else together. optimistix's
+Levenberg-Marquardt starts damped, stops on the size of a step and factorises by QR (docs/fit-speed.md measures both).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, PyTree
 
 from cfb_mjx.sysid.identification.robust import surprise
 
@@ -24,27 +28,122 @@ FIRST_DAMPING = 1e-3
 MAX_STEPS = 60
 
 
-def least_squares(
-    residual: Callable[[Array], PyTree], start: Float[Array, " k"], ridge: Float[Array, " k"] | float = RIDGE
-) -> Float[Array, " k"]:
-    """The minimum of the sum of squares, from ``start``; forward-mode Jacobian.
+class Quadratic(NamedTuple):
+    """A cost about a point: its value, half its gradient, and half its (expected) Hessian."""
 
-    ``ridge`` is one over the standard deviation of each unknown's prior about zero; a large one holds it.
+    cost: Float[Array, ""]
+    slope: Float[Array, " k"]
+    curvature: Float[Array, "k k"]
 
-    A full Gauss-Newton step is tried first; where it raises the cost (or makes it NaN) the diagonal is raised as in
-    Marquardt (1963) until a step lowers it. Normal equations, not QR: they are what costs, and the uncertainty, which
-    condition numbers would spoil, is computed elsewhere by QR (`uncertainty`).
+
+class Descent(NamedTuple):
+    """The state of a damped descent beside the point that it has reached."""
+
+    here: Quadratic
+    damping: Float[Array, ""]
+    step: Float[Array, " k"]
+    """To be tried next."""
+    gain: Float[Array, ""]
+    """What the step lowers the quadratic by: its squared length in standard deviations of the estimate."""
+
+    @classmethod
+    def first(cls, start: Float[Array, " k"]) -> Descent:
+        """Nothing is known at first and the first step leads nowhere, so that the linearisation is compiled once."""
+        zero = jnp.zeros_like(start)
+        unknown = jnp.full_like(zero[0], jnp.inf)
+        nothing = Quadratic(unknown, zero, jnp.eye(len(start), dtype=start.dtype))
+        return cls(nothing, jnp.zeros_like(unknown), zero, unknown)
+
+    def advanced(
+        self, linearised: Callable[[Array], Quadratic], x: Float[Array, " k"]
+    ) -> tuple[Float[Array, " k"], Descent]:
+        """Try the step from ``x``: where it raises the cost (or makes it NaN) stay, and damp the next one."""
+        there = linearised(x + self.step)
+        better = there.cost <= self.here.cost
+        here = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, self.here)
+        eased = jnp.where(self.damping > FIRST_DAMPING, 0.1 * self.damping, 0.0)
+        damping = jnp.where(better, eased, jnp.maximum(10 * self.damping, FIRST_DAMPING))
+        raised = here.curvature + damping * jnp.diag(jnp.diag(here.curvature))
+        step = -jnp.linalg.solve(raised, here.slope)
+        return jnp.where(better, x + self.step, x), Descent(here, damping, step, -here.slope @ step)
+
+    @property
+    def going_on(self) -> Bool[Array, ""]:
+        """Whether the step is worth trying; False where its gain is NaN."""
+        return self.gain > SETTLED
+
+    def ended(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
+        """The last step is too short to be worth another linearisation, and is taken on trust."""
+        return jnp.where(self.gain <= SETTLED, x + self.step, x)
+
+
+class _State(eqx.Module):
+    descent: Descent
+    aux: Any
+    """In the shape that optimistix asks for; what it holds at the end is computed there."""
+
+
+class GaussNewton(optx.AbstractLeastSquaresSolver):
+    """Full Gauss-Newton steps on the normal equations, damped as in Marquardt (1963) where one raises the cost.
+
+    A solver for `optimistix.least_squares` whose unknowns are one vector. Jacobians are forward-mode. It ends where the
+    next step is shorter than a thousandth of the estimate's standard deviation, if residuals are divided by their
+    noise: ``rtol`` and ``atol`` are not read. Normal equations, not QR: they are what costs. The uncertainty, which
+    their condition numbers would spoil, is computed elsewhere by QR (`uncertainty`).
     """
 
-    def linearised(x):
-        values, slopes = _slopes(residual, x)
-        cost, slope, curvature = _prior(ridge, x)
-        for value, part in zip(jax.tree.leaves(values), jax.tree.leaves(slopes), strict=True):
-            value, part = value.ravel(), part.reshape(len(x), -1)
-            cost, slope, curvature = cost + value @ value, slope + part @ value, curvature + part @ part.T
-        return cost, slope, curvature
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable[[PyTree], Array] = optx.max_norm
 
-    return _descended(linearised, start)
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _State:
+        """The state before the first step; the arguments are optimistix's."""
+        return _State(Descent.first(y), jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct))
+
+    def step(self, fn, y, args, options, state, tags) -> tuple[Array, _State, Any]:
+        """Linearise at the proposed point, accept it or not, propose another."""
+        y, descent = state.descent.advanced(lambda x: _linearised(lambda x: fn(x, args)[0], x), y)
+        return y, _State(descent, state.aux), state.aux
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        """Whether the next step is too short to matter."""
+        return ~state.descent.going_on, optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result) -> tuple[Array, Any, dict[str, Any]]:
+        """Take the last step."""
+        y = state.descent.ended(y)
+        return y, fn(y, args)[1], {}
+
+
+def least_squares(
+    residual: Callable[[Array], PyTree],
+    start: Float[Array, " k"],
+    ridge: Float[Array, " k"] | float = RIDGE,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
+) -> Float[Array, " k"]:
+    """The minimum of the sum of squares, from ``start``.
+
+    Args:
+        residual: of the unknowns; a pytree of arrays, each divided by its noise.
+        start: where to begin.
+        ridge: one over the standard deviation of each unknown's prior about zero; a large one holds it.
+        solver: of optimistix, such as ``optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)``; None takes `GaussNewton`.
+    """
+
+    def with_prior(x, _):
+        return residual(x), ridge * x
+
+    solver = GaussNewton() if solver is None else solver
+    return optx.least_squares(with_prior, solver, start, max_steps=MAX_STEPS, throw=False).value
+
+
+def _linearised(residual: Callable[[Array], PyTree], x: Float[Array, " k"]) -> Quadratic:
+    values, slopes = _slopes(residual, x)
+    cost, slope, curvature = jnp.zeros_like(x[0]), jnp.zeros_like(x), jnp.zeros((len(x), len(x)), x.dtype)
+    for value, part in zip(jax.tree.leaves(values), jax.tree.leaves(slopes), strict=True):
+        value, part = value.ravel(), part.reshape(len(x), -1)
+        cost, slope, curvature = cost + value @ value, slope + part @ value, curvature + part @ part.T
+    return Quadratic(cost, slope, curvature)
 
 
 def most_likely(
@@ -53,7 +152,8 @@ def most_likely(
     """The maximum of a Gaussian likelihood whose variances move too, from ``start``: Fisher's scoring.
 
     ``predicted`` gives errors and the logarithms of their variances. A level that hardly counts has next to no slope;
-    the expected curvature, which vanishes faster, still leads back from there, where a line search would stay.
+    the expected curvature, which vanishes faster, still leads back from there, where a line search would stay. (BFGS,
+    which knows nothing of how errors and variances make the likelihood, took 150 to 270 steps.)
     """
 
     def surprising(whitened):
@@ -66,13 +166,21 @@ def most_likely(
         moved, spread = (moved * weight).reshape(len(x), -1), spread.reshape(len(x), -1)
         surprised, pull = jax.value_and_grad(surprising)(whitened)
         cost, slope, curvature = _prior(ridge, x)
-        return (
+        return Quadratic(
             cost + jnp.sum(log_variance) + surprised,
             slope + 0.5 * (jnp.sum(spread, axis=1) + (moved - 0.5 * whitened * spread) @ pull),
             curvature + moved @ moved.T + 0.5 * spread @ spread.T,
         )
 
-    return _descended(linearised, start)
+    def advance(carry):
+        x, descent, done = carry
+        return *descent.advanced(linearised, x), done + 1
+
+    def unsettled(carry):
+        return (carry[2] < MAX_STEPS) & carry[1].going_on
+
+    x, descent, _ = jax.lax.while_loop(unsettled, advance, (start, Descent.first(start), 0))
+    return descent.ended(x)
 
 
 def _slopes(function, x):
@@ -87,35 +195,3 @@ def _slopes(function, x):
 def _prior(ridge, x):
     prior = jnp.broadcast_to(jnp.asarray(ridge) ** 2, x.shape)
     return x @ (prior * x), prior * x, jnp.diag(prior)
-
-
-def _descended(linearised: Callable, start: Float[Array, " k"]) -> Float[Array, " k"]:
-    """Where ``linearised`` (cost, half its slope, half its curvature) is least, from ``start``."""
-
-    def proposed(slope, curvature, damping):
-        raised = curvature + damping * jnp.diag(jnp.diag(curvature))
-        step = -jnp.linalg.solve(raised, slope)
-        return step, -slope @ step
-
-    def unsettled(carry):
-        _, _, _, (_, gain), done = carry
-        # Not `gain > SETTLED`: a NaN gain must not pass for a step worth trying.
-        return (done < MAX_STEPS) & (gain > SETTLED)
-
-    def advance(carry):
-        x, here, damping, (step, _), done = carry
-        there = linearised(x + step)
-        better = there[0] <= here[0]
-        here = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, here)
-        eased = jnp.where(damping > FIRST_DAMPING, 0.1 * damping, 0.0)
-        damping = jnp.where(better, eased, jnp.maximum(10 * damping, FIRST_DAMPING))
-        return jnp.where(better, x + step, x), here, damping, proposed(here[1], here[2], damping), done + 1
-
-    # Nothing is known at first and the first step leads nowhere, so that the linearisation is compiled once only.
-    zero = jnp.zeros_like(start)
-    unknown = jnp.full_like(zero[0], jnp.inf)
-    nothing = unknown, zero, jnp.eye(len(start), dtype=start.dtype)
-    carry = (start, nothing, jnp.zeros_like(unknown), (zero, unknown), 0)
-    x, _, _, (step, gain), _ = jax.lax.while_loop(unsettled, advance, carry)
-    # The last step is too short to be worth another linearisation, and is taken on trust.
-    return jnp.where(gain <= SETTLED, x + step, x)
