@@ -1,9 +1,9 @@
-"""The loop closed all the way, for many drones: fly, diagnose, retrain, fly again (cfb demo-loop).
+"""Run `cfb demo-loop` on many simulated drones: fly, correct the model, retrain, fly again.
 
     python scripts/demo_loop.py [--effects payload wind ...] [--seeds 3] [--page-only]
 
-A few minutes for each of effects x seeds; what is done is kept in out/demo-loop, and a run begun anew goes on. Writes
-benchmarks/closed-loop.json, which grows drone by drone, docs/closed-loop.md and docs/closed-loop.png.
+Each drone (one effect and one seed) takes a few minutes. Finished drones are kept in out/demo-loop, so an interrupted
+run continues. Writes benchmarks/closed-loop.json after every drone, docs/closed-loop.md and docs/closed-loop.png.
 """
 
 import argparse
@@ -22,25 +22,25 @@ EFFECTS = (
     "battery_sag",
     "rotor_drag",
 )
-"""Chosen before any corrected policy had flown: what should push a drone away from its target, a battery whose voltage
-no policy sees, and a drag that hovering should hardly notice."""
+"""Chosen before any corrected policy had flown: effects that should push a drone away from its target, a battery whose
+voltage no policy observes, and a drag that should hardly affect hovering."""
 RESULTS = ROOT / "benchmarks" / "closed-loop.json"
 FIGURE = ROOT / "docs" / "closed-loop.png"
 
 
 def main() -> None:
-    """Fly what is missing, write."""
+    """Fly the missing drones and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--effects", nargs="+", default=list(EFFECTS))
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--seed", type=int, default=61_000)
     parser.add_argument("--folder", type=Path, default=ROOT / "out" / "demo-loop")
-    parser.add_argument("--page-only", action="store_true", help="write the page from the results that are there")
+    parser.add_argument("--page-only", action="store_true", help="write the page from the stored results")
     arguments = parser.parse_args()
     from cfb_mjx.files import write_json, write_text
     from cfb_mjx.loop.cells import cells_of
+    from cfb_mjx.loop.page import loop_figure
     from cfb_mjx.runtime import configure_jax
-    from cfb_mjx.view.closed_loop import loop_figure
 
     cells = cells_of(arguments.effects, arguments.seeds, arguments.seed)
     if not arguments.page_only:
@@ -56,8 +56,8 @@ def main() -> None:
 
 
 def page(results: dict, planned: int) -> str:
-    """The Markdown page."""
-    from cfb_mjx.view.closed_loop import TITLE, lead, sections
+    """Return the page as Markdown."""
+    from cfb_mjx.loop.page import TITLE, lead, sections
 
     done = list(results["cells"].values())
     lines = [
@@ -65,10 +65,19 @@ def page(results: dict, planned: int) -> str:
         "",
         facts_line("python scripts/demo_loop.py", [cell["trials"] for cell in done]),
         "",
+        "This page shows whether a drone flies better after its model was corrected. Policies trained on the declared",
+        "and on the corrected model fly the same simulated drones. To run it on drones of your choice:",
+        "",
+        "```sh",
+        "cfb demo-loop --effects payload wind --seeds 3 -o loop",
+        "```",
+        "",
+        "The files that the command writes are described in [closing-the-loop.md](closing-the-loop.md).",
+        "",
         lead(results),
     ]
     if len(done) < planned:
-        lines += ["", f"{len(done)} of {planned} drones have been flown so far; the command goes on with the rest."]
+        lines += ["", f"{len(done)} of {planned} drones have been flown so far; the command continues with the rest."]
     for section in sections(results, FIGURE):
         lines += ["", f"## {section.title}"]
         for paragraph in section.paragraphs:

@@ -1,10 +1,11 @@
-"""What each choice in the training is worth: learning curves of variants, three seeds each.
+"""Measure the learning curves of variants of the training, each with several seeds.
 
     python scripts/learning_curves.py [--seeds 3] [--only VARIANT ...] [--page-only]
 
-Judged on the nominal drone, and but for those with `random` trained on it alone: there the time to a hover error says
-most. `brax` is the trainer of Brax itself. What is done is kept in benchmarks/learning-curves.json, and a run begun
-anew goes on. Writes docs/learning-curves.md and its figure.
+Variants with `random` in the name train on randomised drones, the others on the nominal drone only. All are evaluated
+on the nominal drone, where the time to a given hover error is most informative. `brax` is Brax's own trainer. Finished
+trainings are kept in benchmarks/learning-curves.json, so an interrupted run continues. Writes docs/learning-curves.md
+and its figure.
 """
 
 import csv
@@ -30,35 +31,35 @@ VARIANTS = {
     "quick": ("quick", ("checkpoints=8",), "`cfb train target --config quick`: randomisation x 0.25"),
     "ppo": ("target", PPO, "PPO as in `target`"),
     "ppo-paper": ("target-paper", PPO, "the paper's reward as printed"),
-    "ppo-straight": ("target", (*PPO, *STRAIGHT), "positions and velocities shown as they are"),
-    "ppo-alone": ("target", (*PPO, *ALONE), "no copies"),
+    "ppo-straight": ("target", (*PPO, *STRAIGHT), "positions and velocities observed on a linear scale"),
+    "ppo-alone": ("target", (*PPO, *ALONE), "no copies (every drone flies its own episode)"),
     "ppo-random": ("target", RANDOM, "PPO as in `target`, with the paper's randomisation"),
     "ppo-random-paper": ("target-paper", RANDOM, "the paper's reward as printed"),
-    "ppo-random-no-bell": ("target", (*RANDOM, *NO_BELL), "no bell about the target, other weights kept"),
-    "ppo-random-wide": ("target", (*RANDOM, *WIDE), "a bell that is wide in speed: 1 m/s in place of 0.4"),
-    "ppo-random-rough": ("target", (*RANDOM, *ROUGH), "no price on changes of the command"),
-    "ppo-random-straight": ("target", (*RANDOM, *STRAIGHT), "positions and velocities shown as they are"),
+    "ppo-random-no-bell": ("target", (*RANDOM, *NO_BELL), "no bell-shaped reward at the target, other weights kept"),
+    "ppo-random-wide": ("target", (*RANDOM, *WIDE), "a bell that is wider in speed: 1 m/s instead of 0.4"),
+    "ppo-random-rough": ("target", (*RANDOM, *ROUGH), "no penalty on changes of the command"),
+    "ppo-random-straight": ("target", (*RANDOM, *STRAIGHT), "positions and velocities observed on a linear scale"),
     "ppo-random-adaptive": (
         "target-adaptive-ppo",
         (),
-        "the observation of `target-adaptive`, a narrower bell, longer: `--config target-adaptive-ppo`",
+        "the observation of `target-adaptive`, a narrower bell, a longer training: `--config target-adaptive-ppo`",
     ),
-    "ppo-random-alone": ("target", (*RANDOM, *ALONE), "no copies"),
+    "ppo-random-alone": ("target", (*RANDOM, *ALONE), "no copies (every drone flies its own episode)"),
 }
 LONG = "ppo-random-adaptive"
-"""Not in the figure, whose time axis it would stretch."""
+"""Variant left out of the figure, whose time axis it would stretch."""
 MARKS_MM = (100, 50, 25)
 BRAX = {
-    "brax": (PPO, "Brax's own trainer, the numbers of `ppo-alone`, observations normalised"),
+    "brax": (PPO, "Brax's own trainer, the settings of `ppo-alone`, observations normalised"),
     "brax-random": (RANDOM, "the same with the paper's randomisation"),
 }
-"""Whose task and numbers Brax's trainer gets, and what it is."""
+"""Changes of configuration and description of each variant that Brax's trainer runs."""
 SB3 = ROOT / "benchmarks" / "sb3.json"
 WHAT = {name: text for name, (*_, text) in {**VARIANTS, **BRAX}.items()}
 
 
 def main() -> None:
-    """Train what is missing, write."""
+    """Train the missing variants and write the page."""
     arguments = study_arguments(__doc__, "--only", WHAT)
     from cfb_mjx.files import write_text
 
@@ -80,7 +81,7 @@ def main() -> None:
     found = {}
     for key, run in json.loads(results.read_text()).items():
         for row in run["curve"]:
-            # JSON knows no infinity: every flight was lost.
+            # JSON has no infinity: null means that every flight failed.
             row |= {key: float("inf") for key in ("hover_mm", "random_mm") if key in row and row[key] is None}
         found.setdefault(key.rpartition("-")[0], []).append(run)
     found = {name: found[name] for name in WHAT if name in found}
@@ -90,18 +91,19 @@ def main() -> None:
 
 
 def judged(judge):
-    """Controller to its score, with late and noisy sensors."""
+    """Return a function from controller to score that includes the tests with late and noisy sensors."""
     return lambda controller: judge(controller) | {"sensors": judge.with_sensors(controller)}
 
 
 def by_brax(name: str, seed: int, results) -> None:
-    """Train with `brax.training.agents.ppo` on as many commands, unless ``results`` holds it; judged on the way."""
+    """Train with `brax.training.agents.ppo` for as many commands, unless ``results`` has this run already."""
     import functools
 
     import jax.numpy as jnp
     from brax.training.agents.ppo import networks
 
-    from cfb_mjx.envs.brax_env import BraxEnv, controller_of, wrap
+    from cfb_mjx.control import brax_controller
+    from cfb_mjx.envs.brax_env import BraxEnv, wrap
     from cfb_mjx.files import write_json
     from cfb_mjx.train.brax_compat import brax_ppo
     from cfb_mjx.train.config import load_config
@@ -136,7 +138,7 @@ def by_brax(name: str, seed: int, results) -> None:
         nonlocal judging
         paused = time.perf_counter()
         seconds = paused - began - judging
-        score = judge(controller_of(params, task.layout, normalized=True))
+        score = judge(brax_controller(params, task.layout, normalized=True))
         nominal, random = score["nominal"], score.get("random")
         lost = nominal["hover_mm"] is None
         judging += time.perf_counter() - paused
@@ -170,11 +172,11 @@ def by_brax(name: str, seed: int, results) -> None:
             ),
             wrap_env_fn=wrap,
         )
-    score = judged(judge)(controller_of(params, task.layout, normalized=True))
+    score = judged(judge)(brax_controller(params, task.layout, normalized=True))
     found[f"{name}-{seed}"] = {
         "seed": seed,
         "score": score,
-        # Before it has flown there is nothing of a curve.
+        # Brax also evaluates before the first command; that is no point of the curve.
         "curve": [row for row in rows if row["commands"]],
         "config": {"trainer": "brax", "magnitude": config.randomisation.magnitude, **settings},
         "environment": environment(),
@@ -183,7 +185,7 @@ def by_brax(name: str, seed: int, results) -> None:
 
 
 def _reached(run: dict, mark: float) -> tuple[float, float] | None:
-    """Seconds and millions of commands at the first point of the curve from which it stays below ``mark``."""
+    """Seconds and millions of commands from which on the curve stays below ``mark``; None if never."""
     stays = None
     for row in run["curve"]:
         if row["hover_mm"] > mark:
@@ -196,7 +198,7 @@ def _reached(run: dict, mark: float) -> tuple[float, float] | None:
 def _cell(runs: list[dict], mark: float) -> str:
     there = [reached for reached in (_reached(run, mark) for run in runs) if reached is not None]
     if not there:
-        return "not"
+        return "never"
     seconds, commands = (statistics.median(x) for x in zip(*there, strict=True))
     lost = f" ({len(there)} of {len(runs)})" if len(there) < len(runs) else ""
     return f"{seconds:.0f} s, {commands:.1f} M{lost}"
@@ -207,21 +209,34 @@ def page(found: dict[str, list[dict]]) -> str:
     lines = [
         "# Learning curves",
         "",
+        "This page is for users who change the configuration of a training: it shows what each choice gains or costs. "
+        "A variant is an ordinary training with other settings, such as",
+        "",
+        "```sh",
+        "cfb train target --set ppo.smoothness=0 -o out/rough",
+        "```",
+        "",
         facts_line("python scripts/learning_curves.py", [run for runs in found.values() for run in runs]),
         "",
-        "From random weights, on the nominal drone but for those with `random`; hover error there by the paper's test "
-        "(mean of 64 flights with noise). Time is that of the updates, compiling the first included, judging not, on a "
-        "machine that did other things beside. Reached: the first point of the curve from which it stays below the "
-        "mark, median over the seeds; where not all got there it says how many did. On randomised drones: median of "
-        "256 of the training's own magnitude, where training judged it. Command std: of the last policy on the nominal "
-        "drone, with the pose 24 ms late and the gyro read on the drone, and with all 16 ms late (in the model: 8 ms); "
-        "above 0.04 the drone swings.",
+        "Every training begins with random weights. Variants with `random` in their name train on randomised drones, "
+        "the others on the nominal drone only. The columns of the table:",
+        "",
+        "- below N mm: time and number of commands from which on the hover error on the nominal drone (the paper's "
+        "test, mean of 64 flights with noise) stays below N mm. Median over the seeds; if some seeds do not get there, "
+        "the cell says how many do.",
+        "- at the end: hover error at the last checkpoint, median [least, greatest] of the seeds.",
+        "- time: the duration of the updates, with the compilation of the first and without evaluation, on a machine "
+        "that also ran other programs.",
+        "- on randomised drones: hover error, median of 256 drones drawn with the training's own magnitude. Empty "
+        "where the training did not measure it.",
+        "- std: command std of the last policy on the nominal drone, with the pose 24 ms late and the gyro read on the "
+        "drone, and with both 16 ms late (8 ms in the model). Above 0.04 the drone oscillates.",
         "",
         "![learning curves](learning-curves.png)",
         "",
-        "| variant | what it changes | seeds | "
+        "| variant | change | seeds | "
         + " | ".join(f"below {m} mm" for m in MARKS_MM)
-        + " | at the end, mm | on randomised drones, mm | std, 24 ms | std, 16 ms | s |",
+        + " | at the end, mm | on randomised drones, mm | std, 24 ms | std, 16 ms | time, s |",
         "|---|---|---|" + "---|" * len(MARKS_MM) + "---|---|---|---|---|",
     ]
     for name, runs in found.items():
@@ -232,8 +247,8 @@ def page(found: dict[str, list[dict]]) -> str:
         cells.append(f"{statistics.median(random):.0f} [{min(random):.0f}, {max(random):.0f}]" if random else "")
         for late in (0, 1):
             stds = [list(run["score"]["sensors"].values())[late]["command_std"] for run in runs]
-            # None where every flight was lost.
-            cells.append("all lost" if None in stds else f"{statistics.median(stds):.3f}")
+            # None where every flight failed.
+            cells.append("all failed" if None in stds else f"{statistics.median(stds):.3f}")
         cells.append(f"{statistics.median(run['curve'][-1]['seconds'] for run in runs):.0f}")
         lines.append("| " + " | ".join(cells) + " |")
     lines += ["", "## The shipped `target`", *of_shipped("cfb train target", "-1")]
@@ -241,7 +256,7 @@ def page(found: dict[str, list[dict]]) -> str:
 
 
 def of_sb3() -> list[str]:
-    """What the example with Stable-Baselines3 came to."""
+    """Section with the result of the example with Stable-Baselines3."""
     run = json.loads(SB3.read_text())
     return [
         "",
@@ -249,22 +264,23 @@ def of_sb3() -> list[str]:
         "",
         facts_line(f"python examples/train_with_sb3.py --write {SB3.relative_to(ROOT)}", [run]),
         "",
-        f"stable_baselines3 {run['environment']['stable_baselines3']}, on the nominal drone alone: "
-        f"{run['commands'] / 1e6:.1f} M commands in {run['seconds']:.0f} s, on a machine that did other things beside. "
-        f"Then, from within 0.7 m, its mean distance to the target after the first of 6 s is {run['mean_mm']:.0f} mm, "
-        f"the worst of 64 flights' {run['worst_mm']:.0f} mm.",
+        f"stable_baselines3 {run['environment']['stable_baselines3']} trained on the nominal drone only: "
+        f"{run['commands'] / 1e6:.1f} M commands in {run['seconds']:.0f} s, on a machine that also ran other programs. "
+        "The policy then flew 64 times for 6 s from within 0.7 m of the target. Without the first second, its mean "
+        f"distance to the target is {run['mean_mm']:.0f} mm, in the worst flight {run['worst_mm']:.0f} mm.",
     ]
 
 
 def of_shipped(command: str, part: str) -> list[str]:
-    """The curve that was kept with the shipped `target`, of the part of its training that ``command`` was."""
+    """Learning curve stored with the shipped `target`, for the part of its training that ``command`` ran."""
     folder = ROOT / "src" / "cfb_mjx" / "policies" / "target"
     facts = json.loads((folder / f"training{part}.json").read_text())["environment"]
     rows = list(csv.DictReader((folder / f"curve{part}.csv").read_text().splitlines()))
     lines = [
         "",
         f"`{command}`, {facts['date']}, {facts['processor']}, Python {facts['python']}, jax {facts['jax']}. "
-        "Flown with the delays of its training; on randomised drones: median of 256 drawn at the paper's magnitude.",
+        "Evaluated with the delays of the training. On randomised drones: median of 256 drones drawn at the paper's "
+        "magnitude.",
         "",
         "| commands | time | hover, nominal, mm | command std | on randomised drones, mm | failed |",
         "|---|---|---|---|---|---|",
@@ -278,7 +294,7 @@ def of_shipped(command: str, part: str) -> list[str]:
 
 
 def figure(found: dict[str, list[dict]], path) -> None:
-    """Hover error over seconds and over commands: the seeds' median, and their span."""
+    """Plot the hover error over time and over commands: median and range of the seeds."""
     import numpy as np
     from matplotlib.ticker import FormatStrFormatter
 
@@ -296,7 +312,7 @@ def figure(found: dict[str, list[dict]], path) -> None:
         "#882255",
         "#44AA99",
     )
-    # Trained on randomised drones: the colour of what is the same on the nominal one, dashed.
+    # A variant on randomised drones has the colour of its twin on the nominal drone, dashed.
     plain = list(dict.fromkeys(name.replace("-random", "") for name in found))
     colour_of = dict(zip(plain, colours[: len(plain)], strict=True))
     with context():
@@ -309,8 +325,8 @@ def figure(found: dict[str, list[dict]], path) -> None:
                 at = scale * np.median([[row[key] for row in run["curve"]] for run in runs], axis=0)
                 axis.plot(at, np.median(error, axis=0), line, color=colour, label=name)
                 axis.fill_between(at, error.min(axis=0), error.max(axis=0), color=colour, alpha=0.15, linewidth=0)
-        axes[0].set_xlabel("training, s")
-        axes[1].set_xlabel("commands flown, millions")
+        axes[0].set_xlabel("training time, s")
+        axes[1].set_xlabel("commands, millions")
         axes[0].set_ylabel("mean hover error, mm")
         axes[0].set_yscale("log")
         axes[0].set_ylim(2, 5000)

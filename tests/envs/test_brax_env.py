@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from cfb_mjx.control import brax_controller
 from cfb_mjx.envs import FlipTask, Noise, TargetTask, observe, reset, step
-from cfb_mjx.envs.brax_env import EACH, BraxEnv, controller_of, wrap
+from cfb_mjx.envs.brax_env import EACH, BraxEnv, wrap
 from cfb_mjx.envs.flip import FLIP_LAYOUT
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters import load_randomisation
@@ -112,7 +113,7 @@ def _same_policy(policy, params, normalized: bool) -> None:
     env = BraxEnv(TASK)
     obs = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(5), 6)).obs
     action, _ = policy(obs, jax.random.PRNGKey(0))
-    controller = controller_of(params, TASK.layout, normalized=normalized)
+    controller = brax_controller(params, TASK.layout, normalized=normalized)
     np.testing.assert_allclose(jax.vmap(controller.act)(obs["state"]), 0.5 * (1 + action), atol=2e-5)
 
 
@@ -152,5 +153,5 @@ def test_sac_of_brax_runs_on_it():
             env, num_timesteps=128, min_replay_size=16, max_replay_size=256, batch_size=8, **SMALL
         )
     assert np.isfinite(metrics["eval/episode_reward"])
-    with pytest.raises(CfbError, match="controller_of"):
-        controller_of(params, FLIP_LAYOUT, normalized=False, activation="relu")
+    with pytest.raises(CfbError, match="brax_controller"):
+        brax_controller(params, FLIP_LAYOUT, normalized=False, activation="relu")

@@ -12,11 +12,11 @@ from cfb_mjx.commands import DemoLoop
 from cfb_mjx.errors import CfbError
 from cfb_mjx.loop import steps
 from cfb_mjx.loop.cells import Cell, cells_of
+from cfb_mjx.loop.page import TITLE, lead, loop_figure, sections
 from cfb_mjx.loop.study import study
 from cfb_mjx.loop.summary import summarise
 from cfb_mjx.reference_simulator import EFFECTS
 from cfb_mjx.view import html_page
-from cfb_mjx.view.closed_loop import TITLE, lead, loop_figure, sections
 
 ERRORS = {
     "position_rmse_m@0.5s": 0.1,

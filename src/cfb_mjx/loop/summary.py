@@ -13,7 +13,7 @@ MEASURES = ("hover_mm", "track_m")
 HARDLY = 0.1
 """What raises an error by less than this share costs hardly anything."""
 NOTES = {
-    "battery_sag": "A policy cannot see the voltage: it is trained with a cell that begins half full, and the flights "
+    "battery_sag": "A policy cannot see the voltage: it is trained with a cell that starts half full, and the flights "
     "begin with packs of 3.4 to 3.95 V. The right model is of no use to a controller that is not told what changes."
 }
 """What is known of an effect and a policy that only sees the estimated state."""

@@ -42,7 +42,7 @@ def lead(results: dict[str, Any]) -> str:
     drones = "drone" if count == 1 else "drones"
     effects = "effect" if len(rows) == 1 else "effects"
     return (
-        f"{count} {drones} with {len(rows)} {effects} the model does not know. From flights of a policy trained on "
+        f"{count} {drones} with {len(rows)} {effects} that the model lacks. From flights of a policy trained on "
         f"that model, close-loop named the effect of {right} of {count}. Trained further on the corrected model, the "
         f"policy hovers the same drone better for {better['hover_mm']} of {len(rows)} {effects} and tracks better for "
         f"{better['track_m']} of {len(rows)} (median over the seeds)."
@@ -58,8 +58,9 @@ def sections(results: dict[str, Any], figure: Path) -> list[Section]:
     """
     rows = summarise(results["cells"].values())
     short = (
-        "Each effect's median over its seeds; changes are those of the policy trained on the corrected model against "
-        "the nominal one it began from. Beside them, what as much training on the declared model changed."
+        "Each row is the median over the seeds of an effect. The changes compare the policy trained on the corrected "
+        "model with the nominal policy that it started from. Training alone: the change after as much further training "
+        "on the declared model."
     )
     return [
         Section("In short", [short], [_in_short(rows)], [(figure, "hover and tracking error, effect by effect")]),
@@ -68,8 +69,8 @@ def sections(results: dict[str, Any], figure: Path) -> list[Section]:
         Section(
             "How it flies",
             [
-                "Median over the seeds with the least and the greatest; a seed's value is the mean over its flights. "
-                "A policy of whose flights one crashed counts as lost with that seed."
+                "Each cell is the median over the seeds [smallest, largest]. The value of a seed is the mean over its "
+                "flights. If one flight of a policy crashes, the policy counts as lost with that seed."
             ],
             [_table(rows, measure) for measure in MEASURES],
         ),
@@ -111,33 +112,33 @@ def _story(settings: dict[str, Any]) -> list[str]:
     further = dict(change.split("=") for change in settings["further"])
     more = dict(change.split("=") for change in settings["randomised"])
     return [
-        "The drones are of the reference simulator (cfb_mjx.reference_simulator): plain NumPy that shares no line with "
+        "The drones fly in the reference simulator (cfb_mjx.reference_simulator): plain NumPy that shares no code with "
         "the model, with effects of other functional forms than the catalogue's, sensor noise, gusts of force and "
-        "torque, and a battery that drains. The effects were chosen for what they should do to a flight, before any "
-        "corrected policy had flown; flights and training were developed on other seeds.",
+        "torque, and a battery that drains. The effects were chosen by their expected influence on a flight, before "
+        "any corrected policy had flown. Flights and training were developed on other seeds.",
         f"1. A policy is trained on the declared model by back-propagation (configuration `loop`, "
         f"{analytic['updates']} updates of {analytic['drones']} drones, randomisation x "
         f"{config['randomisation']['magnitude']:g}).",
-        f"2. It flies the drone and the flights are logged: {', '.join(flights['FIT'])} to fit, "
-        f"{', '.join(flights['HELD_OUT'])} to judge on, {flights['USUAL_SECONDS'][0]:g} to "
+        f"2. The policy flies the drone, and the flights are logged: {', '.join(flights['FIT'])} to fit, "
+        f"{', '.join(flights['HELD_OUT'])} held out, {flights['USUAL_SECONDS'][0]:g} to "
         f"{flights['USUAL_SECONDS'][1]:g} s each (long_hover {flights['SECONDS']['long_hover'][0]:g} to "
-        f"{flights['SECONDS']['long_hover'][1]:g} s). It is shown position, velocity and heading relative to a target "
-        f"that moves, {flights['RAISE']:g} m higher than the plants' own controller would be sent. In motor_excitation "
-        f"(a few hundredths) and in jumps (up to {flights['DITHER_OF_JUMPS']:g}) a dither is added to its commands, "
-        "which its own memory of commands does not see; nowhere else.",
+        f"{flights['SECONDS']['long_hover'][1]:g} s). Its input is position, velocity and heading relative to a moving "
+        f"target, {flights['RAISE']:g} m higher than the target that the simulator's own controller would get. In "
+        f"motor_excitation (a few hundredths) and in jumps (up to {flights['DITHER_OF_JUMPS']:g}), and only there, a "
+        "dither is added to its commands, which is not part of its own memory of commands.",
         "3. `cfb close-loop` gets these logs and the declared model, nothing else, and writes the corrected model.",
         f"4. The policy is trained further on the corrected model: {further['analytic.updates']} updates.",
-        f"5. The same drone is flown again, under other noise. Hover: {trials['HOVERS']} flights of "
-        f"{trials['HOVER_S']:g} s at a target held for two seconds before, mean distance over all but the first "
+        f"5. The same drone is flown again with other noise. Hover: {trials['HOVERS']} flights of "
+        f"{trials['HOVER_S']:g} s at a target that was held for two seconds before; mean distance without the first "
         f"{trials['SETTLING_S']:g} s. Tracking: {trials['TRACKS']} flights along a level figure eight of "
         f"{2 * trials['WIDTH_M']:g} m by {2 * trials['DEPTH_M']:g} m, one round in {trials['PERIOD_S']:g} s, RMS "
         f"distance from its moving point from {trials['ENTRY_S']:g} s to {trials['TRACK_S']:g} s. Positions are those "
-        "the drone's own tracking reports.",
-        f"Beside it: the nominal policy trained further by the same number of updates on the declared model (whatever "
-        f"more training is worth); a policy trained on randomisation x {float(more['randomisation.magnitude']):g} with "
-        f"as many updates as the corrected one had in all; that one trained further on the corrected model, still "
-        "randomised; and the nominal policy on the same drone without the effect, which "
-        "is what it would fly if the model were right.",
+        "that the drone's own tracking reports.",
+        f"For comparison: the nominal policy trained further by the same number of updates on the declared model (the "
+        f"value of more training); a policy trained with randomisation x {float(more['randomisation.magnitude']):g} "
+        f"and as many updates as the corrected one in total; that policy trained further on the corrected model, still "
+        "randomised; and the nominal policy on the same drone without the effect, "
+        "as it would fly if the model were right.",
     ]
 
 
@@ -147,7 +148,7 @@ def _named(rows: Sequence[Row]) -> tuple:
         names = "; ".join(", ".join(names) or "nothing" for names in row.named)
         before, after = row.held_out[ERROR]
         body.append([row.effect, names, f"{1e3 * before:.1f}", f"{1e3 * after:.1f}"])
-    caption = "Seed by seed; RMS position error of predictions over 0.5 s on the held-out flights, median over seeds"
+    caption = "Reported effects by seed; RMS position error of predictions over 0.5 s on held-out flights (median)"
     return caption, ["effect", "close-loop reports", "before, mm", "after, mm"], body
 
 
@@ -197,7 +198,7 @@ def _each(results: dict[str, Any]) -> tuple:
         ends = [[value_of(cell["trials"][p], m) for p in ("nominal", "corrected")] for m in MEASURES]
         values = [" to ".join(_one(x, _DIGITS[m]) for x in pair) for m, pair in zip(MEASURES, ends, strict=True)]
         body.append([f"{cell['effect']}, {cell['seed']}", names, *values])
-    return "Nominal to corrected policy", ["effect, seed", "close-loop reports", *_HEADS.values()], body
+    return "From the nominal to the corrected policy", ["effect, seed", "close-loop reports", *_HEADS.values()], body
 
 
 def loop_figure(results: dict[str, Any], path: Path) -> None:
