@@ -2,8 +2,8 @@
 
     python scripts/accuracy.py [-o docs/accuracy.md]
 
-The reference is the oracle of the tests (``tests/helpers.py``): the paper's equations in plain NumPy, sharing no code
-with the library.
+The reference is that of the tests (``tests/helpers.py``): the paper's equations in plain NumPy, without code of the
+library.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ HORIZONS = (0.2, 0.5)
 SEEDS = range(4)
 METHODS = [(i, loads) for i in INTEGRATORS for loads in ("instant", "mean")]
 RATES = (15, 30, 60, 100)
-"""Of a free body, rad/s."""
+"""Body rates of the free body, rad/s."""
 MANOEUVRES = {"aggressive": helpers.aggressive_manoeuvre, "gentle": helpers.gentle_manoeuvre}
 
 
@@ -70,7 +70,7 @@ def main() -> None:
 
 
 def reference(parameters, make) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Starts, commands and DOP853's states of one kind of manoeuvre, one row per seed."""
+    """Return initial states, commands and DOP853's trajectories of one kind of manoeuvre, one row per seed."""
     constants = helpers.constants_of(parameters)
     pairs = [make(max(HORIZONS) + INTERVAL, INTERVAL, seed) for seed in SEEDS]
     truth = np.array([helpers.fly(constants, y, commands, INTERVAL) for y, commands in pairs])
@@ -78,10 +78,10 @@ def reference(parameters, make) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def compare(flown: np.ndarray, truth: np.ndarray) -> list[tuple[float, float]]:
-    """Worst position [m] and attitude [deg] error over the seeds, at each horizon."""
+    """Return the worst position [m] and attitude [deg] error over the seeds, at each horizon."""
     rows = []
     for horizon in HORIZONS:
-        # Not every horizon is a multiple of the command interval: take the state just after it.
+        # Not every horizon is a multiple of the command interval; use the first state after it.
         at = int(np.ceil(horizon / INTERVAL - 1e-9)) - 1
         distance = np.linalg.norm(flown[:, at, :3] - truth[:, at, :3], axis=-1).max()
         angle = helpers.attitude_error(flown[:, at, 6:10], truth[:, at, 6:10]).max()
@@ -90,9 +90,12 @@ def compare(flown: np.ndarray, truth: np.ndarray) -> list[tuple[float, float]]:
 
 
 def tumble(model: Quadrotor, duration: float = 2.0, directions: int = 32) -> dict[int, tuple[float, float]]:
-    """Largest relative change of rotational energy, and of angular momentum at the end, over ``duration`` s.
+    """Simulate free tumbling with the rotors off, and measure the drift of the conserved quantities.
 
-    Rotors off; worst of ``directions`` random directions of the body rate, at each of `RATES`. NaN where the state is.
+    Returns:
+        Per body rate of `RATES`, for the worst of ``directions`` random directions: the largest relative change of the
+        rotational energy during ``duration`` [s], and the relative change of the angular momentum at the end. NaN if
+        the state is NaN.
     """
     y, _ = helpers.aggressive_manoeuvre(0.1)
     y[13:] = 0.0
@@ -116,7 +119,7 @@ def tumble(model: Quadrotor, duration: float = 2.0, directions: int = 32) -> dic
 
 
 def euler_rule(parameters) -> list[tuple[float, float, float]]:
-    """(time, error, dt/2 a t) of Euler at 4 ms climbing at constant acceleration a."""
+    """Return (time, height error, dt/2 a t) of Euler at 4 ms in a climb at constant acceleration a."""
     model = Quadrotor(parameters, integrator="euler")
     y = np.zeros(17)
     y[6], y[13:] = 1.0, 0.8 * 2900
@@ -127,7 +130,7 @@ def euler_rule(parameters) -> list[tuple[float, float, float]]:
 
 
 def machine() -> str:
-    """Processor and operating system, as far as the system tells."""
+    """Describe the processor and operating system."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -139,19 +142,28 @@ def machine() -> str:
 
 
 def page(errors, tumbling, rule, peak) -> str:
-    """The Markdown page."""
+    """Return the page as Markdown."""
     packages = ", ".join(f"{name} {version(name)}" for name in ("jax", "equinox", "numpy", "scipy"))
     lines = [
         "# Accuracy of the simulation",
+        "",
+        "This page gives the error of each integrator at each time step. Use it to choose the options of a model:",
+        "",
+        "```python",
+        "from cfb_mjx.model import Quadrotor",
+        "",
+        'model = Quadrotor.from_file("cfb-guards", dt=0.004, integrator="rk4", rotor_loads="instant")',
+        "```",
         "",
         f"Measured {datetime.date.today().isoformat()} on {machine()}, Python {platform.python_version()}, {packages}, "
         "float64, by",
         "",
         "    python scripts/accuracy.py",
         "",
-        "which writes this page. Reference: SciPy's DOP853 (rtol 1e-10) on the paper's equations written in NumPy",
-        '(`tests/helpers.py`), the `cfb-guards` preset, commands held for 8 ms (so "500 ms" is 504 ms,',
-        f"the next multiple). Worst of {len(SEEDS)} manoeuvres of each kind. Rotor speeds are exact (1e-12 relative).",
+        "which writes this page. The reference is SciPy's DOP853 (rtol 1e-10) on the paper's equations written in",
+        'NumPy (`tests/helpers.py`), with the `cfb-guards` preset. Commands are held for 8 ms, so "500 ms" is 504 ms,',
+        f"the next multiple. Errors are the worst of {len(SEEDS)} manoeuvres of each kind. Rotor speeds are exact",
+        "(1e-12 relative).",
         "",
     ]
     texts = {
@@ -177,8 +189,9 @@ def page(errors, tumbling, rule, peak) -> str:
     lines += [
         "## Free tumbling, 2 s, rotors off",
         "",
-        "Largest change of the rotational energy / of the angular momentum at the end, relative; worst of 32",
-        "directions of the body rate. Both are constants of the motion. NaN: the state is no number at the end.",
+        "A free body conserves rotational energy and angular momentum. The table gives the largest relative change of",
+        "the energy / the relative change of the angular momentum at the end, for the worst of 32 directions of the",
+        "body rate. NaN: the state is not a number at the end.",
         "",
         "| step | integrator | " + " | ".join(f"{rate} rad/s" for rate in RATES) + " |",
         "|---|---|" + "---|" * len(RATES),
@@ -193,23 +206,22 @@ def page(errors, tumbling, rule, peak) -> str:
         "",
         "## What to choose",
         "",
-        "- **`leapfrog`** is the default: second order for one evaluation of the loads. Half a step of drift, the",
-        "  loads' kick at the middle of the rotors' path, half a step of drift; the rotation follows Euler's equations",
-        "  to fourth order. What tumbles fast loses a little of its energy (the table).",
-        "- **`euler`** is MuJoCo's semi-implicit Euler: first order. It moves with the velocity at the step's end, so",
-        "  its position is off by about dt/2 x acceleration x time. "
+        "- **`leapfrog`** is the default. It is second order and evaluates the loads once per step: half a step of",
+        "  drift, a kick by the loads at the middle of the rotors' path, half a step of drift. The rotation follows",
+        "  Euler's equations to fourth order. A body that tumbles fast loses a little energy (table above).",
+        "- **`euler`** is MuJoCo's semi-implicit Euler, first order. It moves with the velocity at a step's end,",
+        "  so its position error is about dt/2 x acceleration x time. "
         f"In a climb at constant acceleration, 4 ms, {rules}.",
-        "  It gains rotational energy when tumbling, and ends in NaN at high rates. Use it for parity with MuJoCo.",
-        '- **`rk4` with `rotor_loads="instant"`** evaluates thrust and torque on the exact rotor path at each stage:',
-        "  fourth order, the most accurate choice at every step measured.",
+        "  It gains rotational energy when tumbling and ends in NaN at high rates. Use it for parity with MuJoCo.",
+        '- **`rk4` with `rotor_loads="instant"`** evaluates thrust and torque on the exact rotor path at each stage.',
+        "  It is fourth order, and the most accurate choice at every step measured.",
         '- **`rotor_loads="mean"`** replaces the loads by their '
         "exact means over the step, so the impulse of thrust and",
-        "  torque (the yaw kick J_m dOmega above all) is exact at any step. What is lost is where within the step the",
-        "  load acts, which makes `rk4` second order; at 4 ms it stays below 1 mm and 0.2 deg over 200 ms of flips.",
-        "  With `euler` the means remove the error of holding the "
-        "loads of the step's start, but not that of the position",
-        "  update, which can have the opposite sign: in the tables `mean` is not uniformly better there.",
-        "- Where the integrator must not be seen (evaluating a model on logs, fitting), use `rk4`.",
+        "  torque (above all the yaw kick J_m dOmega) is exact at any step. The means do not say when within the step",
+        "  the load acts, which makes `rk4` second order; at 4 ms its error stays below 1 mm and 0.2 deg over 200 ms",
+        "  of flips. With `euler` the means remove the error of holding the loads of the step's start, but not the",
+        "  error of the position update, which can have the opposite sign: in the tables `mean` is not always better.",
+        "- To evaluate a model on logs or to fit, use `rk4`, so that the integrator adds no error.",
         "",
     ]
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Trainings of a study, one after the other: what is done is kept, so that an interrupted study goes on."""
+"""Run the trainings of a study one after the other, and keep finished ones, so that an interrupted study continues."""
 
 import argparse
 import json
@@ -24,18 +24,18 @@ class Run:
 
 
 def study_arguments(description: str, option: str, choices: Iterable[str], **flags: str) -> argparse.Namespace:
-    """Read a study's command line: which of ``choices`` to run, how many seeds, or only the page; set jax up for it.
+    """Parse the command line of a study, and configure jax for it.
 
     Args:
-        description: of the study.
-        option: how ``choices`` are chosen from.
-        choices: what the study compares.
-        flags: further switches of this study, with what each does.
+        description: help text of the study.
+        option: name of the option that selects from ``choices``.
+        choices: variants that the study compares.
+        flags: further switches of this study, name to help text.
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(option, nargs="+", choices=list(choices), default=list(choices), dest="chosen")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--page-only", action="store_true", help="write the page from the results that are there")
+    parser.add_argument("--page-only", action="store_true", help="write the page from the stored results")
     for name, text in flags.items():
         parser.add_argument(f"--{name.replace('_', '-')}", action="store_true", help=text)
     arguments = parser.parse_args()
@@ -44,14 +44,14 @@ def study_arguments(description: str, option: str, choices: Iterable[str], **fla
 
 
 def carry_out(runs: list[Run], results: Path, folder: Path, judge, kept: Path | None = None) -> None:
-    """Train what ``results`` does not hold yet, and judge it.
+    """Train and score the runs that ``results`` does not have yet.
 
     Args:
-        runs: of the study, in order.
-        results: JSON file that grows with every run: name to seed, score, curve, config and environment.
-        folder: for checkpoints and policies.
-        judge: controller to numbers.
-        kept: where policies are copied to, by the names of their runs.
+        runs: runs of the study, in order.
+        results: JSON file, written after every run: name to seed, score, curve, config and environment.
+        folder: folder for checkpoints and policies.
+        judge: function from a controller to its score.
+        kept: folder that the policies are copied to, under the names of their runs.
     """
     from cfb_mjx.control.policy_file import load_policy
     from cfb_mjx.files import write_json
@@ -83,7 +83,10 @@ def carry_out(runs: list[Run], results: Path, folder: Path, judge, kept: Path | 
 
 
 def _what_counts(config: dict) -> dict:
-    """Without the settings of the algorithm that is not used; what did not exist yet then is as it is by default."""
+    """Return a configuration without its description and the settings of the unused algorithm.
+
+    Settings that did not exist when the result was stored get their defaults.
+    """
     from cfb_mjx.train.config import config_from
 
     whole = config_from(config, "a stored result").to_mapping()
@@ -92,12 +95,12 @@ def _what_counts(config: dict) -> dict:
 
 
 def report(row: dict) -> None:
-    """A line of a learning curve."""
+    """Print one row of a learning curve."""
     say(f"  {row['commands'] / 1e6:.3g} M commands, {row['seconds']:.0f} s, hover {row['hover_mm']:.4g} mm")
 
 
 def facts_line(command: str, results: list[dict], did: str = "trained") -> str:
-    """Which command wrote a page, what it ``did``, when and on what."""
+    """Say which command wrote a page, and when and on which machine and versions it ``did`` its work."""
     facts = [result["environment"] for result in results]
     first, last = min(f["date"] for f in facts), max(f["date"] for f in facts)
     when = first if first == last else f"{first} to {last}"
@@ -109,15 +112,15 @@ def facts_line(command: str, results: list[dict], did: str = "trained") -> str:
 
 
 def moved(before: dict, now: dict, pick: Callable[[dict], dict[str, float]], share: float = 0.05) -> list[str]:
-    """Markdown lines of a page's section on what is not what it was.
+    """Return a page's section on the numbers that differ from those of an earlier run, as Markdown lines.
 
     Args:
-        before: results of an earlier run, with their ``environment``.
-        now: results of this one.
-        pick: results to the numbers that count, by the name they are listed under.
-        share: of the larger by which two numbers differ to be listed.
+        before: results of the earlier run, with their ``environment``.
+        now: results of this run.
+        pick: function from results to the numbers to compare, by name.
+        share: least relative difference that is listed.
     """
-    # What is not finite is null in a file.
+    # A number that is not finite is null in the file.
     old, new = ({k: math.inf if x is None else x for k, x in pick(which).items()} for which in (before, now))
     rows = [
         f"| {name} | {old[name]:.4g} | {value:.4g} |"
@@ -126,6 +129,6 @@ def moved(before: dict, now: dict, pick: Callable[[dict], dict[str, float]], sha
     ]
     alike = sum(name in old for name in new) - len(rows)
     date = before["environment"]["date"]
-    text = f"Beside {date}: of {alike + len(rows)} numbers {len(rows)} differ by more than {share:.0%}."
+    text = f"Compared with {date}, {len(rows)} of {alike + len(rows)} numbers differ by more than {share:.0%}."
     head = ["", f"| number | {date} | now |", "|---|---:|---:|"]
-    return ["", "## What moved", "", text, *(head + rows if rows else [])]
+    return ["", "## What changed", "", text, *(head + rows if rows else [])]

@@ -1,11 +1,11 @@
-"""Close the loop on real flights in the IDSIA layout; write docs/closing-real-flights.md with its figure, and what
-docs/closing-the-loop.md says of it.
+"""Correct the model on real flights in the IDSIA layout.
 
     python scripts/close_real_flights.py FOLDER [--work out/real]
 
-FOLDER holds fit/*.parquet and validation/*.parquet. Nothing is fitted to validation/. Only aggregate numbers are
-written; the flights themselves never enter the project. What a step leaves in the work folder is used again. The plant
-and the predictor become the presets cfb-idsia and cfb-idsia-predictor.
+Writes docs/closing-real-flights.md with its figure, the summary in docs/closing-the-loop.md, and the plant and the
+predictor as the presets cfb-idsia and cfb-idsia-predictor. FOLDER holds fit/*.parquet and validation/*.parquet. Nothing
+is fitted to validation/. Only aggregate numbers are written; the flights do not become part of the project. Steps whose
+results are already in the work folder are not repeated.
 """
 
 import argparse
@@ -53,33 +53,33 @@ PRESETS = {
 MASS = 0.045
 MOTORS = ("battery_sag", "motor_asymmetry")
 BESIDE = ("blade_flapping", "thrust_scale", "inertia")
-"""Fitted with the motors, so that these do not have to stand in for them."""
+"""Effects fitted together with the motors, so that motor parameters do not absorb them."""
 BODY = (
     *("blade_flapping", "inflow_thrust", "rotor_drag", "thrust_scale"),
     *("inertia", "cog_offset", "torque_scale", "thrust_tilt", "position_moment"),
 )
 FORECAST = (*BODY, "regression_dilution")
-"""Of the predictor."""
+"""Effects of the predictor."""
 GENTLE = 7
-"""Gentle flights among those fitted: the square counts as much as all of them, for the two are judged side by side."""
+"""Weight of the square flight: the number of gentle fit flights, because the page reports both groups separately."""
 PREDICTOR_SQUARE = 3
-"""The same for the predictor: of 1, 3 and `GENTLE` what makes `benchmark_score` smallest, with the observer, on the
-flights fitted to."""
+"""Weight of the square flight for the predictor: of 1, 3 and `GENTLE` the one with the smallest `benchmark_score` on
+the fit flights, with the observer."""
 JUDGES = {"plant": score, "predictor": benchmark_score}
-"""By what the observer's levels are chosen, on the flights fitted to."""
+"""Scores on the fit flights that the observer's levels are chosen by."""
 SLOW = 2.0
-"""Hz; below it what hangs on the place is looked for in velocity and acceleration."""
+"""Cut-off frequency, Hz, of the signals that `by_place` searches for a dependence on the position."""
 STEP = 0.01
-"""Of the even grid on which signals are filtered, s."""
+"""Time step of the uniform grid on which signals are filtered, s."""
 INNER = slice(150, -150)
-"""Rows that a filter's ends do not reach."""
+"""Rows that the transients at the ends of a filtered signal do not reach."""
 PARTS = {"fit": "fitted to", "validation": "judged on"}
 BANDS = ((0.1, 0.3), (0.2, 0.5), (0.5, 1.0))
-"""Hz; faster motion is too small in the gentle flights for the slope of a position to show it."""
+"""Frequency bands, Hz; the derivative of the position does not resolve faster motion in the gentle flights."""
 
 
 def steps(folder: Path, work: Path) -> dict[str, list[str]]:
-    """The commands, by the model file they leave in the work folder."""
+    """Return the commands, by the name of the model file that each writes to the work folder."""
     fit = sorted(str(path) for path in (folder / "fit").glob("*.parquet"))
     made = {name: str(work / f"{name}.yaml") for name in ("rotors", "motors", "repaired", "plant", "predictor")}
     refine = ["refine", *fit, "--weight", f"square={GENTLE}"]
@@ -101,19 +101,19 @@ def steps(folder: Path, work: Path) -> dict[str, list[str]]:
 
 
 def kept(path: Path, make: Callable[[], dict]) -> dict:
-    """What an earlier run left, else what ``make`` gives."""
+    """Return the result of an earlier run from ``path``, or compute and store it with ``make``."""
     if not path.exists():
         write_json(path, make())
     return json.loads(path.read_text())
 
 
 def group_of(name: str) -> str:
-    """The group of a flight."""
+    """Return the group of the flight ``name``."""
     return next(group for group, prefixes in GROUPS.items() if name.startswith(prefixes))
 
 
 def errors(described: ModelFile, logs: list[FlightLog], observer: Observer | None = None) -> dict:
-    """Mean attitude, rad, and velocity error, m/s, by group, horizon and kind of prediction."""
+    """Return the mean attitude error, rad, and velocity error, m/s, by kind of prediction, group and horizon."""
     faults = SensorFaults.from_mappings(described.effects, described.name)
     found = {}
     for group in GROUPS:
@@ -128,8 +128,10 @@ def errors(described: ModelFile, logs: list[FlightLog], observer: Observer | Non
 
 
 def columns(made: dict[str, ModelFile], logs: dict[str, list[FlightLog]]) -> dict:
-    """The fit flights, predicted with the sensor faults taken out and as they were logged; what the velocity column
-    does, stretched alike at all frequencies or in a band of them."""
+    """Measure the fault of the logged velocity, as one stretch for all frequencies and as a band of frequencies.
+
+    Also the errors on the fit flights with the sensor faults removed and as logged.
+    """
     fit = logs["fit"]
     parameters = made["repaired"].parameters()
     even = check_sensors(fit, usual_delay(fit, parameters), float(parameters.gyro_delay)).faults
@@ -148,7 +150,7 @@ def columns(made: dict[str, ModelFile], logs: dict[str, list[FlightLog]]) -> dic
 
 
 def by_kind(logs: dict[str, list[FlightLog]], measure: Callable[[list[FlightLog]], Any]) -> dict[str, Any]:
-    """What is measured of every group of the flights fitted to and judged on."""
+    """Apply ``measure`` to every group of the fit flights and of the held-out flights."""
     return {
         f"{PARTS[part]}, {group}": measure([log for log in some if group_of(log.name) == group])
         for part, some in logs.items()
@@ -157,14 +159,17 @@ def by_kind(logs: dict[str, list[FlightLog]], measure: Callable[[list[FlightLog]
 
 
 def tilted(logs: list[FlightLog], scale: float) -> dict[str, dict]:
-    """What estimators would have done to the tilt: one that ignores drag, one whose flow is stretched."""
+    """Fit two models of the on-board estimator to the logged tilt: one ignores drag, one has stretched optical flow."""
     made = {"ignoring": fit_flow_estimator(logs), "stretched": fit_flow_estimator(logs, scale, 0.0)}
     return {name: asdict(estimator) for name, estimator in made.items()}
 
 
 def stretched(logs: list[FlightLog], low: float, high: float) -> dict[str, list[float]]:
-    """Velocity, and specific force turned by the attitude, over what position says, of motion between ``low`` and
-    ``high`` Hz; horizontally and vertically, over all flights."""
+    """Return ratios of the logged velocity and acceleration to the derivatives of the position.
+
+    For motion between ``low`` and ``high`` Hz, over all flights, horizontally and vertically. The acceleration is the
+    specific force, rotated by the logged attitude.
+    """
     sos = butter(2, [low, high], "band", fs=1 / STEP, output="sos")
     found: dict[str, list[tuple]] = {"horizontal": [], "vertical": []}
     for log in logs:
@@ -178,22 +183,25 @@ def stretched(logs: list[FlightLog], low: float, high: float) -> dict[str, list[
 
 
 def _filtered(log: FlightLog, sos: np.ndarray, *signals: np.ndarray) -> list[np.ndarray]:
-    """Signals of a log on an even grid of `STEP`, filtered forth and back."""
+    """Resample signals of a log to a uniform grid of `STEP`, and filter them forwards and backwards."""
     grid = np.arange(log.time[0], log.time[-1], STEP)
     return [sosfiltfilt(sos, interpolate(log.time, x, grid), axis=0) for x in signals]
 
 
 def _in_step(parts: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    """How many times larger the second is than the first; what is a quarter turn ahead or behind does not count."""
+    """Return the gain of the in-phase part of the second signal over the first; a part in quadrature is removed."""
     one, other = (np.concatenate([x.ravel() for x in side]) for side in zip(*parts, strict=True))
     beside = np.concatenate([np.gradient(x, STEP, axis=0).ravel() for x, _ in parts])
     return float(np.linalg.lstsq(np.stack([one, beside], axis=1), other)[0][0])
 
 
 def by_place(logs: list[FlightLog]) -> dict[str, dict[str, list[float]]]:
-    """What moves per distance from the middle, 1/s, along x and y, by flight: what the velocity column takes off, its
-    scale and age apart; and the air, by the drag that the accelerometer feels beside that of the motion, thrust that
-    leans and a lag of the drag apart."""
+    """Return velocities per distance from the middle of the room, 1/s, along x and y, by flight.
+
+    ``column`` is what the logged velocity lacks, apart from a scale and a delay. ``drag`` is the speed of the air, from
+    the drag that the accelerometer measures in addition to the drag of the motion, apart from tilted thrust and a lag
+    of the drag.
+    """
     sos = butter(2, SLOW, fs=1 / STEP, output="sos")
     found = {}
     for log in logs:
@@ -215,12 +223,12 @@ def by_place(logs: list[FlightLog]) -> dict[str, dict[str, list[float]]]:
 
 
 def weighing(square: float, fit: list[FlightLog]) -> dict[str, float]:
-    """Square flights count so many times as much as others."""
+    """Return the weights of the fit flights that count square flights ``square`` times."""
     return {log.name: float(square) for log in fit if group_of(log.name) == "square"}
 
 
 def without_each(plant: ModelFile, fit: list[FlightLog], judged: list[FlightLog]) -> dict:
-    """Errors with one effect taken out and the others fitted again."""
+    """Return the errors with each effect removed and the others fitted again."""
     weights = weighing(GENTLE, fit)
     found = {}
     for name in (*BODY, *MOTORS):
@@ -232,7 +240,7 @@ def without_each(plant: ModelFile, fit: list[FlightLog], judged: list[FlightLog]
 
 
 def tuned(plant: ModelFile, fit: list[FlightLog], judge: Callable[..., float]) -> dict:
-    """Levels of the observer that predict the fit flights best, says ``judge``."""
+    """Return the levels of the observer with the best score of ``judge`` on the fit flights."""
     groups = {group: [log for log in fit if group_of(log.name) == group] for group in GROUPS}
     faults = SensorFaults.from_mappings(plant.effects, plant.name)
     say = partial(print, flush=True)
@@ -240,7 +248,7 @@ def tuned(plant: ModelFile, fit: list[FlightLog], judge: Callable[..., float]) -
 
 
 def sums(models: dict[str, ModelFile], judged: list[FlightLog], observers: dict[str, Observer]) -> dict:
-    """The IDSIA benchmark's sums on the validation flights, together and one by one."""
+    """Return the sums of the IDSIA benchmark on the validation flights, together and flight by flight."""
     built = {name: Contestant.of(described) for name, described in models.items()}
     for name, described in models.items():
         built[f"{name}, observer"] = Contestant.of(described, observers.get(name, observers["plant"]))
@@ -249,12 +257,12 @@ def sums(models: dict[str, ModelFile], judged: list[FlightLog], observers: dict[
 
 
 def summed(rows: dict) -> dict[str, list[float]]:
-    """The four sums of every row of the benchmark."""
+    """Return the four sums of every row of the benchmark."""
     return {name: [row[f"{q}_sum_{u}"] for q, u in QUANTITIES.items()] for name, row in rows.items()}
 
 
 def unseen(plant: ModelFile, logs: dict[str, list[FlightLog]], observer: Observer) -> dict[str, dict]:
-    """The benchmark's sums on flights of a kind of reference that the predictor was not fitted to."""
+    """Return the sums of the benchmark on kinds of reference that the predictor was not fitted to."""
     found = {}
     for kind in ("multisine", "random"):
         others = [log for log in logs["fit"] if not log.name.startswith(kind)]
@@ -267,7 +275,7 @@ def unseen(plant: ModelFile, logs: dict[str, list[FlightLog]], observer: Observe
 
 
 def published(name: str, described: ModelFile, what: str, fit: list[FlightLog]) -> ModelFile:
-    """A fitted model as a preset: no file of this machine in it, and where it comes from."""
+    """Return a fitted model as a preset, with its origin and without file names of this machine."""
     description = (
         "A Crazyflie 2.1 Brushless with AI-deck and flow deck, the drone of the IDSIA nano-drone benchmark (Busetto "
         f"et al., Control Engineering Practice 172, 2026): {what}. Velocities are those of its on-board estimator, and "
@@ -283,7 +291,7 @@ def published(name: str, described: ModelFile, what: str, fit: list[FlightLog]) 
 
 
 def repeats(models: dict[str, ModelFile], logs: list[FlightLog]) -> dict:
-    """Pairs of flights of one reference: what each model misses in both."""
+    """Return the residuals that two flights of one reference have in common, for each model."""
     found = {}
     for one, other in combinations(sorted(logs, key=lambda log: log.name), 2):
         if one.name.split("_")[0] != other.name.split("_")[0]:
@@ -300,7 +308,7 @@ def repeats(models: dict[str, ModelFile], logs: list[FlightLog]) -> dict:
 
 
 def main() -> None:
-    """Run what is missing, then write the page."""
+    """Run the missing steps, then write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--work", type=Path, default=Path("out/real"))
@@ -313,7 +321,7 @@ def main() -> None:
         for part in ("fit", "validation")
     }
     if not all(logs.values()):
-        sys.exit(f"{arguments.folder}: holds no fit/*.parquet or no validation/*.parquet")
+        sys.exit(f"{arguments.folder}: has no fit/*.parquet or no validation/*.parquet")
     commands = steps(arguments.folder, work)
     for name, command in commands.items():
         if not (work / f"{name}.yaml").exists():

@@ -3,8 +3,8 @@
     pip install 'mujoco[sysid]'
     python scripts/compare_mujoco_sysid.py [--drones 4] [--repeats 2]
 
-The flights come from the independent plant of the tests (``tests/sysid/plant.py``, ``open_loop.py``), the fit by
-`mujoco.sysid` is ``tests/sysid/mujoco_fit.py``.
+The flights come from the independent plant of the tests (``tests/sysid/plant.py``, ``open_loop.py``). The fit with
+`mujoco.sysid` is in ``tests/sysid/mujoco_fit.py``.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ SHOWN = {
     "motor_time_constant": ("T", 1e3, "ms"),
 }
 SAME = ("mujoco_windows", "shooting_measured_start")
-"""The same least-squares problem, solved twice."""
+"""Two solvers of the same least-squares problem."""
 BEST = ("mujoco_manoeuvres", "shooting", "innovation")
-"""Each method as its users would run it."""
+"""The methods as their users would run them."""
 TITLES = {
     "mujoco_windows": "mujoco.sysid, same windows",
     "shooting_measured_start": "`shoot(free_start=False)`",
@@ -87,7 +87,7 @@ def main() -> None:
 
 
 def one_drone(rng: np.random.Generator, repeats: int, first: bool) -> dict:
-    """Fly one drawn drone and fit its flights by every method; the first drone's fits say what compilation costs."""
+    """Fly a random drone and fit its flights with every method; with ``first``, also measure the compilation time."""
     plant = open_loop.draw_drone(rng)
     logs = open_loop.fly(plant, repeats, rng)
     found, seconds, compile_seconds = {}, {}, {}
@@ -126,16 +126,19 @@ def one_drone(rng: np.random.Generator, repeats: int, first: bool) -> dict:
 
 
 def difference(a: dict, b: dict) -> float:
-    """Difference of two estimates in combined standard deviations."""
+    """Return the difference of two estimates in combined standard deviations."""
     return (b["value"] - a["value"]) / np.hypot(a["std"], b["std"])
 
 
 def page(results: dict) -> str:
-    """The Markdown page."""
+    """Return the page as Markdown."""
     env = results["environment"]
     packages = ", ".join(f"{name} {env[name]}" for name in ("cfb_mjx", "jax", "mujoco", "numpy", "scipy"))
     lines = [
-        "# Against an independent implementation: mujoco.sysid",
+        "# Comparison with an independent implementation: mujoco.sysid",
+        "",
+        "This page compares the estimates, the standard deviations and the speed of this library's fits with those of",
+        "`mujoco.sysid` on the same simulated flights. Read it to decide whether to trust these fits.",
         "",
         f"Measured {env['date']} on {env['processor']}, {env['device']}, Python {env['python']},",
         f"{packages}, float64, by",
@@ -147,39 +150,45 @@ def page(results: dict) -> str:
         "",
         "## What is compared",
         "",
-        f"{len(results['drones'])} drones are drawn around the paper's (each moment of inertia within 20 %, J_m within",
-        f"30 %, T within 20 %). Each flies {results['flights_per_drone']} manoeuvres open loop from hover: roll, pitch",
-        "and yaw doublets and single-motor steps of half a second, simulated by the paper's equations in plain NumPy",
-        "(RK4 at 1 ms), logged at 250 Hz with white noise: gyro 0.02 rad/s, attitude 1 mrad, velocity 0.01 m/s,",
-        "position 0.5 mm; pose and velocity 8 ms late; no rotor speeds. Mass, thrust and torque curves and K are",
-        "known; J_xx, J_yy, J_zz, J_m and T are fitted, all starting from the preset.",
+        f"{len(results['drones'])} drones are drawn at random around the paper's (each moment of inertia within 20 %,",
+        f"J_m within 30 %, T within 20 %). Each flies {results['flights_per_drone']} open-loop manoeuvres from hover:",
+        "roll, pitch and yaw doublets and single-motor steps of half a second. The paper's equations are simulated in",
+        "plain NumPy (RK4 at 1 ms) and logged at 250 Hz with white noise: gyro 0.02 rad/s, attitude 1 mrad, velocity",
+        "0.01 m/s, position 0.5 mm. Pose and velocity are 8 ms late. There are no rotor speeds. Mass, thrust and",
+        "torque curves and K are known; J_xx, J_yy, J_zz, J_m and T are fitted, all starting from the preset.",
         "",
         "`mujoco.sysid` (part of MuJoCo) simulates `assets/cfb.xml` without its floor in MuJoCo C (RK4, 2 ms) and",
-        "differentiates by finite differences. A MuJoCo actuator is affine in its activation and cannot hold a cubic",
-        "thrust curve; the motor model is therefore evaluated in NumPy from the logged commands and the candidate's T",
-        "(its `custom_rollout`), and three actuators per rotor receive thrust, aerodynamic torque and rotor",
-        "acceleration as means over each step. J_m is the gain of the last; MuJoCo's own geometry turns thrust into",
-        "moments. It shares no code with the library's model or fits (`tests/sysid/mujoco_fit.py`). Its optimiser",
-        "stops at changes of 1e-6; at its default of 1e-8 it searches in the noise of its finite differences.",
+        "differentiates by finite differences. It shares no code with the model or the fits of this library",
+        "(`tests/sysid/mujoco_fit.py`).",
+        "",
+        "A MuJoCo actuator is affine in its activation and cannot represent a cubic thrust curve. The motor model is",
+        "therefore evaluated in NumPy from the logged commands and the candidate value of T (`custom_rollout` of",
+        "`mujoco.sysid`). Three actuators per rotor receive thrust, aerodynamic torque and rotor acceleration as means",
+        "over each step. J_m is the gain of the last one; MuJoCo's own geometry turns thrust into moments. The",
+        "optimiser stops at changes of 1e-6: at its default of 1e-8 it searches in the noise of its finite",
+        "differences.",
         "",
         "## The same least-squares problem",
         "",
-        "Windows of 0.2 s from the *measured* (noisy) state at 0.6, 0.8 and 1.0 s of each flight, compared every",
-        "20 ms, weighted by the noise that third differences show. Both tools get the same states, rows and",
-        "weights, so the minimum must be the same. The standard deviations differ, and ours are the honest ones",
-        "here: an error of the",
-        "start is shared by a whole window, which `mujoco.sysid`'s intervals (white residuals) cannot know and our",
-        "bootstrap over windows sees. The last column is the difference in units of the *smaller* of the two.",
+        "Windows of 0.2 s start from the *measured* (noisy) state at 0.6, 0.8 and 1.0 s of each flight. Predictions",
+        "are compared every 20 ms, weighted by the noise that third differences show. Both tools get the same states,",
+        "rows and weights, so the minimum must be the same.",
+        "",
+        "The standard deviations differ, and ours are the realistic ones here. All rows of a window share the error of",
+        "its initial state. The intervals of `mujoco.sysid` assume white residuals and leave this out; our bootstrap",
+        "over windows includes it. The last column is the difference in units of the *smaller* standard deviation.",
         "",
         *table(results, SAME, strict=True),
         "",
         "## Each tool as its users would run it",
         "",
         "`mujoco.sysid` gets every row of 0.6 s from the start of each manoeuvre, predicted in one piece from the",
-        "known start (hover at rest, free of noise). `shoot` and `fit` get the noisy logs as they are and are not told",
-        "that the drone was at rest; they allow for unknown starts, rotor speeds (`shoot`) and disturbances (`fit`),",
-        "and are less certain for it. In brackets: distance from the truth in standard deviations; last columns:",
-        "difference from `mujoco.sysid` in combined standard deviations.",
+        "known initial state (hover at rest, free of noise). `shoot` and `fit` get the noisy logs as they are and do",
+        "not know that the drone was at rest. They also estimate initial states and rotor speeds (`shoot`) or",
+        "disturbances (`fit`), so their standard deviations are larger.",
+        "",
+        "In brackets: distance from the truth in standard deviations. Last columns: difference from `mujoco.sysid` in",
+        "combined standard deviations.",
         "",
         *table(results, BEST),
         "",
@@ -194,7 +203,7 @@ def page(results: dict) -> str:
 
 
 def table(results: dict, methods: tuple[str, ...], strict: bool = False) -> list[str]:
-    """One row per drone and parameter."""
+    """Return a table with one row per drone and parameter."""
     first, *others = methods
     if strict:
         heads = ["difference / smaller std"]
@@ -227,7 +236,7 @@ def table(results: dict, methods: tuple[str, ...], strict: bool = False) -> list
 
 
 def summary(results: dict) -> list[str]:
-    """Over all drones and parameters."""
+    """Return a table with the errors of each method over all drones and parameters."""
     pairs = [(d, name) for d in results["drones"] for name in SHOWN]
 
     def estimates(method):
@@ -250,12 +259,12 @@ def summary(results: dict) -> list[str]:
 
 
 def times(results: dict) -> list[str]:
-    """Seconds per fit, median over the drones."""
+    """Return a table with the seconds per fit, median over the drones."""
     drones = results["drones"]
     lines = [
-        f"Wall time of one fit of {results['flights_per_drone']} flights, median over the drones (a shared machine,",
-        f"load average {results['environment']['load_average']} at the end). Compilation: once per process, without",
-        "a compile cache.",
+        f"Wall time of one fit of {results['flights_per_drone']} flights, median over the drones, on a shared machine",
+        f"(load average {results['environment']['load_average']} at the end). Compilation is needed once per process;",
+        "its time is without a compile cache.",
         "",
         "| method | fit [s] | compilation [s] |",
         "|---|---|---|",
@@ -266,9 +275,10 @@ def times(results: dict) -> list[str]:
         lines.append(f"| {TITLES[method]} | {np.median([d['seconds'][method] for d in drones]):.2f} | {cell} |")
     lines += [
         "",
-        "SciPy minimises the residual of `shoot(free_start=False)`, compiled by us. `shoot` and `fit` iterate over",
-        "weights or noise levels and bootstrap their uncertainty, all of which is included; `mujoco.sysid` compiles a",
-        "MuJoCo model for every candidate and window. `benchmarks/fit_speed.py` compares speed on a minute of flight.",
+        "SciPy minimises the residual of `shoot(free_start=False)`, compiled by this library. The times of `shoot` and",
+        "`fit` include their iterations over weights or noise levels and the bootstrap of the uncertainty.",
+        "`mujoco.sysid` compiles a MuJoCo model for every candidate and window. `benchmarks/fit_speed.py` compares the",
+        "speed on a minute of flight.",
     ]
     return lines
 

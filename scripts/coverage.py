@@ -1,12 +1,12 @@
-"""How often the intervals of `cfb fit` cover the truth: flights by a simulator that shares nothing with this library.
+"""Measure how often the intervals of `cfb fit` cover the truth, and write docs/coverage.md.
 
     python scripts/coverage.py [--drones 20] [--only hover] [--generator ../shared/cases/fit/make_fit_logs.py]
 
-The generator is a program ``GENERATOR OUT --drones N --seed S --seconds T --rates HZ... [--omega] [--hover]
-[--wrong-mass SHARE]`` that writes logs and ``truth.json`` (per drone: files, stated_mass, mass, inertia,
-motor_time_constant, motor_gain, rotor_inertia, thrust_scale, torque_scale, cog). Without one nothing is done. What was
-fitted is kept in benchmarks/coverage.json after every fit, and a later run goes on from there (``--anew`` does not).
-Writes docs/coverage.md.
+The flights come from a simulator that shares no code with this library: a program ``GENERATOR OUT --drones N --seed S
+--seconds T --rates HZ... [--omega] [--hover] [--wrong-mass SHARE]`` that writes logs and ``truth.json`` (per drone:
+files, stated_mass, mass, inertia, motor_time_constant, motor_gain, rotor_inertia, thrust_scale, torque_scale, cog).
+Without it the script exits. Every fit is stored in benchmarks/coverage.json, and a later run continues from there;
+``--anew`` starts again.
 """
 
 import argparse
@@ -27,12 +27,12 @@ ROOT = Path(__file__).resolve().parents[1]
 GENERATOR = ROOT.parent / "shared" / "cases" / "fit" / "make_fit_logs.py"
 RESULTS, PAGE = ROOT / "benchmarks" / "coverage.json", ROOT / "docs" / "coverage.md"
 SCALE = 0.002
-"""The mass a fit is told is drawn about the stated one with this relative std, and this is what the fit is told."""
+"""Relative standard deviation of the random error of the mass given to a fit; the fit is told this value too."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Condition:
-    """How the logs of one row of the page are made and fitted."""
+    """Settings of the flights and fits of one section of the page."""
 
     what: str
     seconds: float
@@ -40,7 +40,7 @@ class Condition:
     flags: tuple[str, ...] = ()
     irregular: bool = False
     mass_std: float | None = SCALE
-    """Relative; None tells the fit nothing, and it takes its default."""
+    """Relative standard deviation of the mass given to the fit; None leaves the default of the fit."""
 
 
 CONDITIONS = {
@@ -64,7 +64,7 @@ CONDITIONS = {
 
 
 def truths(drone: dict) -> dict[str, float]:
-    """What a drone of ``truth.json`` really is, by the names of a fit."""
+    """Return the true constants of a drone of ``truth.json``, under the names that a fit uses."""
     axes = dict(zip(("inertia_xx", "inertia_yy", "inertia_zz"), drone["inertia"], strict=True))
     same = ("mass", "motor_time_constant", "motor_gain", "rotor_inertia", "thrust_scale", "torque_scale")
     trim = {"cog_x": drone["cog"][0], "cog_y": drone["cog"][1]}
@@ -74,7 +74,7 @@ def truths(drone: dict) -> dict[str, float]:
 
 
 def product(text: str, truth: dict[str, float]) -> float:
-    """``inertia_xx / mass`` of the true constants."""
+    """Evaluate a product such as ``inertia_xx / mass`` with the true constants."""
     value, sign = 1.0, 1.0
     for word in text.split():
         if word in ("*", "/"):
@@ -86,7 +86,7 @@ def product(text: str, truth: dict[str, float]) -> float:
 
 
 def one(log, drone: dict, condition: Condition, rng) -> dict:
-    """Fit one log; value, std and truth of all that is reported."""
+    """Fit one log; return value, std and truth of every reported quantity."""
     from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid.identification.fitting import fit
 
@@ -126,14 +126,14 @@ ROWS = (
 
 
 def fly(generator: Path, folder: Path, condition: Condition, drones: int, seed: int) -> dict:
-    """Have the logs of one condition made; ``truth.json`` as read."""
+    """Generate the logs of one condition; return the contents of ``truth.json``."""
     size = ["--drones", drones, "--seed", seed, "--seconds", condition.seconds, "--rates", condition.hz]
     subprocess.run([sys.executable, generator, folder, *map(str, size), *condition.flags], check=True)
     return json.loads((folder / "truth.json").read_text())
 
 
 def rows_of(fits: list[dict]) -> dict[str, dict]:
-    """Per quantity: how many fits gave it a number, how many of those intervals hold the truth, and the errors."""
+    """Return per quantity the number of fits that report it, the number of covering intervals, and the errors."""
     rows = {}
     names = list(dict.fromkeys(n for f in fits for n in (*f["reported"], *f["untold"], *f["together"])))
     for name in names:
@@ -154,7 +154,7 @@ def rows_of(fits: list[dict]) -> dict[str, dict]:
 
 
 def page(results: dict, options: argparse.Namespace) -> str:
-    """The Markdown page."""
+    """Return the page as Markdown."""
     facts = ", ".join(f"{name} {value}" for name, value in environment().items())
     parts, every = [], []
     for key, condition in CONDITIONS.items():
@@ -168,33 +168,51 @@ def page(results: dict, options: argparse.Namespace) -> str:
         lines = [
             f"## {condition.what}",
             "",
-            f"{len(fits)} drones. How long a logged command acted (the truth is 2 ms): "
-            f"{1e3 * np.median(holds):.2f} ms; taken to act until the next row in {in_time}.",
+            f"{len(fits)} drones. Estimated time that a logged command acts (true value 2 ms): median "
+            f"{1e3 * np.median(holds):.2f} ms; {in_time} fits let it act until the next row.",
             "",
-            "| quantity | told | not told | 95 % intervals that hold it | mean z | std z | median error | stated std |",
+            "| quantity | identified | not identified | covered | mean z | std z | median error | stated std |",
             "|---|---:|---:|---:|---:|---:|---:|---:|",
         ]
         lines += [_line(name, row) for name, row in rows_of(fits).items()]
         parts.append("\n".join(lines))
     total = {name: row for name, row in rows_of(every).items() if row["fits"] >= 10}
-    summary = ["| quantity | told | not told | covered | mean z | std z |", "|---|---:|---:|---:|---:|---:|"]
+    summary = [
+        "| quantity | identified | not identified | covered | mean z | std z |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
     for name, row in total.items():
         summary.append(
             f"| {name} | {row['fits']} | {row['untold']} | {row['covered'] / row['fits']:.1%} "
             f"| {row['z_mean']:+.2f} | {row['z_std']:.2f} |"
         )
-    return f"""# Do the intervals cover the truth?
+    return f"""# Coverage of the intervals of `cfb fit`
 
 Written by `python scripts/coverage.py --drones {options.drones} --seed {options.seed}`; do not edit. {facts}
 
-Logs by a simulator and a controller that share nothing with this library (NumPy, RK4 at 2 ms, a PD controller at
-500 Hz, gyro noise 0.02 rad/s, accelerometer 0.15 m/s^2, pose 8 ms late). Every drone is drawn anew: mass -10 to +15 %,
-inertia and motor lag +-20 %, gain +-7 %, J_m -40 to +50 %, thrust -16 to +10 % and torque +-30 % of the paper's curves,
-centre of gravity +-3 mm. Each is one `cfb fit` from the preset with nothing asked for. The mass it is told is off by
-{SCALE:.1%} (one std, drawn, and stated), except where a section says otherwise. z is the error in the fit's own
-standard deviations. What a fit names as not identified gets no number and counts as "not told"; products like
-`inertia_xx / mass` are what it then reports instead. Of 20 intervals that are right, 17 to 20 hold the truth in
-99 % of such tables; of {len(every)}, {_binomial(max(len(every), 1))}.
+This page says how far you can trust the standard deviations of `cfb fit`: it compares the 95 % intervals of many fits
+with the true constants of simulated drones. Each fit is one command from the preset, with default options:
+
+```sh
+cfb fit flight.mcap --set mass=0.0385 --mass-std 0.0002 -o model.yaml
+```
+
+The logs come from a simulator and a controller that share nothing with this library (NumPy, RK4 at 2 ms, a PD
+controller at 500 Hz, gyro noise 0.02 rad/s, accelerometer noise 0.15 m/s^2, pose 8 ms late). The constants of each
+drone are drawn at random: mass -10 to +15 %, inertia and motor lag +-20 %, gain +-7 %, J_m -40 to +50 %, thrust -16 to
++10 % and torque +-30 % of the paper's curves, centre of gravity +-3 mm. The mass given to the fit has a random error
+with a standard deviation of {SCALE:.1%}, which the fit knows, except where a section says otherwise.
+
+| column | meaning |
+|---|---|
+| identified | fits that give a number for the quantity |
+| not identified | fits that report it as not identifiable; they report products such as `inertia_xx / mass` instead |
+| covered | 95 % intervals that contain the true value |
+| mean z, std z | mean and standard deviation of z, the error over the fit's own standard deviation |
+| median error, stated std | medians of the error and of the fit's standard deviation |
+
+If the intervals are correct, 17 to 20 of 20 contain the true value in 99 % of such tables; of {len(every)} intervals,
+{_binomial(max(len(every), 1))}.
 
 ## All {len(every)} fits
 
@@ -220,17 +238,19 @@ def _binomial(count: int) -> str:
 
 
 def main() -> None:
-    """Fit what is not fitted yet and write the results."""
+    """Run the missing fits and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--drones", type=int, default=20, help="per condition")
+    parser.add_argument("--drones", type=int, default=20, help="number of drones per condition")
     parser.add_argument("--only", nargs="+", choices=list(CONDITIONS), default=list(CONDITIONS))
     parser.add_argument("--generator", type=Path, default=GENERATOR)
-    parser.add_argument("--seed", type=int, default=9000, help="of the first condition; the others count on from it")
-    parser.add_argument("--anew", action="store_true", help="forget what an earlier run fitted")
+    parser.add_argument(
+        "--seed", type=int, default=9000, help="seed of the first condition; the next ones count up from it"
+    )
+    parser.add_argument("--anew", action="store_true", help="discard the fits of earlier runs")
     options = parser.parse_args()
     if not options.generator.is_file():
         raise SystemExit(
-            f"{options.generator}: not there; name a generator of logs with --generator. Nothing was done."
+            f"{options.generator}: no such file; give the generator of the logs with --generator. Nothing was done."
         )
     configure_jax(x64=True)
     from cfb_mjx.logs import read_log
@@ -248,7 +268,7 @@ def main() -> None:
                     continue
                 rng = np.random.default_rng([options.seed + index, number])
                 done[drone] = one(read_log(Path(folder) / facts["files"][0]), facts, condition, rng)
-                # After every fit: an hour's work must not hang on the last.
+                # Write after every fit, so that an interruption loses one fit only.
                 write_json(
                     RESULTS,
                     {

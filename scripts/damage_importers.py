@@ -1,11 +1,11 @@
-"""Damage recordings of every format at random and see what the importers make of it; note the result in docs/logs.md.
+"""Test the importers on randomly damaged recordings of every format; write the result into docs/logs.md.
 
     python scripts/damage_importers.py [-n 10000] [--seed 0] [-o docs/logs.md]
 
-Every damaged file must be refused with a `CfbError`, be read with a warning, or give exactly the undamaged flight.
-Where the format has no checksums the reader says so; where it does not even say that, a change is counted as unseen.
-None may hold values that no flight has. Exits with status 1 if anything else happens, if a file takes more than 20 s,
-or if the process grows by 1 GB.
+A damaged file must be refused with a `CfbError`, be read with a warning, or give exactly the undamaged flight. For a
+format without checksums the reader notes that it has none; if there is no such note either, a change counts as unseen.
+No log may have values that no flight can have. The exit status is 1 if anything else happens, if a file takes more than
+20 s, or if the process grows by 1 GB.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from cfb_mjx.logs import read_log, write_mcap, write_tabular  # noqa: E402
 from cfb_mjx.logs.flight_log import OPTIONAL, REQUIRED  # noqa: E402
 
 CHECKED = ("micro SD card", "MCAP bag", "MCAP of JSON", "own MCAP", "own parquet", "npz")
-"""Formats with a checksum over every value."""
+"""Formats with checksums that cover every value."""
 SLOW, LARGE = 20.0, 1 << 30
 
 
 def samples(folder: Path) -> dict[str, list[tuple[Path, dict]]]:
-    """Small undamaged files of every format with the options to read them."""
+    """Write small undamaged files of every format; return their paths with the options to read them."""
     flight = make_flight(duration=0.4, rate=100.0)
     imu, motors, state = (list(v) for v in (foreign_logs.IMU, foreign_logs.MOTOR, foreign_logs.STATE))
     everything = foreign_logs.STATE | foreign_logs.IMU | foreign_logs.MOTOR | foreign_logs.RPM | foreign_logs.BATTERY
@@ -95,7 +95,7 @@ def samples(folder: Path) -> dict[str, list[tuple[Path, dict]]]:
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """One to three of: a bit or byte changed, the end cut off, a piece lost, doubled, blanked or overwritten."""
+    """Damage a file one to three times: change a bit or byte, truncate it, or remove, repeat or overwrite a piece."""
     out = bytearray(data)
     for _ in range(rng.integers(1, 4)):
         if not out:
@@ -120,7 +120,7 @@ def damaged(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 def same(a, b) -> bool:
-    """Bit for bit the same data, NaN included."""
+    """Whether two logs have the same data, bit for bit, NaN included."""
     for field in (*REQUIRED, *OPTIONAL):
         x, y = getattr(a, field), getattr(b, field)
         if (x is None) != (y is None) or (x is not None and x.tobytes() != y.tobytes()):
@@ -129,19 +129,19 @@ def same(a, b) -> bool:
 
 
 def plausible(log) -> bool:
-    """Whether a flight can have these values."""
+    """Whether the values of a log are possible in a flight."""
     limits = {"position": 1e4, "velocity": 60.0, "body_rate": 70.0, "specific_force": 320.0}
     return all(np.abs(getattr(log, f)).max() <= limit for f, limit in limits.items())
 
 
 def outcome_of(path: Path, options: dict, truth) -> tuple[str, str]:
-    """What became of a damaged file, and what was wrong with that."""
+    """Read a damaged file; return the outcome, and the fault of the reader or an empty string."""
     began = time.monotonic()
     try:
         log = read_log(path, **options)
     except CfbError as error:
         found = "refused", "a message of several lines" if "\n" in str(error) else ""
-    except Exception as error:  # what this script looks for
+    except Exception as error:  # a fault of the reader
         found = "crashed", f"{type(error).__name__}: {error}"
     else:
         told = [*(log.metadata.get("warnings") or ())]
@@ -155,9 +155,9 @@ def outcome_of(path: Path, options: dict, truth) -> tuple[str, str]:
 
 
 def main() -> int:
-    """Damage, read, count, and write the block of the page."""
+    """Damage and read the files, count the outcomes, and write the block of the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("-n", type=int, default=10_000, help="how many damaged files")
+    parser.add_argument("-n", type=int, default=10_000, help="number of damaged files")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "logs.md")
     arguments = parser.parse_args()
@@ -192,7 +192,7 @@ def main() -> int:
 
 
 def report(arguments, counts: dict, failures: list[str], slowest: float, grown: int) -> str:
-    """The result as a sentence and a table."""
+    """Return the result as a sentence and a table."""
     outcomes = ("refused", "warned", "unchanged", "said to have no checksums", "unseen")
     rows = []
     for format, counter in counts.items():

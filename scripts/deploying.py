@@ -1,7 +1,7 @@
-"""Export and check the shipped policies, and write docs/deploying.md with what they cost on the drone.
+"""Export and check the shipped policies, and write their cost on the drone into docs/deploying.md.
 
-python scripts/deploying.py             check them all: benchmarks/deploying.json and the page (a minute)
-python scripts/deploying.py --page-only write the page from the numbers that are there
+python scripts/deploying.py             check all of them: benchmarks/deploying.json and the page (a minute)
+python scripts/deploying.py --page-only write the page from the stored results
 """
 
 import argparse
@@ -21,7 +21,7 @@ NUMBERS, PAGE = ROOT / "benchmarks" / "deploying.json", ROOT / "docs" / "deployi
 
 
 def measure() -> dict:
-    """What `cfb export --check` says of each."""
+    """Run `cfb export --check` on every policy and collect its numbers."""
     found = {}
     for name in POLICIES:
         with tempfile.TemporaryDirectory() as folder:
@@ -34,7 +34,7 @@ def measure() -> dict:
 
 
 def row(name: str, found: dict) -> str:
-    """Of the table."""
+    """Format one row of the table."""
     costs, loop = found["cortex_m4"], found["closed_loop"]
     far = next(value for key, value in loop.items() if key.endswith("_m@6s"))
     cells = [
@@ -52,22 +52,26 @@ def row(name: str, found: dict) -> str:
 
 
 def page(found: dict) -> str:
-    """docs/deploying.md."""
+    """Write the text of docs/deploying.md."""
     rows = "\n".join(row(name, one) for name, one in found["policies"].items())
     costs = next(iter(found["policies"].values()))["cortex_m4"]
     return f"""# Onto the drone
 
-`cfb export` turns a policy into C for the Crazyflie's STM32F405: C11, single precision, static memory, nothing beyond
-the C library's `sqrtf` (and `atan2f` in flips).
+This page is for users who want to run a policy on a Crazyflie. `cfb export` turns the policy into C for the drone's
+STM32F405: C11, single precision, static memory, and no function of the C library but `sqrtf` (and `atan2f` in flips).
 
 ```sh
 cfb export target -o target-c --check              # a shipped policy; or policy.npz of cfb train
 cfb export double-flip -o flip-c --check           # holds a target, flips on demand
 ```
 
-The folder holds the sources, an app for the firmware with its `Makefile`, `contract.json` (units, frames, rates,
-history and scale of every number, the hash of the weights, the model and randomisation of the training), and a
-`README.md` on building, flashing and first flights.
+The output folder holds
+
+- the C sources,
+- an app for the firmware with its `Makefile`,
+- `contract.json`: units, frames, rates, history and scale of every number, the hash of the weights, and the model and
+  randomisation of the training,
+- a `README.md` on building, flashing and first flights.
 
 ## What it costs, and how near to JAX it is
 
@@ -78,15 +82,23 @@ instructions | ms per step |
 |---|---|---|---|---|---|---|---|---|
 {rows}
 
-The first two columns are the largest difference of a command (of 1) between C and JAX in single precision: on
-10 000 sequences of random estimates, near and far, slow and fast, each from a reset; and over a second in closed loop
-with the simulated drone, from half a metre off or in a flip. The third is the largest distance between a drone flown by
-the C and one flown by JAX over 6 s of hover, or of a flip, both with the same noise. Sizes are those of
-`arm-none-eabi-gcc -mcpu=cortex-m4 -mfpu=fpv4-sp-d16 -O2`; the stack is the sum over all functions, more than any chain
-of calls needs. Instructions are counted, the most of any step, by running the program on QEMU's model of an STM32F405,
-where the commands were the same as here; the time follows with {costs["cycles_per_instruction"]:g} cycles for each at
-{costs["clock_hz"] / 1e6:.0f} MHz, which is more than a Cortex-M4 needs on such code. None of it has been measured on a
-drone. A step is due every 8 ms; the firmware's other tasks run beside it.
+| column | meaning |
+|---|---|
+| random sequences | largest difference of a command (range 0 to 1) between C and JAX in single precision, on 10 000 \
+sequences of random estimates, near and far, slow and fast, each after a reset |
+| 1 s closed loop | the same over one second in closed loop with the simulated drone, starting half a metre from the \
+target, or in a flip |
+| 6 s apart | largest distance between a drone flown by the C and one flown by JAX, over 6 s of hover or of a flip, \
+with the same noise |
+| flash, memory, stack | sizes with `arm-none-eabi-gcc -mcpu=cortex-m4 -mfpu=fpv4-sp-d16 -O2`; the stack is the sum \
+over all functions, an upper bound for any chain of calls |
+| instructions | largest number in one step, counted on QEMU's model of an STM32F405; the commands there were the same \
+as on this machine |
+| ms per step | the instructions at {costs["cycles_per_instruction"]:g} cycles each and \
+{costs["clock_hz"] / 1e6:.0f} MHz; a Cortex-M4 needs fewer cycles on such code |
+
+Nothing here has been measured on a drone. A step is due every 8 ms, and the firmware's other tasks need processor time
+too.
 
 ## The interface
 
@@ -101,25 +113,26 @@ void cfb_policy_set_flip(float v_target, float rate_target);    /* flips only: b
 cfb_phase_t cfb_policy_phase(void);                             /* hold, climb, turn, catch */
 ```
 
-The history is inside. A flip begins with the step after `cfb_policy_set_flip`; until then, and after the catch, the
-target is held. What happens when an estimate is not finite, when steps are missed or the set-point goes away is in the
-exported `README.md`, and tested (`tests/deploy`).
+The policy keeps its own history of estimates and commands. A flip begins with the step after `cfb_policy_set_flip`;
+until then, and after the catch, the policy holds the target. The exported `README.md` describes the behaviour if an
+estimate is not finite, if steps are missed or if the set-point disappears; `tests/deploy` tests it.
 
 ## What the firmware does between the policy and the motors
 
-- The app commands `controlModeForce` with `normalizedForces`, which the firmware passes to the motors as shares of
-  65535. That share is the `u` of the model (docs/conventions.md): proportional to the voltage, not to the thrust.
-- Firmware since October 2025 compensates for the battery's voltage on this drone by default, and caps the thrust of a
-  motor at 0.2 N. Both change what a policy's command does; the exported `app-config` turns that off. Policies trained
-  on a model with `battery_sag` fitted to your flights need it off as well.
-- The estimate the policy sees is the firmware's Kalman filter's, position and velocity in the world, the gyro after its
-  80 Hz low-pass. Training assumed 8 ms of delay for all of it (`pose_delay`, and the gyro as late); `cfb fit
-  --parameters pose_delay` measures yours.
+- The app uses `controlModeForce` with `normalizedForces`, which the firmware passes to the motors as fractions of
+  65535. This fraction is the `u` of the model ([conventions](conventions.md)). It is proportional to the voltage, not
+  to the thrust.
+- Firmware since October 2025 compensates for the battery voltage on this drone by default, and limits the thrust of a
+  motor to 0.2 N. Both change the effect of a command; the exported `app-config` turns them off. Policies trained on a
+  model with `battery_sag` fitted to your flights also need them off.
+- The policy reads the estimate of the firmware's Kalman filter (position and velocity in the world) and the gyro after
+  its 80 Hz low-pass filter. Training assumed a delay of 8 ms for both (`pose_delay`). Measure the delay of your drone
+  with `cfb fit --parameters pose_delay`.
 """
 
 
 def main() -> None:
-    """Measure, write."""
+    """Measure the policies and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--page-only", action="store_true")
     if not parser.parse_args().page_only:

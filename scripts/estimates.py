@@ -1,9 +1,9 @@
-"""How far the Crazyflie's own estimate is from motion capture in the same files; writes a table into docs/logs.md.
+"""Compare the Crazyflie's own estimate with motion capture in the same files; write a table into docs/logs.md.
 
     python scripts/estimates.py NAME=FOLDER ...
 
-Every file below FOLDER that holds motion capture beside the estimate counts. Only medians over flights are written; the
-flights themselves never enter the project.
+All files below FOLDER that hold both are used. Only medians over flights are written; the flights do not become part of
+the project.
 """
 
 import argparse
@@ -19,12 +19,15 @@ from cfb_mjx.runtime import environment
 
 ROOT = Path(__file__).resolve().parents[1]
 SPAN, TURNING = 0.4, 0.1
-"""Over which an attitude is compared with the gyro, s, and how far it has to turn in that, rad rms."""
+"""Interval over which an attitude is compared with the gyro, s, and the least rotation in it, rad rms."""
 
 
 def turned(log: FlightLog) -> np.ndarray:
-    """(2,) how much further than the gyro the attitude turns about body x and y, whatever axes it has: the symmetric
-    part of what maps the gyro's turns onto its own."""
+    """Return the ratio of the attitude's rotation to the gyro's about body x and y, shape (2,).
+
+    It is the symmetric part of the linear map from the gyro's rotations to those of the attitude, so the ratio does not
+    depend on the axes of the attitude.
+    """
     gyro, pose = motion_capture.turned_by_gyro(log), motion_capture.Capture(log.time, log.position, log.quaternion)
     late = motion_capture.delay_behind(log, gyro, pose)
     x, y = motion_capture.turns(log, gyro, pose, late, SPAN)
@@ -34,7 +37,7 @@ def turned(log: FlightLog) -> np.ndarray:
 
 
 def ratios(path: Path) -> list[float] | None:
-    """Lean, speed over ground, climb, and turns about x and y: the estimate's over motion capture's, or the gyro's."""
+    """Return ratios of estimate to motion capture (tilt, horizontal speed, climb) and to the gyro (rotations)."""
     try:
         estimate, captured = read_log(path), read_log(path, motion_capture=True)
     except CfbError as error:

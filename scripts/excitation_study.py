@@ -1,7 +1,8 @@
-"""Does `cfb excite` predict the scatter of `cfb fit`? Simulate several flights of each manoeuvre, and fit each.
+"""Compare the scatter of `cfb fit` on simulated flights with the prediction of `cfb excite`.
 
-Every flight has its own noise and disturbances and holds five repetitions; the true parameters are the preset's, and
-every fit starts 20 % off in inertia and J_m.
+Several flights of each manoeuvre are simulated and fitted one by one. Every flight has its own noise and disturbances,
+and five repetitions of the manoeuvre. The true parameters are the preset's; every fit starts with errors of 20 % in
+inertia and J_m.
 
     python scripts/excitation_study.py [--flights 8] [--json PATH]
 """
@@ -31,7 +32,7 @@ REPETITIONS = 5
 
 
 def main() -> None:
-    """Print predicted and found scatter per parameter."""
+    """Print the predicted and the actual scatter of each parameter."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--flights", type=int, default=8)
     parser.add_argument("--measured-rotors", action="store_true")

@@ -1,9 +1,9 @@
-"""Find, fly and show the shipped flips.
+"""Search for the settings of the shipped flips, measure the flips, and write docs/flips.md.
 
-python scripts/flips.py             measure them: docs/flips.md, its figures, benchmarks/flips.json (minutes)
-python scripts/flips.py --search    look for their knobs first: configs/manoeuvres (a quarter of an hour)
-python scripts/flips.py --before EARLIER.json   say what moved since those results
-python scripts/flips.py --page-only write the page from the numbers that are there
+python scripts/flips.py             measure: docs/flips.md, its figures, benchmarks/flips.json (minutes)
+python scripts/flips.py --search    search for the settings first: configs/manoeuvres (a quarter of an hour)
+python scripts/flips.py --before EARLIER.json   list the changes since those results
+python scripts/flips.py --page-only write the page from the stored results
 """
 
 import argparse
@@ -23,7 +23,7 @@ MANOEUVRES, RESULTS, PAGE = ROOT / "configs" / "manoeuvres", ROOT / "benchmarks"
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a shipped flip is to be."""
+    """Requirements of a shipped flip."""
 
     rotations: int
     aim: str
@@ -31,12 +31,12 @@ class Wanted:
     fixed: dict = field(default_factory=dict)
     goal: dict = field(default_factory=dict)
     magnitude: float = 1.0
-    """Of the randomisation a margin is looked for with: above one where hardly any drone fails at one."""
+    """Magnitude of the randomisation in the search; above one where hardly any drone fails at one."""
     holder: str = "target-analytic"
-    """Climbs and catches."""
+    """Policy that flies the climb and the catch."""
 
 
-# About 1000 deg/s is 17.5 rad/s; the drone overshoots what is asked of it by a tenth.
+# About 1000 deg/s is 17.5 rad/s; the drone overshoots the commanded rate by a tenth.
 FLIPS = {
     "flip": Wanted(1, "margin", "One turn, for the most drones.", {"rate_radps": 17.0}, magnitude=1.2),
     "double-flip": Wanted(2, "margin", "Two turns, for the most drones.", {"rate_radps": 17.1}),
@@ -69,15 +69,21 @@ FLIPS = {
     ),
 }
 SHAPES = ("flip-low", "flip-fast", "flip-wide", "flip-high")
-"""The single flips of the figure."""
+"""Single flips in the figure."""
 
 
 def main() -> None:
-    """Search if asked to, fly, write."""
+    """Search if asked to, measure the flips and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--search", nargs="*", choices=list(FLIPS), metavar="NAME", help="all, or these")
+    parser.add_argument(
+        "--search",
+        nargs="*",
+        choices=list(FLIPS),
+        metavar="NAME",
+        help="search for the settings of these flips; of all without a NAME",
+    )
     parser.add_argument("--page-only", action="store_true")
-    parser.add_argument("--before", type=Path, help="results of an earlier run")
+    parser.add_argument("--before", type=Path, help="results of an earlier run to compare with")
     arguments = parser.parse_args()
     before = json.loads(arguments.before.read_text()) if arguments.before else None
     configure_jax(x64=False)
@@ -96,7 +102,7 @@ def main() -> None:
 
 
 class Course:
-    """The drone, the policies and the tests."""
+    """The drone, the policies and the tests that all flips share."""
 
     def __init__(self):
         import jax
@@ -115,13 +121,13 @@ class Course:
         self.few, self.many = (jax.random.split(jax.random.PRNGKey(SEED), n) for n in (NOMINAL, RANDOM))
 
     def manoeuvre(self, name: str):
-        """As it lies in configs."""
+        """Load a flip from configs/manoeuvres."""
         from cfb_mjx.deploy.deployment import find_deployment
 
         return find_deployment(name).controller
 
     def search(self, name: str) -> None:
-        """Find the knobs of one, from those it has if it has any."""
+        """Search for the knobs of a flip, beginning from its present ones if it has any, and save them."""
         from dataclasses import replace
 
         import jax
@@ -147,7 +153,7 @@ class Course:
         save_manoeuvre(written, MANOEUVRES / f"{name}.yaml")
 
     def measure(self, name: str) -> dict:
-        """Nominal, randomised and off-nominal drones, and the commands again without the controller."""
+        """Measure a flip on nominal, randomised and off-nominal drones, and replay its commands in open loop."""
         from cfb_mjx.train.flips import flips, replay
 
         say(name)
@@ -177,7 +183,7 @@ class Course:
         }
 
     def draw(self) -> None:
-        """The paper's two figures, and a recording of each flip in out/flips."""
+        """Draw the figures of the page and write a recording of each flip to out/flips."""
         from cfb_mjx.files import output_folder
         from cfb_mjx.train.flips import flips
         from cfb_mjx.view.flight_recording import write_flight_recording
@@ -211,21 +217,37 @@ def page(found: dict, change: list[str]) -> str:
     lines = [
         "# Flips",
         "",
+        "This page is for users who fly the shipped flips or search for their own. It measures each shipped flip in "
+        "simulation.",
+        "",
+        "```sh",
+        "cfb fly double-flip --figure flip.png",
+        "```",
+        "",
         facts_line("python scripts/flips.py", [found]).replace("trained", "flown"),
         "",
-        "The shipped policy `flip`, trained by PPO, holds a rate about the x axis while a holder climbs before and "
-        "catches after it (`cfb fly double-flip`): the shipped `target-analytic`, trained by back-propagation; in "
-        "`double-flip-ppo` `target`, trained by PPO. Holder and knobs of each flip are in `configs/manoeuvres`; the "
-        "knobs were found by `python scripts/flips.py --search`, the cross-entropy method in simulation. All flights "
-        f"are seen 8 ms late and with noise; nominal: mean of {NOMINAL} flights; completed: turned as often as it "
-        f"should, back within 0.75 m, never 2 m below the start, no limit of speed or rate passed, of {RANDOM} drones "
-        f"of the paper's full randomisation; within {PAPER_EXTENT_M} m: completed in no more height than that. "
-        "Stopping times count from the switch to the holder: until the body rate is below 100 deg/s, and until the "
-        "drone does not fall any more. The paper's double flip on the real drone: 1.8 m, about 1000 deg/s stopped in "
-        "0.35 s, about 3.5 m/s in 0.6 s.",
+        "A flip has three phases. A policy that holds a target (the holder) climbs, the shipped policy `flip`, trained "
+        "by PPO, turns about the x axis at a given rate, and the holder catches the drone at the start. The holder is "
+        "the shipped `target-analytic`, trained by back-propagation, and in `double-flip-ppo` it is `target`, trained "
+        "by PPO. `configs/manoeuvres` has the holder and the settings (knobs) of each flip. `python scripts/flips.py "
+        "--search` found them in simulation with the cross-entropy method.",
         "",
-        "| flip | turns | height, m | rate, deg/s | stopped, s | fall, m/s | stopped, s | off, mm | completed "
-        f"| within {PAPER_EXTENT_M} m | height of those completed, m: median, 95 % |",
+        "In all flights the estimates are noisy and 8 ms late. The columns of the table:",
+        "",
+        f"- turns to error: on the nominal drone, mean of {NOMINAL} flights. Height is the highest minus the lowest "
+        "point; rate and fall are the largest roll rate and downward speed; error is the mean distance from the start "
+        "in the last second.",
+        "- rate stopped, fall stopped: time from the switch to the holder until the body rate is below 100 deg/s, and "
+        "until the drone no longer falls.",
+        f"- completed: share of {RANDOM} drones of the paper's full randomisation that make all turns, return within "
+        "0.75 m, are never 2 m below the start and exceed no limit of speed or rate.",
+        f"- within {PAPER_EXTENT_M} m: share of the same drones that complete the flip in no more height than that.",
+        "",
+        "The paper's double flip on the real drone takes 1.8 m; it stops about 1000 deg/s in 0.35 s, and about 3.5 m/s "
+        "in 0.6 s.",
+        "",
+        "| flip | turns | height, m | rate, deg/s | rate stopped, s | fall, m/s | fall stopped, s | error, mm "
+        f"| completed | within {PAPER_EXTENT_M} m | height of completed flips, m: median, 95 % |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name, r in found["flips"].items():
@@ -243,21 +265,22 @@ def page(found: dict, change: list[str]) -> str:
         lines.append("| " + " | ".join(cells) + " |")
     lines += [
         "",
-        "![double flip as the paper's](double-flip-paper.png)",
+        "![double flip like the paper's](double-flip-paper.png)",
         "",
-        "Left the way in the YZ plane and the drone on it; right the roll angle, its rate, and the vertical speed; "
-        "grey: the flip policy flies.",
+        "Left: the trajectory in the YZ plane, with the drone. Right: roll angle, roll rate and vertical speed. The "
+        "flip policy flies in the grey interval.",
         "",
         "## Single flips",
         "",
-        "Four shapes from four settings of the knobs, with one policy (`out/flips` has rerun recordings of all flips):",
+        "One policy flies four shapes with four settings of the knobs. The script writes Rerun recordings of all flips "
+        "to `out/flips`.",
         "",
         "![single flips](flips.png)",
         "",
         "## The least height",
         "",
-        "`double-flip-low` and `triple-flip-low` are the lowest the search found; the table says how few of the "
-        "randomised drones still complete them.",
+        "`double-flip-low` and `triple-flip-low` are the lowest flips that the search found. Fewer randomised drones "
+        "complete them (see the table).",
         "",
         "![lowest double flip](double-flip-low.png)",
         "",
@@ -265,7 +288,7 @@ def page(found: dict, change: list[str]) -> str:
         "",
         "## Other drones",
         "",
-        "Share of 16 flights completed on drones with effects that no policy was trained on "
+        "Share of 16 flights that are completed on drones with effects that no policy was trained on "
         "(`configs/plants/off-nominal.yaml`).",
         "",
     ]
@@ -277,11 +300,12 @@ def page(found: dict, change: list[str]) -> str:
         "",
         "## No hidden thrust",
         "",
-        "Commands stay within [0, 1]. Flown again without any controller, on the nominal drone without noise, the "
-        "recorded commands lead along the same way; the thrust felt (specific force times mass) never exceeds what "
-        "the motor model gives at full command.",
+        "This check shows that only the motors move the drone. Commands stay within [0, 1]. The recorded commands of a "
+        "flight without noise, replayed in open loop on the nominal drone, give the same trajectory. The thrust in "
+        "flight (specific force times mass) never exceeds the thrust of the motor model at full command.",
         "",
-        "| flip | least and largest command | apart, mm | largest thrust, N | motor model's, N |",
+        "| flip | least and largest command | distance between trajectories, mm | largest thrust, N "
+        "| motor model at full command, N |",
         "|---|---|---|---|---|",
     ]
     for name, r in found["flips"].items():
@@ -297,7 +321,7 @@ def page(found: dict, change: list[str]) -> str:
 
 
 def _headlines(found: dict) -> dict[str, float]:
-    """The numbers of the page's first table, by name."""
+    """Return the main numbers of each flip, for the comparison with an earlier run."""
     numbers = {}
     for name, r in found["flips"].items():
         n = r["nominal"]

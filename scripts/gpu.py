@@ -1,10 +1,10 @@
-"""Measure the library on a GPU, write docs/performance-gpu.md and benchmarks/gpu.json.
+"""Measure the library on a GPU, and write docs/performance-gpu.md and benchmarks/gpu.json.
 
     python scripts/gpu.py [--only SECTION ...] [--seconds 500]
     python scripts/gpu.py --page-only
 
-Needs a GPU that jax uses, and no network. Results are kept after every row, and what fails is kept too; a section is
-not begun when the time is up. With --only the other sections stay as they were measured before.
+Needs a GPU that jax uses, and no network. Results, failures included, are written after every row. After `--seconds`
+no further section starts. With `--only` the other sections keep their earlier results.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ HOVER_MM = 30.0
 
 
 def best(work) -> dict:
-    """A row of a workload: the fastest of several runs."""
+    """Measure a workload several times; return the fastest run as a row."""
     seconds = min(work.seconds() for _ in range(REPETITIONS))
     return {
         "what": work.what,
@@ -43,7 +43,7 @@ def best(work) -> dict:
 
 
 def over_batches(make, drones, found: list, keep) -> None:
-    """Rows for one workload after the other; the first batch that fails is the last."""
+    """Measure a workload for growing batches, until one fails."""
     for count in drones:
         try:
             found.append(best(make(count)))
@@ -56,7 +56,7 @@ def over_batches(make, drones, found: list, keep) -> None:
 
 
 def machine(found: list, keep) -> None:
-    """Bytes the GPU moves per second, in a program of one line."""
+    """Measure the memory bandwidth of the GPU, with `x + 1` on a large array."""
     import jax
     import jax.numpy as jnp
 
@@ -72,7 +72,7 @@ def machine(found: list, keep) -> None:
 
 
 def open_loop(found: list, keep) -> None:
-    """Rollouts with every tuning of the kernel, and without it."""
+    """Measure open-loop rollouts, with several tunings of the kernel and without it."""
     from cfb_mjx.bench import workloads
     from cfb_mjx.engine.gpu import using
     from cfb_mjx.engine.gpu_kernel import Tuning
@@ -88,14 +88,14 @@ def open_loop(found: list, keep) -> None:
 
 
 def policy(found: list, keep) -> None:
-    """The shipped network in the loop."""
+    """Measure rollouts with a shipped policy in the loop."""
     from cfb_mjx.bench import workloads
 
     over_batches(workloads.rollout_policy, (8192, 65536, 524288), found, keep)
 
 
 def gradient(found: list, keep) -> None:
-    """By all parameters, by ten, and the loss alone."""
+    """Measure gradients with respect to all parameters and to ten, and the loss alone."""
     from cfb_mjx.bench import workloads
 
     for make in (workloads.rollout_gradient, workloads.rollout_ten, workloads.rollout_hundred):
@@ -103,7 +103,7 @@ def gradient(found: list, keep) -> None:
 
 
 def mjx(found: list, keep) -> None:
-    """The MJX body, with and without floor, and plain `mjx.step`."""
+    """Measure the MJX body, with and without floor, and plain `mjx.step`."""
     from cfb_mjx.bench import workloads
 
     workloads.MJX_WORK = 2_000_000
@@ -116,27 +116,27 @@ def mjx(found: list, keep) -> None:
 
 
 def ppo(found: list, keep) -> None:
-    """Updates of PPO."""
+    """Measure updates of PPO."""
     from cfb_mjx.bench import workloads
 
     over_batches(workloads.ppo_update, (512, 8192), found, keep)
 
 
 class Reached(Exception):
-    """The hover policy is good enough."""
+    """The policy hovers well enough; ends the training."""
 
 
 NOMINAL = ("randomisation.magnitude=0", "randomisation.graded=0.0")
 BATCH = ("ppo.drones=8192", "ppo.minibatches=16", "ppo.steps=600000000", "ppo.value_hidden=[256,256,256]")
 TRAININGS = {
     "back-propagation": ("quick-analytic", (*NOMINAL, "checkpoints=40"), HOVER_MM),
-    # To its end, or to that of the time: what a large batch reaches.
+    # Runs to its end or to the time limit, to show what a large batch reaches.
     "PPO": ("target", (*NOMINAL, *BATCH, "checkpoints=30"), 0.0),
 }
 
 
 def hover(found: list, keep) -> None:
-    """Learning curves on the nominal drone: when the policy holds it within 30 mm."""
+    """Record learning curves on the nominal drone, up to a hover error below `HOVER_MM` or to their end."""
     from cfb_mjx.train.config import load_config
     from cfb_mjx.train.run import Training, train
 
@@ -156,7 +156,7 @@ def hover(found: list, keep) -> None:
 
 
 def tests(found: list, keep) -> None:
-    """What the GPU computes, beside doubles on the CPU."""
+    """Run the tests that compare the results of the GPU with double precision on the CPU."""
     done = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-s", "-p", "no:cacheprovider", "tests/engine/test_on_gpu.py"],
         cwd=ROOT,
@@ -178,28 +178,35 @@ TITLES = {
     "ppo": "Updates of PPO",
 }
 WORDS = {
-    "open_loop": """500 steps of 4 ms, one command held per drone; `rollout_randomised`: every drone with its own
-parameters; `rollout_kept`: a command per step and every state returned. `rigid` is the closed form in one kernel,
-the state of a drone in registers from the first step to the last; `rigid-plain` the program XLA makes of it. The
-kernel's default is 128 drones by 4 warps; the last rows are other ways to deal them out.""",
-    "policy": "The shipped policy `target-analytic`, a command every 8 ms, two steps each (`rollout_closed_loop`).",
-    "gradient": """Reverse mode through 100 steps: by all parameters, by ten; `rollout_hundred` is the loss alone, in
-the kernel. The reverse pass has no kernel: it is the program XLA makes of it.""",
-    "mjx": "`mjx-floor` is with floor contact, `mjx-stock` plain `mjx.step` on the same MJCF without contact.",
-    "ppo": "Flights of all drones and the learning from them, configuration `target`; steps of 4 ms.",
+    "open_loop": """500 steps of 4 ms. In `rollout`, every drone holds one command, and only the final state is
+returned. In `rollout_randomised`, every drone also has its own parameters. `rollout_kept` takes a command per step and
+returns every state. `rigid` is the closed form as one kernel, which keeps the state of a drone in registers for the
+whole rollout; `rigid-plain` is the program that XLA compiles from it. The default of the kernel is 128 drones per block
+of 4 warps; the last rows are other partitions.""",
+    "policy": "The shipped policy `target-analytic` gives a command every 8 ms, for two steps (`rollout_closed_loop`).",
+    "gradient": """Reverse mode through 100 steps, with respect to all parameters (`rollout_gradient`) and to ten
+(`rollout_ten`). `rollout_hundred` is the loss alone, in the kernel. The reverse pass has no kernel; it is the program
+that XLA compiles.""",
+    "mjx": "`mjx-floor` is with floor contact, `mjx-stock` is plain `mjx.step` on the same MJCF without contact.",
+    "ppo": "One update flies all drones and trains on the flights, with the configuration `target` and steps of 4 ms.",
 }
 
 
 def page(result: dict) -> str:
-    """The results as Markdown."""
+    """Return the page of the results, as Markdown."""
     sections = result["sections"]
     facts = {", ".join(f"{k} {v}" for k, v in s["environment"].items()) for s in sections.values()}
     text = ["# Performance on a GPU", ""]
-    text += ["Written by `make gpu` (`scripts/gpu.py`); do not edit. float32, the best of several runs.", ""]
+    text += ["Use this page to estimate the speed and memory of rollouts, gradients and trainings on a GPU.", ""]
+    text += ["```sh", "make gpu", "```", ""]
+    text += [
+        "Written by `make gpu` (`scripts/gpu.py`); do not edit. All numbers are float32, the best of several runs.",
+        "",
+    ]
     text += [*sorted(facts), ""]
     if "machine" in sections:
         copied = sections["machine"]["rows"][0]["per_s"]
-        text += [f"Measured in the same way: {copied / 1e12:.1f} TB/s read and written by `x + 1`.", ""]
+        text += [f"Memory bandwidth, measured in the same way: `x + 1` reads and writes {copied / 1e12:.1f} TB/s.", ""]
     for name, title in TITLES.items():
         if name in sections:
             text += [f"## {title}", "", WORDS[name], "", *_table(sections[name]), ""]
@@ -210,7 +217,7 @@ def page(result: dict) -> str:
     text += [
         "## Tests",
         "",
-        f"`tests/engine/test_on_gpu.py`, beside doubles on the CPU of the same machine: {said}.",
+        f"`tests/engine/test_on_gpu.py` compares the GPU with double precision on the CPU of the same machine: {said}.",
         "",
     ]
     return "\n".join(text)
@@ -228,8 +235,12 @@ def _table(section: dict) -> list[str]:
 
 
 def _hover(rows: list) -> list[str]:
-    text = [f"The nominal drone; the first point of the learning curve within {HOVER_MM:.0f} mm, and the best one."]
-    text += ["", "| training | commands | seconds | with start and tests | hover, mm |", "|---|---:|---:|---:|---:|"]
+    text = [f"On the nominal drone: the first point of the learning curve below {HOVER_MM:.0f} mm, and the best point."]
+    text += [
+        "",
+        "| training | commands | updates, s | with start and tests, s | hover, mm |",
+        "|---|---:|---:|---:|---:|",
+    ]
     for row in rows:
         there = [point for point in row["curve"] if point["hover_mm"] < HOVER_MM]
         best = min(row["curve"], key=lambda point: point["hover_mm"])
@@ -242,7 +253,11 @@ def _hover(rows: list) -> list[str]:
             )
             text.append(f"| {row['what']} | {' | '.join(cells)} |")
     changes = [f"`{row['config']}` with {', '.join(row['changes'])}" for row in rows]
-    return [*text, "", f"Configurations: {'; '.join(changes)}. Seconds of updates hold the compiling of the first."]
+    text += [
+        "",
+        f"Configurations: {'; '.join(changes)}. The time of the updates includes the compilation of the first.",
+    ]
+    return text
 
 
 def main() -> int:
@@ -253,7 +268,7 @@ def main() -> int:
     parser.add_argument("--page", type=Path, default=ROOT / "docs" / "performance-gpu.md")
     parser.add_argument("--page-only", action="store_true")
     options = parser.parse_args()
-    # Sections measured before stay, each with the machine it was measured on.
+    # Earlier sections stay, each with the machine that it was measured on.
     result = json.loads(options.json.read_text()) if options.json.exists() else {"sections": {}}
     if options.page_only:
         write_text(options.page, page(result))
@@ -263,14 +278,14 @@ def main() -> int:
     configure_jax(x64=False)
     import jax
 
-    # A program from the cache would make compile time look like nothing.
+    # A program from the cache would take no time to compile.
     jax.config.update("jax_enable_compilation_cache", False)
     if jax.default_backend() != "gpu":
-        print("There is no GPU here that jax uses.", file=sys.stderr)
+        print("jax finds no GPU on this machine.", file=sys.stderr)
         return 2
     for name in options.only:
         if time.perf_counter() - began > options.seconds:
-            print(f"{name}: not begun, the time is up", file=sys.stderr)
+            print(f"{name}: not started, because --seconds have passed", file=sys.stderr)
             continue
         section = {"environment": environment(), "rows": []}
         result["sections"][name] = section

@@ -1,9 +1,9 @@
-"""Write constraints.txt from environments in which the tests passed.
+"""Write constraints.txt from environments in which the tests pass.
 
     python scripts/lock.py ENV311/bin/python ENV312/bin/python ...
 
-Each argument is the Python of an environment with ``pip install -e '.[test]'`` done. Packages whose version differs
-between Pythons get a marker. No download addresses are written.
+Each argument is the Python of an environment after ``pip install -e '.[test]'``. Packages whose version depends on the
+Python get a marker. No download addresses are written.
 """
 
 import subprocess
@@ -17,7 +17,7 @@ HEADER = """\
 
 
 def frozen(python: str) -> tuple[str, dict[str, str]]:
-    """Python version (``3.11``) and installed packages of an environment."""
+    """Return the Python version (``3.11``) and the installed packages of an environment."""
     version = subprocess.check_output([python, "-c", "import sys; print('%d.%d' % sys.version_info[:2])"], text=True)
     lines = subprocess.check_output([python, "-m", "pip", "freeze", "--exclude-editable"], text=True).split()
     return version.strip(), dict(line.split("==") for line in lines if line.count("==") == 1)

@@ -1,7 +1,7 @@
-"""Make the bench measurements in ``data/bench``: a motor's steps, and force and torque of rotors at steady speeds.
+"""Make the bench measurements in ``data/bench``: step responses of a motor, and force and torque of rotors.
 
-The paper's own bench data are not public. Motor and rotor are its equations 5, 8 and 9 typed in afresh in NumPy and
-SciPy; nothing of cfb_mjx is used.
+The paper's own bench data are not public. Motor and rotor are simulated with equations 5, 8 and 9 of the paper in NumPy
+and SciPy; no code of cfb_mjx is used.
 
     python scripts/make_bench_data.py [FOLDER]
 """
@@ -27,7 +27,7 @@ FORCE_NOISE, TORQUE_NOISE = 1e-3, 1e-5  # N, N m
 
 
 def motor_steps(random: np.random.Generator) -> np.ndarray:
-    """Columns t, u, omega."""
+    """Simulate the step responses; return a table with the columns t, u, omega."""
     speed, rows = MOTOR_GAIN * STEPS[0], []
     for number, command in enumerate(STEPS):
         at = np.arange(0.0, HELD_S - 1e-9, ROW_S)
@@ -47,7 +47,7 @@ def motor_steps(random: np.random.Generator) -> np.ndarray:
 
 
 def rotor_points(random: np.random.Generator) -> np.ndarray:
-    """Columns omega, force, torque, motor."""
+    """Simulate rotors at constant speeds; return a table with the columns omega, force, torque, motor."""
     speed = np.tile(POINTS, 4) + random.uniform(-40.0, 40.0, 4 * len(POINTS))
     s = speed / MOTOR_GAIN
     powers = np.stack([s**3, s**2, s])

@@ -1,8 +1,7 @@
-"""Make the flight logs in ``data/flight_logs``: a drone flown by a controller, neither of them the library's.
+"""Make the flight logs in ``data/flight_logs`` with a simulator and a controller that are independent of the library.
 
-The plant is the paper's equations (1-10) typed in afresh in NumPy and integrated by SciPy between control ticks, so
-that evaluating the library on these logs compares two programs and not one with itself. Only writing the file uses
-cfb_mjx.
+The plant is an independent implementation of the paper's equations (1-10) in NumPy, integrated by SciPy between control
+ticks. An evaluation of the library on these logs therefore compares two programs. Only writing the files uses cfb_mjx.
 
     python scripts/make_flight_logs.py [FOLDER]
 """
@@ -34,16 +33,16 @@ YAW = np.array([-1.0, 1.0, -1.0, 1.0])
 TICK = 0.002
 """The controller runs and changes the commands every 2 ms."""
 ROW = 2
-"""Every second tick becomes a row: 250 Hz."""
+"""Ticks per row of the log: 250 Hz."""
 DELAY = 4
-"""Ticks by which pose and velocity are late: 8 ms."""
+"""Delay of pose and velocity in ticks: 8 ms."""
 SETTLE = 100
-"""Ticks flown before the first row, so that the delayed signals have a past."""
+"""Ticks simulated before the first row, so that the delayed signals have a history."""
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations of white noise on what sensors and estimator report."""
+    """Standard deviations of the white noise of sensors and estimator."""
 
     position: float = 0.5e-3  # m
     velocity: float = 5e-3  # m/s
@@ -54,14 +53,20 @@ class Noise:
     voltage: float = 5e-3  # V
 
     def scaled(self, factor: float) -> Noise:
-        """All of them times ``factor``."""
+        """Return the noise with every standard deviation multiplied by ``factor``."""
         return replace(self, **{name: factor * value for name, value in vars(self).items()})
 
 
 @dataclass(frozen=True)
 class Flight:
-    """What is flown: ``drag`` [N s/m] is linear air drag on the body, which the library's declared model lacks;
-    ``kicks`` are (time [s], size) of pulses about yaw on the commands that the controller did not ask for."""
+    """A flight to simulate.
+
+    Attributes:
+        drag: linear air drag of the body, N s/m, which the library's declared model does not have.
+        direction: sign of the figure eight along y.
+        size: size of the figure eight; 0 hovers.
+        kicks: disturbances of the commands about yaw, (time [s], size) each.
+    """
 
     name: str
     description: str
@@ -86,14 +91,14 @@ FLIGHTS = (
     ),
 )
 KICK_S = 0.16
-"""How long a pulse lasts."""
+"""Duration of a kick, s."""
 
 
 # ---------------------------------------------------------------------------------------------------- the plant
 
 
 def rotation_matrix(q: np.ndarray) -> np.ndarray:
-    """Body to world, from [w, x, y, z]."""
+    """Rotation matrix from body to world axes of the quaternion [w, x, y, z]."""
     w, x, y, z = q / np.sqrt(q @ q)
     return np.array(
         [
@@ -105,21 +110,21 @@ def rotation_matrix(q: np.ndarray) -> np.ndarray:
 
 
 def thrust_and_torque(speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each rotor, N and N m, from its speed in rad/s."""
+    """Thrust [N] and torque [N m] of each rotor at its speed [rad/s]."""
     s = speed / MOTOR_GAIN
     powers = np.array([s**3, s**2, s])
     return np.maximum(THRUST @ powers, 0.0), TORQUE @ powers
 
 
 def specific_force(y: np.ndarray, drag: float) -> np.ndarray:
-    """All force except gravity per mass, body axes, m/s^2: what an ideal accelerometer reads."""
+    """Reading of an ideal accelerometer: force without gravity per mass, body axes, m/s^2."""
     force = -drag * rotation_matrix(y[6:10]).T @ y[3:6]
     force[2] += thrust_and_torque(y[13:17])[0].sum()
     return force / MASS
 
 
 def derivative(_, y: np.ndarray, command: np.ndarray, drag: float) -> np.ndarray:
-    """State: position, velocity (world), quaternion, body rate, rotor speeds. Air drag acts at the centre of mass."""
+    """Time derivative of the state: position, velocity (world), quaternion, body rate, rotor speeds."""
     q, rate, speed = y[6:10], y[10:13], y[13:17]
     thrust, torque = thrust_and_torque(speed)
     acceleration = rotation_matrix(q)[:, 2] * (thrust.sum() / MASS) - drag / MASS * y[3:6]
@@ -135,7 +140,7 @@ def derivative(_, y: np.ndarray, command: np.ndarray, drag: float) -> np.ndarray
 
 
 def fly_tick(y: np.ndarray, command: np.ndarray, drag: float) -> np.ndarray:
-    """The state one control tick later, with the command held."""
+    """Return the state one control tick later, with the command held."""
     # A tick is far shorter than any time constant: DOP853 needs one step for 1e-10.
     solution = solve_ivp(
         derivative, (0.0, TICK), y, method="DOP853", rtol=1e-9, atol=1e-10, first_step=TICK, args=(command, drag)
@@ -149,8 +154,8 @@ def fly_tick(y: np.ndarray, command: np.ndarray, drag: float) -> np.ndarray:
 
 
 def reference(t: float, flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Position, velocity, acceleration and heading to fly at time t [s]: a figure eight that begins from hover."""
-    # The phase accelerates smoothly over two seconds, so that the reference has continuous acceleration.
+    """Reference position, velocity, acceleration and heading at time t [s]: a figure eight that begins in hover."""
+    # The phase rate rises smoothly over two seconds, so that the acceleration of the reference is continuous.
     fraction = np.clip(t / 2.0, 0.0, 1.0)
     full = 1.4
     rate = full * (3 * fraction**2 - 2 * fraction**3)
@@ -170,7 +175,7 @@ def reference(t: float, flight: Flight) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def control(t: float, seen: np.ndarray, speed: np.ndarray, flight: Flight) -> np.ndarray:
-    """Geometric position controller: four commands from the state as reported and the rotor speeds it expects."""
+    """Geometric position controller: commands from the reported state and the rotor speeds that it expects."""
     position, velocity, q, rate = seen[:3], seen[3:6], seen[6:10], seen[10:13]
     p, v, a, heading = reference(t, flight)
     wanted = a + 6.0 * (p - position) + 4.0 * (v - velocity) + np.array([0.0, 0.0, GRAVITY])
@@ -182,16 +187,16 @@ def control(t: float, seen: np.ndarray, speed: np.ndarray, flight: Flight) -> np
     error = 0.5 * (matrix.T @ target - target.T @ matrix)
     turn = np.array([error[2, 1], error[0, 2], error[1, 0]])
     moment = INERTIA * (np.array([110.0, 110.0, 25.0]) * turn - np.array([15.0, 15.0, 6.0]) * rate)
-    # Thrusts that give force and moment; yaw through the torque-to-thrust ratio near hover.
+    # Thrusts for the wanted force and moment; yaw uses the torque-to-thrust ratio near hover.
     mix = np.vstack([np.ones(4), LEVER, YAW * 6e-3])
     thrust = np.linalg.solve(mix, [MASS * max(wanted @ matrix[:, 2], 2.0), *moment])
-    # Invert the thrust curve (convex where rotors work), then lead so that the motors answer in 20 and not 50 ms.
+    # Invert the thrust curve, then add lead so that the motors respond in 20 ms instead of 50 ms.
     s = np.interp(thrust, *_CURVE)
     return np.clip(speed / MOTOR_GAIN + 2.5 * (s - speed / MOTOR_GAIN), 0.05, 1.0)
 
 
 def kick(t: float, flight: Flight) -> np.ndarray:
-    """What disturbs the commands at time t."""
+    """Disturbance of the commands at time t [s]."""
     return sum((size for at, size in flight.kicks if at <= t < at + KICK_S), 0.0) * YAW
 
 
@@ -203,7 +208,7 @@ _CURVE = (thrust_and_torque(_GRID * MOTOR_GAIN)[0], _GRID)
 
 
 def turned(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """q followed by a small rotation about body axes [rad]."""
+    """Return q after a small rotation about body axes [rad]."""
     w, x, y, z = q
     a, b, c = vector / 2
     product = np.array([w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c])
@@ -212,7 +217,7 @@ def turned(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def fly(flight: Flight, noise: Noise) -> FlightLog:
-    """Fly it and return what was logged."""
+    """Simulate the flight and return its log."""
     random = np.random.default_rng(flight.seed)
     hover = np.interp(MASS * GRAVITY / 4, *_CURVE) * MOTOR_GAIN
     y = np.concatenate([reference(0.0, flight)[0], np.zeros(3), [1, 0, 0, 0], np.zeros(3), np.full(4, hover)])
@@ -221,20 +226,20 @@ def fly(flight: Flight, noise: Noise) -> FlightLog:
         [noise.position, noise.velocity, noise.attitude, noise.gyro, noise.rotor_speed, noise.accelerometer],
         [3, 3, 3, 3, 4, 3],
     )
-    # The controller leads the motors by the rotor speeds its commands should have produced: with measured ones, its
-    # commands would carry their noise, and a log at half its rate would miss half of that.
+    # The controller uses the rotor speeds that its commands should have produced. With measured speeds, the commands
+    # would contain their noise, and a log at half the rate would not contain all commands.
     expected = y[13:17]
     charge, rows = 0.0, []
     for tick in range(-SETTLE, round(flight.seconds / TICK) + 1):
-        # The same draws at every tick whatever is done with them: a change elsewhere leaves the noise as it was.
+        # Draw the same number of samples at every tick, so that changes elsewhere do not change the noise.
         e = deviation * random.standard_normal(19)
         late = past[0]
         seen = np.concatenate([late[:6] + e[:6], turned(late[6:10], e[6:9]), y[10:13] + e[9:12], y[13:17] + e[12:16]])
         t = tick * TICK
         command = control(max(t, 0.0), seen, expected, flight) + kick(t, flight)
         expected = MOTOR_GAIN * command + (expected - MOTOR_GAIN * command) * np.exp(-TICK / MOTOR_LAG)
-        # Battery: drops while it empties and with the current, here taken as proportional to rotor power. The firmware
-        # compensates it, so the motors do not see it.
+        # The voltage falls with the charge and with the current, which is taken as proportional to the rotor power. The
+        # firmware compensates for it, so it does not affect the motors.
         power = thrust_and_torque(y[13:17])[1] @ y[13:17]
         charge += power * TICK
         voltage = 4.05 - 0.0015 * charge - 0.02 * power + noise.voltage * random.standard_normal()

@@ -1,4 +1,4 @@
-"""A block of a hand-written page that a script writes: everything between two marks."""
+"""Write the blocks of hand-written pages that scripts generate: everything between two marks."""
 
 from pathlib import Path
 
@@ -6,10 +6,10 @@ from cfb_mjx.files import write_text
 
 
 def write_block(page: Path, name: str, text: str) -> None:
-    """Replace what stands between ``<!-- name: begin -->`` and ``<!-- name: end -->``.
+    """Replace the text between ``<!-- name: begin -->`` and ``<!-- name: end -->``.
 
     Raises:
-        ValueError: the page has no such marks.
+        ValueError: the page does not have these marks.
     """
     begin, end = f"<!-- {name}: begin -->", f"<!-- {name}: end -->"
     before, found, rest = page.read_text(encoding="utf-8").partition(begin)

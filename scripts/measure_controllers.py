@@ -1,10 +1,10 @@
-"""Fly every controller through every test, and write docs/controllers.md with its figures.
+"""Measure every controller in every test, and write docs/controllers.md.
 
     python scripts/measure_controllers.py [--plants 4096] [--controllers NAME ...]
 
-A minute each; with no names it writes the page alone. What is not measured anew stays as it is in
-benchmarks/controllers.json. The paper's own numbers are of the real drone and stand beside. `raptor` is RAPTOR's
-published policy (`pip install foundation-policy`).
+A controller takes about a minute. `--controllers` without a name only writes the page. Results of controllers that are
+not measured again stay as they are in benchmarks/controllers.json. The page also lists the paper's numbers, which were
+measured on the real drone. `raptor` is RAPTOR's published policy (`pip install foundation-policy`).
 """
 
 import argparse
@@ -18,10 +18,10 @@ from cfb_mjx.runtime import configure_jax, environment, say
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 RAPTOR = [
-    "`raptor`: the published policy of RAPTOR (Eschmann, Albani, Loianno 2025; `pip install foundation-policy`), 100 "
-    "commands/s, with errors of position and velocity limited to 0.5 m and 1 m/s as its authors' adapter for PX4 does. "
-    "It was trained on quadrotors of every size, without delay, and finds out in flight what it flies; the shipped "
-    "policies were trained on this type and its delay.",
+    "`raptor` is the published policy of RAPTOR (Eschmann, Albani, Loianno 2025; `pip install foundation-policy`). It "
+    "gives 100 commands/s. Its errors of position and velocity are limited to 0.5 m and 1 m/s, as in its authors' "
+    "adapter for PX4. It was trained on quadrotors of every size, without delay, and adapts to the drone in flight. "
+    "The shipped policies were trained on this type of drone and its delay.",
     "",
 ]
 IDSIA = "cfb-idsia"
@@ -31,7 +31,7 @@ PAPER_OF = {"target": PAPER_HOVER[1.0], **PAPER_FIRMWARE}
 
 
 def main() -> None:
-    """Measure, then write."""
+    """Measure the chosen controllers and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--plants", type=int, default=4096)
     parser.add_argument("--controllers", nargs="*", choices=CONTROLLERS, default=CONTROLLERS)
@@ -86,10 +86,10 @@ def main() -> None:
             "plants": {},
         }
         for plant, drone in plants.items():
-            # A drone that was meant to be the paper's: the firmware's controllers are scaled for that one.
+            # The firmware's controllers stay scaled for the nominal drone: they do not know the effects.
             results[name]["plants"][plant] = summary(hover(controller, calm, drone, few)[0], np.mean)
         write_json(RESULTS, results)
-        # Six controllers' compiled programs are more than LLVM may map.
+        # LLVM cannot map the compiled programs of all six controllers at once.
         jax.clear_caches()
     results = {name: results[name] for name in CONTROLLERS if name in results}
     write_text(ROOT / "docs" / "controllers.md", page(results, arguments.plants, described))
@@ -98,14 +98,17 @@ def main() -> None:
 
 def _cell(there: dict) -> str:
     if there["hover_mm"] is None:
-        return "all lost"
+        return "all failed"
     lost = f", {there['failed']:.2%} failed" if there["failed"] else ""
     return f"{there['hover_mm']:.0f} ({there['command_std']:.3f}){lost}"
 
 
 def _factors(drones, nominal, distance, well) -> dict[str, dict[str, float]]:
-    """Of each factor: Spearman's rank correlation of the hover error with the size of its departure, and the median
-    error of the third of the drones that depart least and of the third that departs most."""
+    """Dependence of the hover error on each factor of the randomisation.
+
+    Per factor: Spearman's rank correlation of the error with the size of the deviation from the nominal drone, and the
+    median error of the third of the drones with the smallest deviation and of the third with the largest.
+    """
     import numpy as np
     from scipy.stats import spearmanr
 
@@ -148,16 +151,24 @@ def page(results: dict, plants: int, described) -> str:
     lines = [
         "# Controllers, measured",
         "",
-        f"{facts_line('python scripts/measure_controllers.py', list(results.values()), 'measured')} In simulation: "
-        f"model `{described.name}`, estimates 8 ms late and noisy, the gyro too "
-        "but for the firmware's controllers and RAPTOR, which read it on the drone; noise of the state as in the "
-        "paper. The paper's numbers are of its real drone.",
+        "This page compares the shipped policies, the firmware's PID and Mellinger controllers, and RAPTOR in the same "
+        "tests. Use it to choose a controller. `cfb fly` runs the tests with any policy:",
+        "",
+        "```sh",
+        "cfb fly target-adaptive --plants 4096 --magnitude 1        # hover on randomised drones",
+        "```",
+        "",
+        f"{facts_line('python scripts/measure_controllers.py', list(results.values()), 'measured')} All results are "
+        f"simulated with the model `{described.name}`. Estimates are 8 ms late and noisy. The gyro is equally late, "
+        "except for the firmware's controllers and RAPTOR, which read it on the drone. The noise of the state is that "
+        "of the paper. The paper's numbers were measured on its real drone.",
         "",
         *(RAPTOR if "raptor" in names else []),
         "## On the nominal drone",
         "",
-        "Hover: 6 s, all but the first second counted, mean of 64 flights. Step: 6 m to one side, arrival "
-        "within 10 cm, median of 64.",
+        "Hover: mean distance to the target over 6 s without the first second, mean of 64 flights. Command std: "
+        "standard deviation of the commands over time, mean of the motors. Step: a flight to a target 6 m away; "
+        "arrival is the first time within 10 cm; median of 64 flights.",
         "",
         "| controller | hover, mm | command std | paper, mm | paper, std | arrival, s | peak, m/s | overshoot, m |",
         "|---|---|---|---|---|---|---|---|",
@@ -165,7 +176,7 @@ def page(results: dict, plants: int, described) -> str:
     for name in names:
         r = results[name]
         paper = [f"{x:g}" for x in PAPER_OF.get(name, ())] or ["", ""]
-        # A file has null for what never is.
+        # An infinite time is null in the file.
         arrival = "not within 4" if r["arrival_s"] in (None, float("inf")) else f"{r['arrival_s']:.2f}"
         cells = [name, f"{r['hover_mm']:.1f}", f"{r['command_std']:.4f}", *paper, arrival]
         cells += [f"{r['peak_speed_mps']:.2f}", f"{r['overshoot_m']:.2f}"]
@@ -174,11 +185,11 @@ def page(results: dict, plants: int, described) -> str:
         "",
         f"## On {plants} drones with the paper's full randomisation",
         "",
-        "Quantiles of the hover error of those that did not fail. Failed: faster than 10 m/s or 30 rad/s. Recovered: "
-        "thrown at 3 m/s any way with 60 deg of tilt, and after 6 s slower than 0.5 m/s, tilted less than 30 deg and "
-        "within 0.75 m.",
+        "Quantiles of the hover error, and the median command std, of the drones that did not fail. Failed: faster "
+        "than 10 m/s or 30 rad/s. Recovered: thrown at 3 m/s in a random direction with 60 deg of tilt, the drone did "
+        "not fail and after 6 s is slower than 0.5 m/s, tilted less than 30 deg and within 0.75 m of the target.",
         "",
-        "| controller | 5 % | 25 % | median, mm | 75 % | 95 % | std | failed | recovered | nominal recovered |",
+        "| controller | 5 % | 25 % | median, mm | 75 % | 95 % | std | failed | recovered | recovered, nominal drone |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name in names:
@@ -189,8 +200,9 @@ def page(results: dict, plants: int, described) -> str:
     factors = list(results[names[0]]["factors"])
     lines += [
         "",
-        "Which factor sets the error: median of the third of the drones that depart least by it and of the third that "
-        "departs most, mm; in brackets Spearman's rank correlation of the error with the size of the departure.",
+        "The next table shows which factor of the randomisation determines the error. Each cell has the median error, "
+        "mm, of the third of the drones with the smallest deviation from nominal in this factor, and of the third with "
+        "the largest. In brackets: Spearman's rank correlation of the error with the size of the deviation.",
         "",
         "| factor | " + " | ".join(names) + " |",
         "|---|" + "---|" * len(names),
@@ -203,9 +215,9 @@ def page(results: dict, plants: int, described) -> str:
         "",
         "## With other sensors, and on another laboratory's drone",
         "",
-        "Hover error in mm and the command std. The nominal drone with later and noisier estimates, mean of 64 "
-        f"flights; then {plants} drones drawn with the paper's randomisation about `{IDSIA}`, a real drone as "
-        "identified, median.",
+        "Hover error, mm, and the command std in brackets. The first rows are for the nominal drone with later or "
+        f"noisier estimates, mean of 64 flights. The last row is for {plants} drones, drawn with the paper's "
+        f"randomisation around `{IDSIA}`, the identified model of a real drone; median.",
         "",
         "| sensors | " + " | ".join(names) + " |",
         "|---|" + "---|" * len(names),
@@ -215,10 +227,10 @@ def page(results: dict, plants: int, described) -> str:
     lines.append(f"| `{IDSIA}`, randomised | " + " | ".join(_cell(results[name][IDSIA]) for name in names) + " |")
     lines += [
         "",
-        "## On drones that nothing was trained on",
+        "## On drones with effects outside every training",
         "",
-        "Effects of the catalogue on the nominal drone (`configs/plants/off-nominal.yaml` says which and why): hover "
-        "error in mm, mean of 64 flights, and the command std.",
+        "Each row adds effects of the catalogue to the nominal drone; `configs/plants/off-nominal.yaml` gives their "
+        "constants and the reason for each. Hover error, mm, and the command std in brackets, mean of 64 flights.",
         "",
         "| plant | " + " | ".join(names) + " |",
         "|---|" + "---|" * len(names),

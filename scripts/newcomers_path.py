@@ -1,8 +1,8 @@
-"""Walk a newcomer's path in a fresh clone and a fresh virtual environment, and time every step.
+"""Time the first steps of a new user in a fresh clone and a fresh virtual environment.
 
-python scripts/newcomers_path.py     docs/newcomers-path.md and benchmarks/newcomers-path.json (some ten minutes)
+python scripts/newcomers_path.py     docs/newcomers-path.md and benchmarks/newcomers-path.json (about ten minutes)
 
-From nothing but Python and pip to a policy that one has trained, flown, looked at and exported to C.
+The steps lead from Python and pip to a policy that is trained, flown, viewed and exported to C.
 """
 
 import argparse
@@ -34,11 +34,11 @@ STEPS = (
 
 
 def walk(python: str) -> dict:
-    """Take the steps; seconds of each, and what the policy does."""
+    """Run the steps; return the seconds of each, and the scores of the policy."""
     with tempfile.TemporaryDirectory(prefix="newcomer-") as folder:
         place = Path(folder) / "cfb_mjx"
         subprocess.run(["git", "clone", "-q", str(ROOT), str(place)], check=True)
-        # Nothing of earlier days: neither packages kept by pip nor compiled programs.
+        # An empty home, so that neither pip's cache nor compiled programs shorten the times.
         fresh = os.environ | {"HOME": folder, "XDG_CACHE_HOME": str(Path(folder) / "cache")}
         taken = []
         for what, command in STEPS:
@@ -53,7 +53,7 @@ def walk(python: str) -> dict:
 
 
 def page(found: dict) -> str:
-    """docs/newcomers-path.md."""
+    """Write the text of docs/newcomers-path.md."""
     rows, total = [], 0.0
     for step in found["steps"]:
         total += step["seconds"]
@@ -61,24 +61,28 @@ def page(found: dict) -> str:
     table, hover, check = "\n".join(rows), found["hover"], found["check"]
     return f"""# A newcomer's path, timed
 
-{facts_line("python scripts/newcomers_path.py", [found], "walked")}
+This page shows new users how long the first steps take, from an empty environment to a policy in C. Every command can
+be copied from the table.
 
-In a fresh clone and a fresh virtual environment with empty caches: packages come over the network, every program is
-compiled.
+{facts_line("python scripts/newcomers_path.py", [found], "measured")}
 
-| step | command | s | min so far |
+The steps ran in a fresh clone and a fresh virtual environment with empty caches: packages are downloaded, and every
+program is compiled.
+
+| step | command | s | total, min |
 |---|---|---|---|
 {table}
 
-The policy trained on the way hovers {hover["mean_distance_mm"]:.1f} mm from its target on average, with a standard
-deviation of its commands of {hover["command_std"]:.4f}; in C it commands within {check["parity"]["largest"]:.1e} of
-what it does in JAX. It was trained on the nominal drone alone: for a real one take a shipped policy, or
-`cfb train target --config target-analytic`, which draws a new drone for every flight ([training](training.md)).
+The trained policy hovers {hover["mean_distance_mm"]:.1f} mm from its target on average, with a standard deviation of
+its commands of {hover["command_std"]:.4f}. The commands of the C and of JAX differ by at most
+{check["parity"]["largest"]:.1e}. The policy was trained on the nominal drone only. For a real drone use a shipped
+policy, or `cfb train target --config target-analytic`, which draws a new drone for every flight
+([training](training.md)).
 """
 
 
 def main() -> None:
-    """Walk, write."""
+    """Time the steps and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--python", default=sys.executable)
     parser.add_argument("--page-only", action="store_true")

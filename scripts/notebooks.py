@@ -2,8 +2,8 @@
 
     python scripts/notebooks.py [docs/notebooks/first_flight.ipynb ...]
 
-Needs ``pip install '.[docs]'``. What is written depends on the cells and on the versions only: no times, no names of
-machines. tests/docs/test_notebooks.py runs the same cells without Jupyter.
+Needs ``pip install '.[docs]'``. The output depends only on the cells and the versions: it has no times and no machine
+names. tests/docs/test_notebooks.py runs the same cells without Jupyter.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def execute(path: Path) -> None:
-    """Run all cells from the top and keep what they print and draw."""
+    """Run all cells of a notebook in order and store their output in it."""
     import nbformat
     from nbclient import NotebookClient
 
@@ -37,14 +37,14 @@ def execute(path: Path) -> None:
                 output.metadata = {}
                 output.data = {k: v for k, v in output.data.items() if k in ("image/png", "text/plain")}
                 if "image/png" in output.data:
-                    output.data.pop("text/plain", None)  # the size of a figure in words
+                    output.data.pop("text/plain", None)  # only the size of the figure
     nbformat.validate(notebook)
     nbformat.write(notebook, path)
     print(f"{os.path.relpath(path)}: {path.stat().st_size / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":
-    # Before the kernel starts: it inherits them.
+    # Before the kernel starts, because it inherits the environment.
     from cfb_mjx.runtime import set_up_xla
 
     set_up_xla()

@@ -1,12 +1,12 @@
-"""One model for every drone of a type, from drones whose loops were closed; write cfb-fleet and docs/one-model.md.
+"""Fit one model to several drones of a type; write the preset cfb-fleet and docs/one-model.md.
 
     python scripts/one_model.py NAME=FOLDER,MODEL,MASS_KG ... --loops out/real-loops [--bench TABLE.csv ...]
 
-As `real_loops.py`, which has to run first: FOLDER holds fit/ and validation/, MODEL is a preset or the NAME of a drone
-before it, and LOOPS/NAME/model.yaml is where the fit of a drone starts. Every drone is fitted with the same numbers,
-what it alone carries (a load) beside them; `cfb_mjx.sysid.fleet` says what they have in common. Then every drone is
-judged by the type without it. BENCH tables have rotor speeds (rpm) and the thrust of four rotors (g). Only aggregate
-numbers are written; the flights themselves never enter the project.
+Run `real_loops.py` first. As there, FOLDER holds fit/ and validation/, and MODEL is a preset or the NAME of an earlier
+drone. The fit of a drone starts from LOOPS/NAME/model.yaml. The same numbers are fitted for all drones, plus those of
+effects that one drone alone has (a load); `cfb_mjx.sysid.fleet` computes the common model. Each drone is then predicted
+with the type fitted to the other drones. BENCH tables have rotor speeds (rpm) and the thrust of four rotors (g). Only
+aggregate numbers are written; the flights do not become part of the project.
 """
 
 import argparse
@@ -36,21 +36,21 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE, FIGURE = ROOT / "docs" / "one-model.md", ROOT / "docs" / "one-model.png"
 PRESET = ROOT / "configs" / "parameters" / "cfb-fleet.yaml"
 OWN = ("cog_offset", "thrust_tilt", "position_moment")
-"""A drone's own: the type has none of them, and a spread."""
+"""Drone-specific effects: zero in the type, with a spread."""
 OF_MOTORS = ("command_delay", "motor_asymmetry", "battery_sag")
 COMMON = tuple(name for name in PLANT if name not in OF_MOTORS)
 MOTORS = ("motor_gain", "motor_speed_offset", "motor_time_constant")
 VARIANTS = ("commands_in", "rotor_speed_in", "commands_in_observer", "rotor_speed_in_observer")
 HORIZON, WINDOWS, STEPS = 0.5, 400, 15
 BODY = "cfb"
-"""The preset whose body the type has."""
+"""Preset with the body of the type."""
 CURVE = (800.0, 2600.0)
-"""Rotor speeds over which thrust curves are compared, rad/s."""
+"""Range of rotor speeds in which thrust curves are compared, rad/s."""
 
 
 @dataclass(frozen=True)
 class Drone:
-    """A drone, its flights, what was declared of it and what its closed loop found."""
+    """A drone: its flights, its declared model and the model that `cfb close-loop` found."""
 
     name: str
     folder: Path
@@ -70,7 +70,7 @@ class Drone:
 
     @cached_property
     def extras(self) -> tuple[str, ...]:
-        """What it alone carries."""
+        """Effects that this drone alone has."""
         return tuple(item["name"] for item in self.found.effects if item["name"] not in PLANT)
 
     def refined(self, model: Quadrotor, names: tuple[str, ...]) -> Refinement:
@@ -85,7 +85,7 @@ class Drone:
 
     @cached_property
     def of_drone(self) -> OfDrone:
-        """What it says of the type: no load, and how far its motors follow the battery."""
+        """The fitted numbers that belong to the type: without a load, with the slope of the battery sag."""
         whole = OfDrone.fitted(self.name, self.fit)
         kept = [i for i, n in enumerate(whole.numbers) if n.effect in COMMON]
         numbers, values = [whole.numbers[i] for i in kept], [whole.values[i] for i in kept]
@@ -100,10 +100,10 @@ class Drone:
 
 
 def of_motors(drones: list[Drone]) -> dict[str, Entry]:
-    """Constants of the type's motors: those of the drone whose hover command is the middle one.
+    """Return the motor constants of the type: those of the drone with the median hover command.
 
-    What a command of 1 means differs between laboratories (firmware, batteries), so gain and offset go together and a
-    mean of two laws is nobody's. The spread is that between the motors of one drone.
+    The meaning of a command of 1 differs between laboratories (firmware, batteries). Gain and offset belong together,
+    so a mean over drones would describe no drone. The spread is that between the motors of one drone.
     """
     each = {n: np.array([np.broadcast_to(d.found.entries[n].value, 4) for d in drones]) for n in MOTORS}
     hover = (HOVER_SPEED - each["motor_speed_offset"].mean(axis=1)) / each["motor_gain"].mean(axis=1)
@@ -117,14 +117,14 @@ def of_motors(drones: list[Drone]) -> dict[str, Entry]:
 
 
 def type_of(drones: list[Drone], name: str) -> tuple[ModelFile, Fleet]:
-    """The model of a type from some drones."""
+    """Return the model of the type that is fitted to some drones."""
     common = fleet([drone.of_drone for drone in drones], OWN)
     names = ", ".join(drone.name for drone in drones)
     mappings = common.mappings(f"fitted to flights of {len(drones)} drones ({names}): docs/one-model.md")
     for item in mappings:
         item["source"] = f"{KNOWN[item['name']].source}; {item['source']}"
         if item["name"] == "battery_sag":
-            # What the rotors feel at once, and 3.7 V as the voltage at which the gain holds.
+            # A short lag, and no offset: the gain holds at 3.7 V.
             item["parameters"] |= {"level": 0.0, "lag": 0.02}
     body = load_model_file(BODY)
     file = replace(
@@ -140,7 +140,7 @@ def type_of(drones: list[Drone], name: str) -> tuple[ModelFile, Fleet]:
 
 
 def own_fitted(drone: Drone, of_type: ModelFile) -> Quadrotor:
-    """The type with what is the drone's own fitted to its flights: motors, centre of gravity, tilt, a load."""
+    """Return the type with motors, centre of gravity, tilt and a load fitted to the flights of one drone."""
     mass = drone.declared.entries["mass"]
     motors = {name: drone.found.entries[name] for name in MOTORS}
     model = Quadrotor.from_file(replace(of_type, entries={**of_type.entries, "mass": mass, **motors}))
@@ -150,7 +150,7 @@ def own_fitted(drone: Drone, of_type: ModelFile) -> Quadrotor:
 
 
 def errors(model: Quadrotor, logs: list[FlightLog]) -> dict[str, tuple[float, float]]:
-    """Mean attitude (rad) and velocity (m/s) error after half a second, by variant."""
+    """Return the mean attitude (rad) and velocity (m/s) error half a second ahead, by variant."""
     found = evaluate(model, logs, observer=Observer(), keep_diverged=True)
     told = {name: found.metrics(name) for name in (*VARIANTS, "hold")}
     key = f"@{HORIZON}s"
@@ -158,32 +158,32 @@ def errors(model: Quadrotor, logs: list[FlightLog]) -> dict[str, tuple[float, fl
 
 
 def gentle(drone: Drone) -> list[FlightLog]:
-    """Flights in which hold errs least, within a factor: of the kind that disturbances, not commands, decide."""
+    """Return the flights with the smallest error of `hold`, within a factor of `ALIKE`."""
     each = {log.name: errors(Quadrotor.from_file(drone.declared), [log])["hold"][0] for log in drone.judged}
     return [log for log in drone.judged if each[log.name] <= ALIKE * min(each.values())]
 
 
 def models(drone: Drone, drones: list[Drone]) -> dict[str, Quadrotor]:
-    """What a drone is predicted with, by what the page calls it."""
+    """Return the models that a drone is predicted with, by their names on the page."""
     mass, others = drone.declared.entries["mass"], [other for other in drones if other is not drone]
     of_type, _ = type_of(others, "others")
-    found = {"the declared model": Quadrotor.from_file(drone.declared)}
+    found = {"declared model": Quadrotor.from_file(drone.declared)}
     for other in others:
         model = replace(other.found, entries={**other.found.entries, "mass": mass})
         found[f"{other.name}'s model"] = Quadrotor.from_file(model)
-    found["the type without it"] = Quadrotor.from_file(replace(of_type, entries={**of_type.entries, "mass": mass}))
-    found["the same, its own numbers fitted"] = own_fitted(drone, of_type)
+    found["type from the others"] = Quadrotor.from_file(replace(of_type, entries={**of_type.entries, "mass": mass}))
+    found["the same, drone-specific fit"] = own_fitted(drone, of_type)
     found["its own model"] = Quadrotor.from_file(drone.found)
     return found
 
 
 def judged_table(drone: Drone, drones: list[Drone]) -> list[str]:
-    """Lines of the page: errors of all models on a drone's validation flights."""
+    """Return the section with the errors of all models on a drone's validation flights."""
     few, rows = gentle(drone), models(drone, drones)
     lines = [f"### {drone.name}", ""]
     kinds = {"all validation flights": drone.judged}
     if len(few) < len(drone.judged):
-        kinds[f"the gentle ones ({', '.join(log.name for log in few)})"] = few
+        kinds[f"gentle flights ({', '.join(log.name for log in few)})"] = few
     for words, logs in kinds.items():
         print(f"{drone.name}: {words}", flush=True)
         head = " | ".join(name.replace("_", " ").replace(" observer", ", observer") for name in VARIANTS)
@@ -198,19 +198,19 @@ def judged_table(drone: Drone, drones: list[Drone]) -> list[str]:
 
 
 def bench(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Rotor speed, rad/s, and thrust of a rotor, N, of a table with rpm and grams of four rotors."""
+    """Read a bench table; return rotor speed [rad/s] and thrust of one rotor [N]."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file, skipinitialspace=True))
     speeds = [key for key in rows[0] if key.startswith("rpm")]
     grams = next(key for key in rows[0] if key.endswith("[g]"))
     each = np.array([[float(row[key]) for key in speeds] for row in rows])
-    # A sensor that saw no rotor says nothing, or next to it.
+    # A speed far below that of the other rotors is a missed reading.
     each[each < 0.5 * each.max(axis=1, keepdims=True)] = np.nan
     return np.nanmean(each, axis=1) * np.pi / 30, np.array([float(row[grams]) for row in rows]) * 9.81e-3 / 4
 
 
 def against_curve(speed: np.ndarray, force: np.ndarray) -> tuple[float, float]:
-    """By which share measured thrust exceeds the paper's curve, in the least-squares mean, and where the rms is."""
+    """Return the least-squares excess of measured thrust over the paper's curve, and the relative rms residual."""
     paper = Quadrotor.from_file(BODY).parameters
     inside = (speed > CURVE[0]) & (speed < CURVE[1])
     curve = np.asarray(thrust(paper, np.repeat(speed[inside][:, None], 4, 1)))[:, 0]
@@ -219,7 +219,7 @@ def against_curve(speed: np.ndarray, force: np.ndarray) -> tuple[float, float]:
 
 
 def draw(drones: list[Drone], common: Fleet, tables: dict[str, tuple[np.ndarray, np.ndarray]]) -> None:
-    """The numbers of each drone beside the type's, and thrust curves beside the bench's."""
+    """Draw the numbers of each drone and of the type, and the thrust curves of the type and of benches."""
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
@@ -257,26 +257,36 @@ def draw(drones: list[Drone], common: Fleet, tables: dict[str, tuple[np.ndarray,
 
 
 def page(drones: list[Drone], common: Fleet, of_type: ModelFile, tables: dict) -> str:
-    """The page."""
+    """Return the page as Markdown."""
     facts = ", ".join(f"{name} {value}" for name, value in environment().items())
     lines = ["# One model for every Crazyflie Brushless", ""]
     lines += [f"Written by `python scripts/one_model.py`; do not edit. {facts}", ""]
     lines += [
-        f"`cfb-fleet` is a model of the type, from flights of {len(drones)} drones. Use it for a drone that was not",
-        "measured yet (`cfb evaluate my.csv --model cfb-fleet --set mass=0.037`), as the start of a search",
-        "(`cfb close-loop ... --model cfb-fleet`), and as measured domain randomisation (`cfb fly pid",
-        "--model cfb-fleet --magnitude 1 --randomise cfb-fleet`, `cfb train target --model cfb-fleet --randomise",
-        "cfb-fleet -o out`).",
+        "This page is for readers whose drone was not measured yet. The preset `cfb-fleet` is a model of the type of",
+        f"drone, fitted to flights of {len(drones)} drones:",
         "",
-        "Every drone was fitted on its own to predictions of its flights, all with the same numbers and what it alone",
-        "carries beside them. The spread between drones is the scatter of the fits less what their errors explain; the",
-        "type's numbers are the mean that heeds both. With so few drones a spread is known to about half its size, and",
-        "where all stand at one bound it is nothing. Predictions of flights under a controller ask for more inertia",
-        "and more damping than accelerations do ([real loops](real-loops.md) names where); the type has both.",
+        "| use | command |",
+        "|---|---|",
+        "| predict a drone that was not measured yet | `cfb evaluate my.csv --model cfb-fleet --set mass=0.037` |",
+        "| start a model correction | `cfb close-loop ... --model cfb-fleet` |",
+        "| fly with measured randomisation | `cfb fly pid --model cfb-fleet --magnitude 1 --randomise cfb-fleet` |",
+        "| train with it | `cfb train target --model cfb-fleet --randomise cfb-fleet -o out` |",
+        "",
+        "Each drone was fitted separately to predictions of its flights. The fitted numbers are the same for all",
+        "drones, plus those of the effects that one drone alone has (a load). The spread between drones is the scatter",
+        "of the fits minus what their errors explain. The type's numbers are the mean weighted by spread and errors.",
+        "",
+        "Two limits apply. With so few drones a spread is known to about half its size, and it is zero where all",
+        "drones are at one bound. Predictions of flights with feedback give more inertia and more damping than",
+        "accelerations do ([real loops](real-loops.md) names where), and the type has both.",
         "",
         "![Numbers of the drones and the type; thrust curves](one-model.png)",
         "",
         "## Numbers",
+        "",
+        "*Drone-specific* numbers have a spread but no value for the type. The motor constants of the type are those",
+        "of the drone whose hover command is the middle one: what a command of 1 means differs between laboratories,",
+        "so gain and offset belong together.",
         "",
         "| number | " + " | ".join(d.name for d in drones) + " | the type | spread between drones |",
         "|---|" + "---|" * (len(drones) + 2),
@@ -288,7 +298,7 @@ def page(drones: list[Drone], common: Fleet, of_type: ModelFile, tables: dict) -
             error = np.sqrt(np.diag(drone.of_drone.covariance))
             texts = [f"± {e:.1g}" if e > 0 else "at a bound" for e in error]
             cells.append("".join(f"{drone.of_drone.values[i]:.3g} {texts[i]}" for i in at))
-        kind = "a drone's own" if number.effect in OWN else f"{value:.3g} ± {std:.1g}"
+        kind = "drone-specific" if number.effect in OWN else f"{value:.3g} ± {std:.1g}"
         lines.append(f"| {number.name} | " + " | ".join(cells) + f" | {kind} | {spread:.2g} |")
     for name in MOTORS:
         entry = of_type.entries[name]
@@ -301,21 +311,28 @@ def page(drones: list[Drone], common: Fleet, of_type: ModelFile, tables: dict) -
         for name in drone.extras:
             own = next(item for item in drone.found.effects if item["name"] == name)["parameters"]
             told = ", ".join(f"{key} {value:.4g}" for key, value in own.items() if np.ndim(value) == 0)
-            lines += ["", f"{drone.name} alone carries `{name}`: {told}."]
+            lines += ["", f"Only {drone.name} has `{name}`: {told}."]
     if tables:
-        lines += ["", "Thrust on benches over the paper's curve, in the least-squares mean between"]
-        lines[-1] += f" {CURVE[0]:.0f} and {CURVE[1]:.0f} rad/s (not part of the fit, a check of it):"
+        lines += ["", "Check on thrust benches (not part of the fit): thrust relative to the paper's curve, least"]
+        lines[-1] += f" squares between {CURVE[0]:.0f} and {CURVE[1]:.0f} rad/s:"
         for name, table in tables.items():
             share, rms = against_curve(*table)
-            lines += ["", f"- {name}: {100 * share:+.1f} %, rms of what is left {100 * rms:.1f} % of the mean thrust"]
+            lines += ["", f"- {name}: {100 * share:+.1f} %, rms of the residual {100 * rms:.1f} % of the mean thrust"]
     lines += [
         "",
-        "## A drone the type has not seen",
+        "## Errors on a drone that the type was not fitted to",
         "",
-        "Mean error of attitude (rad) and velocity (m/s) half a second ahead, on validation flights. *The type without",
-        "it* is fitted to the other drones and told the mass, nothing else. *Its own numbers fitted*: motors, centre",
-        "of gravity, tilt and a load fitted to the drone's fit flights, all that is common held. *Its own model*: what",
-        "`cfb close-loop` found on them from the declared model.",
+        "Each cell is the mean error of attitude (rad) / velocity (m/s) half a second ahead, on validation flights.",
+        "",
+        "| model | what it is |",
+        "|---|---|",
+        "| type from the others | fitted to the other drones; of this drone only the mass is used |",
+        "| the same, drone-specific fit | motors, centre of gravity, tilt and a load fitted to the drone's fit "
+        "flights, all common numbers held |",
+        "| its own model | found by `cfb close-loop` on the drone's fit flights ([real loops](real-loops.md)) |",
+        "| hold | constant velocity and constant body rate |",
+        "",
+        f"*Gentle flights* are those with the smallest error of `hold`, within a factor of {ALIKE:g}.",
         "",
     ]
     for drone in drones:
@@ -324,7 +341,7 @@ def page(drones: list[Drone], common: Fleet, of_type: ModelFile, tables: dict) -
 
 
 def main() -> None:
-    """The type, the page and the figure."""
+    """Write the preset of the type, the page and the figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("drones", nargs="+", metavar="NAME=FOLDER,MODEL,MASS_KG")
     parser.add_argument("--loops", type=Path, default=ROOT / "out" / "real-loops")

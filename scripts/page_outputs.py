@@ -1,9 +1,9 @@
-"""Run the Python on hand-written pages and write what it prints below it.
+"""Run the Python blocks of hand-written pages and write their output below them.
 
     python scripts/page_outputs.py [docs/tutorial.md ...]
 
-Blocks of a page share a namespace, in order. A block marked ``text`` right after one of ``python`` holds what that one
-printed; tests/docs/test_pages.py runs the same pages and compares.
+The blocks of a page run in order and share a namespace. A ``text`` block directly after a ``python`` block holds its
+output. tests/docs/test_pages.py runs the same pages and compares the output.
 """
 
 from __future__ import annotations
@@ -25,35 +25,35 @@ BLOCK = re.compile(r"^```python\n(?P<code>.*?)^```\n(?:\n```text\n(?P<output>.*?
 
 @dataclass(frozen=True)
 class Block:
-    """One piece of Python on a page."""
+    """A Python block of a page."""
 
     code: str
     output: str | None
-    """What the page says it prints; None: nothing."""
+    """Its output according to the page; None for no output."""
     line: int
 
 
 def blocks(text: str) -> list[Block]:
-    """The Python blocks of a page."""
+    """Return the Python blocks of a page."""
     return [Block(m["code"], m["output"], text[: m.start()].count("\n") + 2) for m in BLOCK.finditer(text)]
 
 
 def run(page: Path) -> list[str]:
-    """Run the blocks of a page in the current folder; what each printed, without spaces at the ends of lines."""
+    """Run the blocks of a page in the current folder; return the output of each, without trailing spaces."""
     module = types.ModuleType(f"page_{page.stem.replace('-', '_')}")
-    sys.modules[module.__name__] = module  # dataclasses look their module up
+    sys.modules[module.__name__] = module  # dataclasses look up their module here
     printed = []
     for block in blocks(page.read_text(encoding="utf-8")):
         out = io.StringIO()
         with contextlib.redirect_stdout(out):
-            # Empty lines in front: a traceback then names the line of the page.
+            # Leading empty lines make a traceback name the line of the page.
             exec(compile("\n" * (block.line - 1) + block.code, str(page), "exec"), module.__dict__)
         printed.append("".join(f"{line.rstrip()}\n" for line in out.getvalue().splitlines()))
     return printed
 
 
 def written(text: str, printed: list[str]) -> str:
-    """The page with what was printed below each block."""
+    """Return the page with the given output below each block."""
     outputs = iter(printed)
 
     def replaced(match: re.Match) -> str:
@@ -64,7 +64,7 @@ def written(text: str, printed: list[str]) -> str:
 
 
 def main(pages: list[Path]) -> None:
-    """Bring the outputs of pages up to date."""
+    """Update the outputs on the given pages."""
     from cfb_mjx.runtime import configure_jax
 
     configure_jax(x64=True)

@@ -1,9 +1,9 @@
-"""Write the card of each shipped policy: what trained it, on what, its curve, scores and limits.
+"""Write the card of each shipped policy: algorithm, training conditions, learning curve, scores and limits.
 
     python scripts/policy_cards.py
 
-From the files beside each policy and the results of scripts/measure_controllers.py and scripts/flips.py: run it after
-them.
+The cards are written from the files next to each policy and from the results of scripts/measure_controllers.py and
+scripts/flips.py, so run it after these.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from cfb_mjx.control.policy_file import shipped_policies
 
 ROOT = Path(__file__).resolve().parents[1]
 SWINGS = 0.04
-"""Command std in hover above which a drone visibly swings."""
+"""Command std in hover above which a drone visibly oscillates."""
 CURVE_ROWS = 6
 COLUMNS = {
     "hover_mm": "hover, nominal, mm",
@@ -28,7 +28,7 @@ COLUMNS = {
 
 
 def main() -> None:
-    """Write them."""
+    """Write all cards."""
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     from cfb_mjx.files import write_text
 
@@ -38,7 +38,7 @@ def main() -> None:
 
 
 def card(folder: Path) -> str:
-    """The Markdown of one policy."""
+    """Return the card of the policy in ``folder``, as Markdown."""
     config = yaml.safe_load((folder / "config.yaml").read_text())
     last = json.loads((folder / "training.json").read_text())
     flips = config["task"] == "flip"
@@ -46,9 +46,9 @@ def card(folder: Path) -> str:
     lines = [f"# {folder.name}", ""]
     for part in parts:
         lines += [" ".join(part["description"].split()), ""]
-    lines += ["## What trained it", "", *_training(folder, config, last), ""]
-    lines += ["## On what", "", *_conditions(config), ""]
-    lines += ["## Curve", "", *_curve(folder), ""]
+    lines += ["## Training", "", *_training(folder, config, last), ""]
+    lines += ["## Conditions of the training", "", *_conditions(config), ""]
+    lines += ["## Learning curve", "", *_curve(folder), ""]
     lines += ["## Scores", "", *(_flips(folder.name) if flips else _scores(folder.name))]
     return "\n".join(lines) + "\n"
 
@@ -64,30 +64,32 @@ def _training(folder: Path, config: dict, last: dict) -> list[str]:
     if (folder / "training-1.json").exists():
         first = json.loads((folder / "training-1.json").read_text())["last"]
         minutes = first["seconds"] / 60
-        lines.append(f"- Begun from a first part of {first['commands'] / 1e6:.0f} M commands in {minutes:.0f} min.")
-    lines.append("- Commands: `README.md` in the folder above. Every number: `config.yaml`, and inside `policy.npz`.")
+        lines.append(f"- Continues a first part of {first['commands'] / 1e6:.0f} M commands in {minutes:.0f} min.")
+    lines.append(
+        "- Commands: see `README.md` in the folder above. All settings: `config.yaml`, also stored in `policy.npz`."
+    )
     return lines
 
 
 def _conditions(config: dict) -> list[str]:
     random, noise, seen = config["randomisation"], config["noise"], config["observation"]
-    milder = f", a share {random['graded']:g} of the episodes on milder drones" if random.get("graded") else ""
-    late = f", and up to {1e3 * noise['pose_jitter_s']:g} ms more" if noise.get("pose_jitter_s") else ""
-    whose = "pose and gyro alike" if config.get("lumped_delay", True) else "the gyro read on the drone"
+    milder = f"; a share of {random['graded']:g} of the episodes has milder drones" if random.get("graded") else ""
+    late = f" plus up to {1e3 * noise['pose_jitter_s']:g} ms" if noise.get("pose_jitter_s") else ""
+    whose = "for pose and gyro" if config.get("lumped_delay", True) else "for the pose; the gyro is read on the drone"
     lines = [
         f"- Model `{config['model']}`, randomisation `{random['ranges']}` x {random['magnitude']:g}{milder}.",
-        f"- Estimates as late as the model's `pose_delay`{late}: {whose}. Noise: {1e3 * noise['position_m']:g} mm, "
+        f"- Delay of the estimates: the model's `pose_delay`{late}, {whose}. Noise: {1e3 * noise['position_m']:g} mm, "
         f"{1e3 * noise['velocity_mps']:g} mm/s, {1e3 * noise['attitude_rad']:g} mrad, "
         f"{1e3 * noise['rate_radps']:g} mrad/s.",
     ]
     told = f"{1 + seen['past_estimates']} estimates, {seen['past_commands']} past commands"
     told += ", an integral of the position error" if seen.get("integral") else ""
-    return [*lines, f"- Sees {told}; a command every {1e3 * seen['control_dt_s']:g} ms."]
+    return [*lines, f"- Observation: {told}. A command every {1e3 * seen['control_dt_s']:g} ms."]
 
 
 def _curve(folder: Path) -> list[str]:
     rows = list(csv.DictReader((folder / "curve.csv").read_text().splitlines()))
-    # Evenly over the training, its end included.
+    # Evenly spaced, the last row included.
     chosen = rows[:: -(-len(rows) // CURVE_ROWS)]
     chosen += [] if chosen[-1] is rows[-1] else [rows[-1]]
     there = {key: title for key, title in COLUMNS.items() if key in rows[0]}
@@ -105,42 +107,47 @@ def _scores(name: str) -> list[str]:
     r = whole[name]
     sensors = {what: there["command_std"] for what, there in r["sensors"].items()}
     lines = [
-        f"`scripts/measure_controllers.py`, {r['environment']['date']}; all of it in docs/controllers.md.",
+        f"`scripts/measure_controllers.py`, {r['environment']['date']}; full results in docs/controllers.md.",
         "",
         f"- Hover on the nominal drone: {r['hover_mm']:.0f} mm, command std {r['command_std']:.3f}.",
         f"- Hover on {r['drones']} drones of the paper's randomisation: median {r['random_hover_mm']['0.5']:.0f} mm, "
         f"95 % within {r['random_hover_mm']['0.95']:.0f} mm; {r['random_failed']:.2%} failed.",
-        f"- Six metres: {r['arrival_s']:.2f} s, peak {r['peak_speed_mps']:.1f} m/s, {r['overshoot_m']:.2f} m beyond.",
-        f"- Thrown at 3 m/s with 60 deg of tilt: {r['random_recovered']:.1%} of these drones recovered within 6 s, "
-        f"{r['recovered']:.1%} of nominal ones.",
+        f"- Flight over 6 m: {r['arrival_s']:.2f} s, peak speed {r['peak_speed_mps']:.1f} m/s, overshoot "
+        f"{r['overshoot_m']:.2f} m.",
+        f"- Thrown at 3 m/s with 60 deg of tilt: {r['random_recovered']:.1%} of the randomised drones and "
+        f"{r['recovered']:.1%} of the nominal drones recover within 6 s.",
         "",
         "## Limits",
         "",
     ]
     lines += [
-        f"- {what[0].upper() + what[1:]}: " + ("lost." if std is None else f"command std {std:.3f}, it swings.")
+        f"- {what[0].upper() + what[1:]}: "
+        + ("all failed." if std is None else f"command std {std:.3f}, the drone oscillates.")
         for what, std in sensors.items()
         if std is None or std > SWINGS
     ]
     worst, of = max(r["factors"].items(), key=lambda item: item[1]["most_third_mm"] - item[1]["least_third_mm"])
     lines.append(
-        f"- What costs it most: {worst}; the third of the drones that depart least by it hovers at "
-        f"{of['least_third_mm']:.0f} mm, the third that departs most at {of['most_third_mm']:.0f} mm."
+        f"- Factor with the largest influence: {worst}. The median hover error is {of['least_third_mm']:.0f} mm for "
+        "the third of the drones that deviate least from nominal in this factor, and "
+        f"{of['most_third_mm']:.0f} mm for the third that deviates most."
     )
     errors = {plant: there["hover_mm"] or float("inf") for plant, there in r["plants"].items()}
     plant = max(errors, key=errors.get)
-    lines.append(f"- Of the drones with effects it never saw, `{plant}` is held worst: {errors[plant]:.0f} mm.")
+    lines.append(
+        f"- Largest hover error on drones with effects outside the training: {errors[plant]:.0f} mm, `{plant}`."
+    )
     return lines
 
 
 def _flips(name: str) -> list[str]:
     whole = json.loads((ROOT / "benchmarks" / "flips.json").read_text())
     if name != "flip":
-        return ["Not measured here; docs/flips.md is of `flip`."]
+        return ["Not measured. docs/flips.md has the scores of `flip`."]
     lines = [
-        f"`scripts/flips.py`, {whole['environment']['date']}; all of it in docs/flips.md.",
+        f"`scripts/flips.py`, {whole['environment']['date']}; full results in docs/flips.md.",
         "",
-        "| flip | holder | height, nominal, m | completed, randomised | 95 % of these within, m |",
+        "| flip | holder | height, nominal drone, m | completed, randomised drones | height of 95 % of these, m |",
         "|---|---|---|---|---|",
     ]
     for flip, of in whole["flips"].items():
@@ -148,7 +155,7 @@ def _flips(name: str) -> list[str]:
         lines.append("| " + " | ".join([*cells, f"{of['random_extent_m']['0.95']:.2f}"]) + " |")
     few = {flip: of["completed_random"] for flip, of in whole["flips"].items()}
     worst = min(few, key=few.get)
-    return [*lines, "", "## Limits", "", f"- `{worst}` is completed by {few[worst]:.0%} of randomised drones only."]
+    return [*lines, "", "## Limits", "", f"- Only {few[worst]:.0%} of the randomised drones complete `{worst}`."]
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""RAPTOR's published policy as a controller, for comparison: it adapts to any quadrotor within its first second.
+"""RAPTOR's published policy as a controller, for comparison.
 
-J. Eschmann, D. Albani, G. Loianno, RAPTOR: A Foundation Policy for Quadrotor Control, 2025. Its weights are not part of
-this project: `pip install foundation-policy`. Observation, order of the motors and normalisation are those that package
-documents; errors of position and velocity are limited as its authors' adapter for PX4 limits them.
+J. Eschmann, D. Albani, G. Loianno, RAPTOR: A Foundation Policy for Quadrotor Control, 2025. The policy adapts to any
+quadrotor within its first second. Its weights are not part of this project: `pip install foundation-policy`.
+Observation, order of the motors and normalisation are as that package documents them; errors of position and velocity
+are limited as in its authors' adapter for PX4.
 """
 
 from __future__ import annotations
@@ -15,22 +16,22 @@ from jaxtyping import Array, Float
 from cfb_mjx.envs.observation import Estimate, rotation_matrix
 
 STEPS = 5
-"""Steps of the controller from one command to the next: it is asked every 10 ms, as in its training."""
+"""Control steps per evaluation of the network: 10 ms, as in its training."""
 LARGEST_POSITION_ERROR_M, LARGEST_VELOCITY_ERROR_MPS = 0.5, 1.0
 
 
 class Memory(eqx.Module):
-    """What it keeps between two steps."""
+    """State of the controller between two steps."""
 
     hidden: Float[Array, " hidden"]
     action: Float[Array, "4"]
-    """-1 to 1."""
+    """Last action, range -1 to 1."""
     held: Array
-    """Steps since it was asked."""
+    """Steps since the last evaluation."""
 
 
 class RaptorController(eqx.Module):
-    """A layer of rectifiers, a gated recurrent unit and a linear layer."""
+    """The network: a ReLU layer, a gated recurrent unit and a linear layer."""
 
     first: tuple[Array, Array]
     recurrent: tuple[Array, Array, Array, Array]
@@ -40,13 +41,13 @@ class RaptorController(eqx.Module):
 
     @classmethod
     def published(cls) -> RaptorController:
-        """From the installed package, which checks its weights against an example."""
+        """Load the weights from the installed package, which checks them against an example."""
         from foundation_policy import Raptor
 
         dense, gru, out = Raptor().layers
         names = (dense.activation_function_name, out.activation_function_name)
         if names != ("RELU", "IDENTITY"):
-            raise SystemExit(f"foundation-policy: layers with {names} are another network; install version 1.0.2.")
+            raise SystemExit(f"foundation-policy: unknown network with layers {names}; install version 1.0.2.")
         arrays = (
             (dense.weights, dense.biases[0]),
             (gru.weights_input, gru.biases_input, gru.weights_hidden, gru.biases_hidden),
@@ -56,11 +57,11 @@ class RaptorController(eqx.Module):
         return cls(*jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), arrays))
 
     def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Memory:
-        """At take-over."""
+        """Return the memory at take-over."""
         return Memory(self.hidden, 2 * command - 1, jnp.asarray(0))
 
     def command(self, memory: Memory, estimate: Estimate) -> tuple[Memory, Float[Array, "4"]]:
-        """New memory and command."""
+        """Return the new memory and the command."""
         hidden, action = self._asked(memory, estimate)
         due = memory.held == 0
         hidden = jnp.where(due, hidden, memory.hidden)

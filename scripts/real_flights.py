@@ -2,8 +2,8 @@
 
     python scripts/real_flights.py FOLDER       (FOLDER holds fit/*.parquet and validation/*.parquet)
 
-Presets are judged on all flights; the refit uses fit/ only and is judged on validation/.
-Only aggregate errors are written; the flights themselves never enter the project.
+The presets are evaluated on all flights. The refit uses fit/ only and is evaluated on validation/. Only aggregate
+errors are written; the flights do not become part of the project.
 """
 
 import sys
@@ -26,11 +26,11 @@ KEYS = ("position_mean_m", "velocity_mean_mps", "attitude_mean_deg", "rate_mean_
 
 
 def main(folder: Path) -> None:
-    """Evaluate and write the page."""
+    """Evaluate the presets and write the page."""
     configure_jax(x64=True)
     paths = sorted(folder.glob("*/*.parquet"))
     if not paths:
-        sys.exit(f"{folder}: holds no fit/*.parquet or validation/*.parquet")
+        sys.exit(f"{folder}: has no fit/*.parquet or validation/*.parquet")
     logs = [read_log(path) for path in paths]
     lines = []
     for group, prefixes in GROUPS.items():
@@ -58,17 +58,26 @@ def main(folder: Path) -> None:
 
 Written by `python scripts/real_flights.py FOLDER`; do not edit. {facts}
 
+This page shows how well the published presets predict flights of a real drone, and what `cfb fit` changes. To evaluate
+a preset on your own log:
+
+```sh
+cfb evaluate LOG --model cfb-guards --set mass=0.045
+```
+
 ## The presets as published
 
-Flights: the public IDSIA nano-drone system-identification benchmark (Busetto et al., "Nonlinear system identification
-for a nano-drone benchmark", Control Engineering Practice 172, 2026), {len(logs)} raw 100 Hz logs of a Crazyflie 2.1
-Brushless with AI-deck and flow deck. Nothing was fitted: these are the presets as published, with the drone's mass set
-to {MASS} kg. Mean errors of open-loop predictions with 95 % intervals; protocol in [evaluation.md](evaluation.md).
+The flights are the public IDSIA nano-drone system-identification benchmark (Busetto et al., "Nonlinear system
+identification for a nano-drone benchmark", Control Engineering Practice 172, 2026): {len(logs)} raw 100 Hz logs of a
+Crazyflie 2.1 Brushless with AI-deck and flow deck. Nothing was fitted: the presets are used as published, with the
+drone's mass set to {MASS} kg. The table gives mean errors of open-loop predictions with 95 % intervals
+([protocol](evaluation.md)).
 
 **The published models predict these flights worse than `hold`**, which assumes constant velocity and constant body
-rate, everywhere at 0.5 s in attitude. They respond to the logged commands with far more angular acceleration than the
-drone showed: another drone, other decks, other propellers, feedback flights with unmodelled disturbances. What is
-missing is the subject of the next section, and of effects the paper's model does not have.
+rate: at 0.5 s, the attitude error is larger in every case. The models respond to the logged commands with far more
+angular acceleration than the drone showed. It is another drone with other decks and other propellers, and it flew with
+feedback and unmodelled disturbances. The next section refits the model.
+[closing-real-flights.md](closing-real-flights.md) adds effects that the paper's model does not have.
 
 | flights | windows | horizon, s | prediction | position, m | velocity, m/s | attitude, deg | body rate, rad/s |
 |---|---:|---:|---|---|---|---|---|
@@ -78,9 +87,9 @@ missing is the subject of the next section, and of effects the paper's model doe
 
 ## Alignment
 
-Estimated lead of the motor columns over the gyro, as found and as applied on import (whole samples):
+The importer estimates the lead of the motor columns over the gyro and shifts them by whole samples:
 
-| flight | shift |
+| flight | lead, and shift applied |
 |---|---|
 {shifts}
 """,
@@ -89,7 +98,7 @@ Estimated lead of the motor columns over the gyro, as found and as applied on im
 
 
 def _refit(folder: Path) -> str:
-    """The refit on fit/, judged on validation/, as Markdown."""
+    """Return the section on the refit on fit/, evaluated on validation/."""
     base = load_model_file("cfb-guards").with_values("weighed with its decks", mass=MASS)
     logs = [read_log(path) for path in sorted((folder / "fit").glob("*.parquet"))]
     judged = [read_log(path) for path in sorted((folder / "validation").glob("*.parquet"))]
@@ -98,7 +107,7 @@ def _refit(folder: Path) -> str:
     pooled = fit(logs, base.parameters())
     names = pooled.names
     single = {log.name: fit([log], base.parameters(), names) for log in logs}
-    table = [f"| parameter | preset | all {len(logs)} fit flights | single flights: median, least, most |"]
+    table = [f"| parameter | preset | all {len(logs)} fit flights | single flights: median, smallest, largest |"]
     table.append("|---|---:|---:|---|")
     for name in names:
         if name not in pooled.estimates:
@@ -113,14 +122,17 @@ def _refit(folder: Path) -> str:
         [
             "## Refitted",
             "",
-            f"`cfb fit` on the {len(logs)} fit flights ({pooled.rows} rows) together, innovation estimator, measured",
-            "rotor speeds driving the body; mass weighed, torque curve as published.",
+            f"The table compares one `cfb fit` on all {len(logs)} fit flights ({pooled.rows} rows) with fits to single",
+            "flights: innovation estimator, body driven by measured rotor speeds, mass weighed, torque curve as",
+            "published.",
             "",
             *table,
             "",
-            "The two thrust numbers belong together: they lower the thrust at hover and steepen the curve, towards the",
-            "square law other groups measured. What single flights say differs by more than their standard deviations:",
-            "the model leaves out effects that differ from flight to flight.",
+            "The two thrust numbers act together: they lower the thrust at hover and make the curve steeper, closer to",
+            "the square law that other groups measured. Estimates from single flights differ by more than their",
+            "standard deviations, because the model leaves out effects that differ from flight to flight.",
+            "",
+            "Errors on the validation flights before and after the refit:",
             "",
             _held_out(base, corrected, judged),
         ]

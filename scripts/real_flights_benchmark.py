@@ -1,38 +1,41 @@
-"""The section of docs/closing-real-flights.md on the nano-drone benchmark, from what `close_real_flights` measured."""
+"""The section of docs/closing-real-flights.md on the nano-drone benchmark, from results of `close_real_flights`."""
 
 from cfb_mjx.sysid.nanodrone import PUBLISHED
 
 GOAL = (1.91, 8.86, 3.94, 20.8)
-"""What the project set itself on the benchmark's test flights, as the sums of `PUBLISHED`."""
+"""Goal of the project on the benchmark's test flights, as the sums in `PUBLISHED`."""
 FORECASTS = ("predictor", "predictor, observer")
 HEAD = ("| | position | velocity | attitude | body rate |", "|---|---|---|---|---|")
 
 
 def benchmark_section(results: dict) -> list[str]:
-    """Its lines; ``results`` has the sums under ``sums`` and ``unseen``."""
+    """Return the lines of the section; ``results`` has the sums under ``sums`` and ``unseen``."""
     elsewhere = PUBLISHED | {"goal": GOAL}
     return [
         "## The nano-drone benchmark on these flights",
         "",
-        "Sums of mean errors over 50 steps of 10 ms, rotor speeds in ([rules](nanodrone.md)): position m, velocity",
-        "m/s, attitude rad, body rate rad/s, and beside each its share of the rows *naive* and *physics*.",
-        "Published rows are on the benchmark's own test flights, which are easier to predict from how the drone",
-        "moves: *physics*, one and the same rule, errs a smaller share of *naive* there. Compare shares of both.",
+        "The table gives sums of mean errors over 50 steps of 10 ms, rotor speeds in ([rules](nanodrone.md)): position",
+        "m, velocity m/s, attitude rad, body rate rad/s. In brackets is the ratio to the row *naive* / to the row",
+        "*physics* of the same flights.",
+        "",
+        "Rows that begin with *test flights* are published results, and the project's goal, on the benchmark's own",
+        "test flights. Those are easier to predict from the motion of the drone: *physics*, the same rule on both, has",
+        "a smaller ratio to *naive* there. Compare both ratios.",
         "",
         *HEAD,
         *_rows(results["sums"]["together"]),
-        *_rows(elsewhere, "on those: "),
+        *_rows(elsewhere, "test flights: "),
         "",
         *_verdict(results["sums"]["together"]),
         "",
-        "Flight by flight, physics and the predictor with observer, beside the published *physics* and the goal:",
+        "Flight by flight, *physics* and the predictor with observer, with the published *physics* and the goal:",
         "",
         *HEAD,
         *_by_flight(results["sums"]),
-        *_rows(elsewhere, "on those: ", ("physics", "goal")),
+        *_rows(elsewhere, "test flights: ", ("physics", "goal")),
         "",
-        "Does it carry over to references it was not fitted to? The predictor fitted again without flights of the kind",
-        "of reference it is judged on (the observer's levels left as they are):",
+        "To test references that the predictor was not fitted to, it was fitted again without flights of the kind of",
+        "reference that it is judged on (the observer's levels stay as they are):",
         "",
         *HEAD,
         *(line for kind, rows in results["unseen"].items() for line in _rows(rows, f"{kind}, unseen: ", FORECASTS)),
@@ -40,15 +43,15 @@ def benchmark_section(results: dict) -> list[str]:
 
 
 def _verdict(sums: dict[str, list[float]]) -> list[str]:
-    """Which of the goal's shares the predictor reaches."""
+    """Say in how many ratios the predictor reaches the goal."""
     lines = []
     for row in FORECASTS:
         reached = {
             name: [x / a <= g / b for x, a, g, b in zip(sums[row], sums[name], GOAL, PUBLISHED[name], strict=True)]
             for name in ("naive", "physics")
         }
-        text = " and ".join(f"{sum(found)} of {len(found)} shares of *{name}*" for name, found in reached.items())
-        lines.append(f"Of the goal's shares the row *{row}* reaches {text}.")
+        text = " and ".join(f"{sum(found)} of {len(found)} ratios to *{name}*" for name, found in reached.items())
+        lines.append(f"The row *{row}* reaches the goal in {text}.")
     return lines
 
 

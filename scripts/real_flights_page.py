@@ -1,4 +1,4 @@
-"""The page docs/closing-real-flights.md and its figure, from the numbers `close_real_flights` measured."""
+"""The page docs/closing-real-flights.md and its figure, from the results of `close_real_flights`."""
 
 from pathlib import Path
 from statistics import mean, stdev
@@ -20,7 +20,7 @@ TARGETS = {
     ("rotor_speed_in_observer", "gentle"): (0.22, 0.39),
     ("rotor_speed_in_observer", "square"): (0.24, None),
 }
-"""What the project set itself: mean errors after 0.5 s, attitude rad and velocity m/s."""
+"""Goals of the project: mean errors after 0.5 s, attitude rad and velocity m/s."""
 TITLES = {
     "commands_in": "commands in",
     "rotor_speed_in": "rotor speeds in",
@@ -30,7 +30,7 @@ TITLES = {
 
 
 def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[str]]) -> str:
-    """The page as Markdown."""
+    """Return the page as Markdown."""
     facts = ", ".join(f"{name} {value}" for name, value in environment().items())
     rows = []
     for variant, title in TITLES.items():
@@ -41,20 +41,38 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             rows.append(f"| {title} | {group} | {hold} | " + " | ".join(cells) + f" | {target} |")
     return "\n".join(
         [
-            "# Closing the loop on real flights",
+            "# Model correction on real flights",
             "",
             f"Written by `python scripts/close_real_flights.py FOLDER`; do not edit. {facts}",
             "",
-            "Flights: the public IDSIA nano-drone system-identification benchmark (Busetto et al., Control Engineering",
-            "Practice 172, 2026), a Crazyflie 2.1 Brushless with AI-deck and flow deck, logged at 100 Hz; weighed mass",
-            f"{results['mass']} kg. Fitted to: {', '.join(results['fit'])}.",
-            f"Judged on: {', '.join(results['validation'])}.",
+            "This page shows the correction of a model on flights of a real drone: the corrected models, their errors",
+            "on held-out flights, and the commands that made them. Both models are presets that you can use:",
+            "",
+            "```sh",
+            "cfb evaluate LOG --model cfb-idsia --observer",
+            "cfb benchmark-nanodrone FOLDER",
+            "```",
+            "",
+            "`cfb-idsia` is the *plant* below, `cfb-idsia-predictor` the *predictor*.",
+            "",
+            "The flights are the public IDSIA nano-drone system-identification benchmark (Busetto et al., Control",
+            "Engineering Practice 172, 2026): a Crazyflie 2.1 Brushless with AI-deck and flow deck, logged at 100 Hz.",
+            "The drone weighs",
+            f"{results['mass']} kg.",
+            "",
+            f"- Fitted to: {', '.join(results['fit'])}.",
+            f"- Judged on (held out): {', '.join(results['validation'])}.",
             "",
             "## Prediction after 0.5 s",
             "",
-            "Mean error of attitude, rad, / velocity, m/s, of open-loop predictions of the flights nothing was fitted",
-            "to ([protocol](evaluation.md)). *Gentle* are the random and multisine references, *square* is aggressive.",
-            "*Hold* assumes constant velocity and constant body rate.",
+            "The table gives the mean error of attitude, rad, / velocity, m/s, of open-loop predictions of the",
+            "held-out flights ([protocol](evaluation.md)).",
+            "",
+            "- *commands in*, *rotor speeds in*: what drives the prediction. *Observer*: with disturbances estimated",
+            "  from the data before each window.",
+            "- *gentle*: the random and multisine references. *square*: an aggressive reference.",
+            "- *hold*: constant velocity and constant body rate.",
+            "- *goal*: what the project set itself.",
             "",
             "| prediction | flights | hold | " + " | ".join(models) + " | goal |",
             "|---|---|---" + "|---" * len(models) + "|---|",
@@ -62,28 +80,29 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "",
             "![Errors over the horizon](closing-real-flights.png)",
             "",
-            "- *declared*: preset `cfb-guards` at the drone's mass.",
-            "- *innovations*: motors from rotor speeds, and the effects fitted to one-step innovations, which feedback",
-            "  does not bias.",
-            "- *plant*: the same effects and a few more fitted to predictions; inertia within 25 %, damping within",
-            "  2 per second.",
-            "- *predictor*: inertia left free, and small torques of gentle flights answered by less than their size,",
-            "  the body rate expected to return instead (`regression_dilution`, no physics).",
-            *_over_plant(results["errors"]),
-            "  It is a wrong plant: `cfb refine` marks it so.",
-            *_dilution(models["predictor"]),
+            "The models:",
             "",
-            "Plant and predictor are shipped as the presets `cfb-idsia` and `cfb-idsia-predictor`:",
-            "`cfb evaluate LOG --model cfb-idsia --observer`, `cfb benchmark-nanodrone FOLDER`.",
+            "- *declared*: preset `cfb-guards` at the drone's mass.",
+            "- *innovations*: motors fitted to measured rotor speeds, and effects fitted to one-step innovations,",
+            "  which feedback does not bias.",
+            "- *plant*: the same effects and a few more, fitted to predictions; inertia within 25 %, damping within 2",
+            "  per second.",
+            "- *predictor*: fitted again with free inertia and `regression_dilution`, which is no physics: the model",
+            "  responds to small torques of gentle flights with less than their size, and expects the body rate to",
+            "  decay.",
+            *_over_plant(results["errors"]),
+            "  The predictor is a wrong plant, and `cfb refine` marks it as such.",
+            *_dilution(models["predictor"]),
             "",
             *_story(results),
             "",
-            "## The plant, and what each effect buys",
+            "## The plant, effect by effect",
             "",
-            "Without an effect, everything else fitted again: by how much the worst of the four errors above (without",
-            "observer, attitude after 0.5 s, both groups) grows.",
+            "*Error without it* is the growth of the worst of four errors above (attitude after 0.5 s without",
+            "observer, commands in and rotor speeds in, both groups) when the effect is removed and everything else is",
+            "fitted again.",
             "",
-            "| effect | numbers | error without it | argument |",
+            "| effect | numbers | error without it | explanation |",
             "|---|---|---:|---|",
             *_effects(models["plant"], results),
             "",
@@ -97,18 +116,19 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "",
             "## The observer",
             "",
-            "A torque, a force and, where rotor speed was measured, motor errors, estimated from data before each",
-            "window's start; how much they may wander was chosen by predictions of the flights fitted to, gentle and",
-            "square alike (`cfb_mjx.sysid.observer_tuning`): with the plant after half a second, with the predictor by",
-            "the sums of the benchmark below:",
+            "The observer estimates a torque, a force and, where rotor speed was measured, motor errors from the data",
+            "before each window's start. Its noise levels were chosen by predictions of the flights fitted to, with",
+            "equal weight for gentle and square flights (`cfb_mjx.sysid.observer_tuning`): for the plant by the errors",
+            "after 0.5 s, for the predictor by the sums of the benchmark below.",
             "",
             *_levels(results["observer"]),
             "",
-            "## What is missed twice",
+            "## Residuals common to two flights",
             "",
-            "Measured minus modelled angular acceleration below 6 Hz, in flights of one reference: rms, rad/s^2, and",
-            "correlation between the two flights, roll / pitch / yaw. *Explained* is the share of the declared model's",
-            "common residual (covariance, roll and pitch together) that the plant no longer misses.",
+            "A residual that two flights of one reference have in common is a model error, not noise. The table gives",
+            "the measured minus the modelled angular acceleration below 6 Hz, roll / pitch / yaw: its rms, rad/s^2;",
+            "and its correlation between the two flights. *Explained* is the share of the declared model's common",
+            "residual (covariance, roll and pitch together) that the plant removes.",
             "",
             "| flights | declared | plant | explained |",
             "|---|---|---|---:|",
@@ -142,11 +162,11 @@ def _story(results: dict) -> list[str]:
         seen = plant[f"{variant} {group} 0.5"]
         for what, value, goal in (("attitude", seen[0], attitude), ("velocity", seen[1], velocity)):
             if goal is not None and value > goal:
-                missed.append(f"{TITLES[variant]}, {group}, {what}: {value:.4f} where {goal:.2f} was the goal")
+                missed.append(f"{TITLES[variant]}, {group}, {what}: {value:.4f}, goal {goal:.2f}")
     hold = declared["hold gentle 0.5"][0]
     told = {variant: plant[f"{variant} gentle 0.5"][0] for variant in ("commands_in", "rotor_speed_in_observer")}
     compared = (f"{TITLES[v]}, {_beside(error / hold)} hold ({error:.3f} rad)" for v, error in told.items())
-    text = [f"Attitude on gentle flights, where hold errs by {hold:.3f} rad: the plant, {'; '.join(compared)}."]
+    text = [f"Attitude error of the plant on gentle flights (hold: {hold:.3f} rad): {'; '.join(compared)}."]
     if missed:
         text += ["", "**Goals not reached**:", "", *(f"- {line}" for line in missed)]
     return text
@@ -158,18 +178,18 @@ def _over_plant(errors: dict[str, dict]) -> list[str]:
         for group in GROUPS
         for keys in [[f"{variant} {group} 0.5" for variant in TITLES]]
     ]
-    return ["  Its errors of attitude above are of the plant's, row by row: " + "; ".join(shares) + "."]
+    return ["  Its attitude errors above, over those of the plant, row by row: " + "; ".join(shares) + "."]
 
 
 def _dilution(predictor: ModelFile) -> list[str]:
     numbers = {e["name"]: e["parameters"] for e in predictor.effects}
     diluted, inertia = numbers["regression_dilution"], numbers["inertia"]["relative"]
     return [
-        f"  Of a torque far below {1e3 * diluted['knee']:.2g} mN m it answers "
-        f"{100 * (1 - diluted['dilution']):.0f} % while the drone turns far less than {diluted['turning']:.2g} rad/s",
-        f"  (rms, the last {diluted['time_constant']:.2g} s), and expects the body rate to fade at "
-        f"{diluted['dilution'] * diluted['reversion']:.2g} per second. Inertia left free",
-        f"  comes out {', '.join(f'{100 * x:+.0f}' for x in inertia[:2])} % from the declared one.",
+        f"  Of a torque far below {1e3 * diluted['knee']:.2g} mN m only "
+        f"{100 * (1 - diluted['dilution']):.0f} % acts while the body rate is far below {diluted['turning']:.2g} rad/s",
+        f"  (rms, the last {diluted['time_constant']:.2g} s), and the body rate then decays at "
+        f"{diluted['dilution'] * diluted['reversion']:.2g} per second. The free inertia",
+        f"  differs from the declared one by {', '.join(f'{100 * x:+.0f}' for x in inertia[:2])} % (roll, pitch).",
     ]
 
 
@@ -192,20 +212,24 @@ def _position(plant: ModelFile, told: dict[str, dict], slow: float) -> list[str]
         cells += [_mean([one["column"][i] for one in told.values()])]
         rows.append(f"| {axis} | " + " | ".join(cells) + " |")
     return [
-        "`position_moment` lets a torque hang on the position as it would in air that moves towards the middle of the",
-        "room, the faster the farther out. By which share of the distance a second, 1/s, in the flights fitted to:",
-        "told by the moments (over `blade_flapping`); by the accelerometer, which feels the drag of that air beside",
-        f"the drag of the motion (below {slow:g} Hz), reference by reference; and what of both is no air: what the",
-        "velocity column, from which the model takes its airspeed, lacks against the slope of the position.",
+        "`position_moment` is a torque that depends on the position, as in air that moves towards the middle of the",
+        "room, faster the farther out. The table gives the speed of that air per distance from the middle, 1/s, in",
+        "the flights fitted to:",
+        "",
+        "- *by moments*: the numbers of `position_moment` over those of `blade_flapping`.",
+        "- *by drag*: the drag that the accelerometer measures in addition to the drag of the motion (below",
+        f"  {slow:g} Hz), for each reference.",
+        "- *velocity column*: the part of both that is not air. The model computes the airspeed from the logged",
+        "  velocity, which differs from the slope of the position by this much.",
         "",
         "| axis | by moments |" + "".join(f" by drag, {kind} |" for kind in kinds) + " velocity column |",
         "|---|---:|" + "---:|" * len(kinds) + "---:|",
         *rows,
         "",
-        "What is certain is the position: with it flights nothing was fitted to are predicted better. Air is not: a",
-        "third to a half of what the moments tell is the velocity column, and the drag tells of more than that in one",
-        "kind of flight along one axis only. Multisine references move all axes in one rhythm, in which position",
-        "and acceleration are hard to tell apart.",
+        "The dependence on the position is certain: it improves predictions of held-out flights. Moving air is not",
+        "certain. The velocity column accounts for a third to a half of the estimate from moments, and the drag shows",
+        "more than that in one kind of flight along one axis only. Multisine references move all axes in one rhythm,",
+        "in which position and acceleration are hard to separate.",
     ]
 
 
@@ -228,41 +252,48 @@ def _columns(seen: dict, tilted_by: dict) -> list[str]:
     across, _, up = seen["stretch"]
     largest, rise, fade = seen["band"]
     return [
-        f"The sensors, compared with each other, say that the logged velocity is {across:.3f} times too large",
-        f"horizontally and {up:.3f} times vertically (`sensor_velocity_scale`). The drone carried a flow deck, which",
-        "measures horizontal velocity by optical flow and height by a ranger. It is not so at all",
-        f"frequencies: {1 - 1 / largest:.2f} of the velocity,",
-        f"{rise:.2f} s late, less the same another {fade:.2f} s late (`rise`, `fade`; `cfb_mjx.sysid.velocity_band`),",
-        "accounts for more of what the horizontal velocity has over the slope of the position, below 4 Hz:",
+        "A comparison of the sensors shows that the logged velocity is stretched (`sensor_velocity_scale`): it is",
+        f"{across:.3f} times the true one horizontally and {up:.3f} times vertically. The drone carried a flow deck,",
+        "which measures horizontal velocity by optical flow and height by a ranger. The stretch is not the same at",
+        f"all frequencies. A band explains more: {1 - 1 / largest:.2f} of the velocity with a lag of",
+        f"{rise:.2f} s, minus the same with another lag of {fade:.2f} s (`rise`, `fade`;",
+        "`cfb_mjx.sysid.velocity_band`). The table gives the share of the variance of horizontal velocity minus slope",
+        "of the position, below 4 Hz, that each explains:",
         "",
-        "| flights | stretched alike | in a band |",
+        "| flights | one stretch | a band |",
         "|---|---:|---:|",
         *(f"| {part} | {100 * even:.0f}% | {100 * band:.0f}% |" for part, (even, band) in seen["explained"].items()),
         "",
-        "The tilt is too large as well, says the accelerometer,",
-        "turned by the logged attitude and set beside the position; in the flights fitted to:",
+        "The logged tilt is too large as well. In the flights fitted to, the table compares the logged velocity with",
+        "the slope of the position, and the accelerometer, rotated by the logged attitude, with the second",
+        "derivative of the position. A ratio of 1 is agreement:",
         "",
-        "| motion | velocity / position, horizontally | acceleration / position | velocity / position, vertically | "
-        "acceleration / position |",
+        "| frequency | velocity, horizontal | acceleration, horizontal | velocity, vertical | acceleration, vertical |",
         "|---|---:|---:|---:|---:|",
         *bands,
         "",
-        f"The gyro agrees: within {SPAN:g} s the on-board estimator adds tilt that no gyro saw. Two reasons for it are",
-        "set beside each other (`cfb_mjx.sysid.flow_estimator`, the estimator's two gains fitted in each cell): a",
-        "prediction of velocity from thrust alone, which the Crazyflie's filter makes in flight and which ignores the",
-        "drag that the accelerometer feels (the share ignored is fitted too, 1 is all of it); and a flow as stretched",
-        "as the velocity column, without that. Rms tilt added, rad, and how much of its variance each explains:",
+        f"The gyro confirms this: within {SPAN:g} s the on-board estimator adds tilt that the gyro did not measure.",
+        "Two explanations are compared (`cfb_mjx.sysid.flow_estimator`; the two gains of the estimator are fitted in",
+        "each cell):",
+        "",
+        "- *drag ignored*: the estimator predicts the velocity from thrust alone, as the Crazyflie's filter does in",
+        "  flight, and ignores the drag that the accelerometer measures. The share ignored is fitted too (1 is all",
+        "  of it).",
+        "- *flow stretched*: the optical flow is as stretched as the velocity column, and no drag is ignored.",
+        "",
+        "The table gives the rms tilt added, rad, and the share of its variance that each explains:",
         "",
         "| flights | tilt added | drag ignored | share ignored | flow stretched |",
         "|---|---:|---:|---:|---:|",
         *tilt,
         "",
-        "In gentle flights the logged tilt is too large because its estimator knows no drag. In square flights it is",
-        "corrected by more than either explains. Taking the stretch out of the velocity alone leaves the tilt that",
-        "moves the drone too large: positions are predicted better, attitude and velocity of square flights worse.",
-        "Plant and predictor therefore take attitude and velocity as they were logged (`--as-logged`): they agree with",
-        "each other, and drag and thrust are those of this velocity. Only the position they predict is put right: it",
-        "moves less than that velocity says (`with_attitude`).",
+        "In gentle flights the logged tilt is too large because the estimator ignores drag. In square flights the",
+        "estimator corrects the tilt by more than either explanation covers. If the stretch is taken out of the",
+        "velocity alone, the tilt that moves the drone stays too large: positions are predicted better, but square",
+        "flights mostly worse in attitude and velocity (table). Plant and predictor therefore use both as logged",
+        "(`--as-logged`): these two agree with each other, and drag and thrust are fitted to this velocity. Only the",
+        "predicted position is corrected, because it moves less than that velocity says (`with_attitude`).",
+        "",
         "Mean errors on the flights fitted to after 0.5 s, attitude, rad, / velocity as logged, m/s:",
         "",
         "| prediction | flights | stretch taken out | as logged |",
@@ -279,22 +310,22 @@ def _tilt(flights: str, by_reason: dict[str, dict]) -> str:
 
 
 ARGUMENTS = {
-    "blade_flapping": "hub moments against the motion; stronger along the body than across, weaker while climbing",
-    "inflow_thrust": "a climbing blade meets the air at a smaller angle: damps heave, roll, pitch; held at 2 / s",
-    "rotor_drag": "induced drag of the discs, linear in speed",
-    "thrust_scale": "hover at a rotor speed at which the paper's curve gives more thrust: decks stand in the flow",
-    "inertia": "decks and another battery; predictions ask for more than innovations do, which is what feedback does",
-    "cog_offset": "the mean place of the batteries; every flight has its own besides",
-    "torque_scale": "less reactive torque; yaw only",
-    "thrust_tilt": "rotors a few milliradians off the vertical",
-    "position_moment": "a velocity column that leans towards the middle, and perhaps air that moves there",
-    "battery_sag": "rotor speed follows the charge of the battery, little its dips under load (hence the lag)",
-    "motor_asymmetry": "motors are driven up and coast down",
+    "blade_flapping": "hub moments that oppose the motion; larger along body x than along body y, smaller in climb",
+    "inflow_thrust": "a climbing blade has a smaller angle of attack: damps heave, roll, pitch; at its bound of 2 / s",
+    "rotor_drag": "induced drag of the rotor discs, linear in velocity",
+    "thrust_scale": "the paper's curve gives too much thrust at the rotor speed of hover: decks are in the flow",
+    "inertia": "decks and another battery; predictions give more than innovations, as the bias of feedback does",
+    "cog_offset": "mean position of the batteries; each flight has its own offset in addition",
+    "torque_scale": "less reactive torque; acts on yaw only",
+    "thrust_tilt": "rotor axes a few milliradians off the vertical",
+    "position_moment": "a logged velocity biased towards the middle of the room, and perhaps air that moves there",
+    "battery_sag": "rotor speed follows the charge of the battery but hardly its dips under load (hence the lag)",
+    "motor_asymmetry": "motors are driven to spin up but coast to slow down",
 }
 
 
 def summary(plant: ModelFile, results: dict) -> str:
-    """The effects of the plant in the order of what they buy, and what it predicts: for closing-the-loop.md."""
+    """Return the summary for closing-the-loop.md: effects of the plant, sorted by their gain, and its errors."""
     errors = results["errors"]
 
     def at(name: str, group: str) -> str:
@@ -303,11 +334,11 @@ def summary(plant: ModelFile, results: dict) -> str:
     told = (f"{group} flights {at('declared', group)} -> {at('plant', group)} rad" for group in GROUPS)
     return "\n".join(
         [
-            "| effect | error without it | argument |",
+            "| effect | error without it | explanation |",
             "|---|---:|---|",
             *(f"| `{name}` | {growth:+.0%} | {ARGUMENTS[name]} |" for growth, name, _ in _ordered(plant, results)),
             "",
-            "Attitude half a second ahead, rotor speeds in, with observer, declared model -> corrected one:",
+            "Mean attitude error 0.5 s ahead (rotor speeds in, with observer), declared model -> corrected model:",
             f"{'; '.join(told)}. Errors over the horizon:",
             "",
             "![Errors over the horizon](closing-real-flights.png)",
@@ -323,7 +354,7 @@ def _effects(plant: ModelFile, results: dict) -> list[str]:
 
 
 def _ordered(plant: ModelFile, results: dict) -> list[tuple[float, str, str]]:
-    """How much an error grows without each effect, its name and numbers; what buys most first."""
+    """Return the growth of the error without each effect, its name and its numbers, largest first."""
     keys = [f"{variant} {group} 0.5" for variant in ("commands_in", "rotor_speed_in") for group in GROUPS]
     own, rows = results["errors"]["plant"], []
     for name, less in results["without"].items():
@@ -369,7 +400,7 @@ def _repeats(results: dict) -> list[str]:
 
 
 def figure(results: dict, path: Path) -> None:
-    """Attitude error over the horizon, by group and kind of prediction."""
+    """Plot the attitude error over the horizon, by group and kind of prediction."""
     from matplotlib.figure import Figure
 
     horizons = ("0.05", "0.1", "0.2", "0.5")

@@ -1,10 +1,10 @@
-"""Close the loop on real flights with defaults, one drone after another; write docs/real-loops.md.
+"""Run `cfb close-loop` with default settings on real drones, one after the other; write docs/real-loops.md.
 
     python scripts/real_loops.py NAME=FOLDER,MODEL,MASS_KG ... [--work out/real-loops]
 
-FOLDER holds fit/ and validation/. MODEL is a preset, a model file, or the NAME of a drone before it: then the search
-starts from the model found there. Nothing is fitted to validation/. What lies in the work folder is used again. Only
-aggregate numbers are written; the flights themselves never enter the project.
+FOLDER holds fit/ and validation/. MODEL is a preset, a model file, or the NAME of an earlier drone, whose corrected
+model is then the start. Nothing is fitted to validation/. Results that are already in the work folder are not computed
+again. Only aggregate numbers are written; the flights do not become part of the project.
 """
 
 import argparse
@@ -29,24 +29,32 @@ VARIANTS = {
     "rotor_speed_in_observer": "rotor speeds in, observer",
 }
 INTRODUCTION = """
-`cfb close-loop` on recordings of real drones, with defaults: no effect, weight or setting is typed in. Each section is
-one drone: the command, the first paragraph of its report, the effects in the order of what each buys, and the errors of
-the corrected model on flights nothing was fitted to. *Buys*: by which share an effect lowers the mean error of the
-fitted flights' predictions (attitude and velocity, 0.1 to 0.5 s ahead, over what hold errs), the others having moved to
-make up for it. *t*: standard deviations by which predictions of the other flights are better with it. *Accelerations
-ask for*: the same numbers from one-step innovations, which a controller's answers to disturbances do not bias; bold
-where they contradict what predictions ask for: such a number stands in for something else. A drone called *captured*
-flies the same flights, imported with `--motion-capture` ([logs](logs.md)): pose and velocity are not the estimate's.
+This page shows what `cfb close-loop` finds on recordings of real drones with default settings: no effect, weight or
+setting was chosen by hand. Read it to see what a report says, and how large the errors of a corrected model are.
+
+Each section is one drone: the command, the first paragraph of the report, the effects sorted by what each buys, and the
+errors of the corrected model on held-out flights. A drone called *captured* has the same flights, imported with
+`--motion-capture` ([logs](logs.md)): pose and velocity are not those of the on-board estimator.
+
+The columns of the tables of effects:
+
+- *from accelerations*: the same numbers from one-step innovations, which are not biased by the controller's responses
+  to disturbances. Bold numbers contradict those from predictions: such a number stands in for something else.
+- *buys*: share by which the effect lowers the mean prediction error of the fit flights (attitude and velocity, 0.1 to
+  0.5 s ahead, relative to the error of `hold`). In the comparison the other effects are adjusted to compensate for it.
+- *t*: improvement of the predictions of the held-out flights by the effect, in standard deviations. A motor effect that
+  measured rotor speeds show is kept unless *t* clearly contradicts it.
+- *at a bound*: numbers at the edge of their plausible range.
 """
 
 
 def cfb(*arguments: str) -> None:
-    """Run a command of the library."""
+    """Run a ``cfb`` command."""
     subprocess.run([Path(sys.executable).with_name("cfb"), *arguments], check=True)
 
 
 def close(name: str, folder: Path, model: str, mass: str, work: Path) -> tuple[list[str], float | None]:
-    """Close one loop unless it is there; the command's arguments and its processor time in s."""
+    """Correct the model of a drone unless that is done; return its fit flights and the processor time in s."""
     sides = {side: sorted(str(path) for path in (folder / side).iterdir()) for side in ("fit", "validation")}
     own = work / name
     arguments = ["--model", model, "--set", f"mass={mass}", "-o", str(own)]
@@ -62,7 +70,7 @@ def close(name: str, folder: Path, model: str, mass: str, work: Path) -> tuple[l
 
 
 def values(effect: dict) -> str:
-    """The numbers of an effect with their standard deviations."""
+    """Format the numbers of an effect with their standard deviations."""
     found = []
     for key, value in effect["parameters"].items():
         std = effect["uncertainty"].get(key)
@@ -73,7 +81,7 @@ def values(effect: dict) -> str:
 
 
 def asked(effect: dict) -> str:
-    """What the innovations make of its strengths; bold where that contradicts what predictions do."""
+    """Format the numbers from innovations; bold where they contradict those from predictions."""
     found = []
     for name, each in effect.get("innovations", {}).items():
         text = f"{name.split('.', 1)[1]} {each['value']:.3g} ± {each['std']:.1g}"
@@ -82,7 +90,7 @@ def asked(effect: dict) -> str:
 
 
 def section(name: str, folder: Path, model: str, mass: str, work: Path, before: dict[str, Path]) -> str:
-    """One drone."""
+    """Return the section of one drone."""
     start = str(before[model] / "model.yaml") if model in before else model
     fit, seconds = close(name, folder, start, mass, work)
     own = work / name
@@ -95,11 +103,11 @@ def section(name: str, folder: Path, model: str, mass: str, work: Path, before: 
         "",
     ]
     cost = "" if seconds is None else f" {seconds / 60:.1f} minutes of processor time."
-    lines += [f"{len(fit)} flights to learn from, {len(errors['logs'])} to be judged on.{cost}", ""]
+    lines += [f"{len(fit)} fit flights, {len(errors['logs'])} held-out flights.{cost}", ""]
     lines += [
         f"> {report['summary']}",
         "",
-        "| effect | numbers | accelerations ask for | buys | t | at a bound |",
+        "| effect | numbers | from accelerations | buys | t | at a bound |",
         "|---|---|---|---:|---:|---|",
     ]
     for effect in report["effects"]:
@@ -108,7 +116,7 @@ def section(name: str, folder: Path, model: str, mass: str, work: Path, before: 
         t = f"{effect['held_out_t']:.1f}" if "held_out_t" in effect else ""
         lines.append(f"| {effect['name']} | {values(effect)} | {asked(effect)} | {buys} | {t} | {bound} |")
     gone = ", ".join(effect["name"] for effect in report["unconfirmed"])
-    lines += ["", f"Fitted, but not borne out by the other flights: {gone}." if gone else ""]
+    lines += ["", f"Fitted, but not confirmed by the held-out flights: {gone}." if gone else ""]
     formula = report["formula"] or []
     lines += ["", "Formula terms: " + ("; ".join(formula) if formula else "none") + ".", ""]
     head = " | ".join(f"{1e3 * float(h):.0f} ms" for h in HORIZONS)
@@ -124,7 +132,7 @@ def section(name: str, folder: Path, model: str, mass: str, work: Path, before: 
 
 
 def main() -> None:
-    """All drones, then the page."""
+    """Correct the models of all drones and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("drones", nargs="+", metavar="NAME=FOLDER,MODEL,MASS_KG")
     parser.add_argument("--work", type=Path, default=ROOT / "out" / "real-loops")
@@ -137,7 +145,7 @@ def main() -> None:
         before[name] = options.work / name
     facts = ", ".join(f"{name} {value}" for name, value in environment().items())
     by = f"Written by `python scripts/real_loops.py`; do not edit. {facts}"
-    head = "# The loop closed by itself on real drones"
+    head = "# Model correction on real drones with default settings"
     write_text(PAGE, "\n".join([head, "", by, "", INTRODUCTION.strip(), "", "\n\n".join(sections), ""]))
 
 

@@ -2,7 +2,7 @@
 
     python scripts/reproduce.py [--real FOLDER] [-o out/paper]
 
-The same as `cfb reproduce all`, which leaves docs alone.
+`cfb reproduce all` does the same without writing into docs.
 """
 
 import argparse
@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def main() -> None:
-    """Reproduce, then copy."""
+    """Reproduce the paper, then write the page and copy the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "out" / "paper")
     parser.add_argument("--real", type=Path)

@@ -1,11 +1,11 @@
-"""Let the signals of good flights contradict each other and see what the gate makes of it; note the result in a page.
+"""Test the check of flights on logs whose signals contradict each other; write the result into a page.
 
     python scripts/semantic_damage.py [FLIGHT...] [-n 20] [-o docs/logs.md] [--unseen]
 
-FLIGHT are recordings of real drones or of anybody's simulator; without any the shipped ones are used. Every
-contradiction of ``tests/logs/contradictions.py`` is put into N of them, spread over what was given; all are read
-undamaged for false alarms. ``--unseen`` says that no threshold was set on these flights, and writes only the sum. Exits
-with status 1 if fewer than 95 % of what shows is noticed, or if an undamaged flight is doubted.
+FLIGHT are recordings of real drones or of any simulator; the default is the shipped flights. Every contradiction of
+``tests/logs/contradictions.py`` is applied to N of them, evenly spread over the list. All are also read undamaged, to
+count false alarms. With ``--unseen``, for flights on which no threshold was chosen, only the totals are written. The
+exit status is 1 if fewer than 95 % of the visible contradictions are noticed, or if there is a false alarm.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cfb_mjx.logs import FlightLog, read_log, validate  # noqa: E402
 
 
 def noticed(log: FlightLog) -> str | None:
-    """What the gate says, or None."""
+    """Return the message of the check, or None."""
     try:
         checked = validate(log, "flight")
     except CfbError as error:
@@ -40,9 +40,9 @@ def main() -> int:
     """Run the study and write the block of the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("flights", nargs="*", type=Path)
-    parser.add_argument("-n", type=int, default=20, help="flights to damage")
+    parser.add_argument("-n", type=int, default=20, help="number of flights to damage")
     parser.add_argument("-o", "--output", type=Path, default=ROOT / "docs" / "logs.md")
-    parser.add_argument("--unseen", action="store_true", help="flights on which no threshold was set")
+    parser.add_argument("--unseen", action="store_true", help="no threshold was chosen on these flights")
     arguments = parser.parse_args()
     paths = arguments.flights or sorted((ROOT / "data" / "flight_logs").glob("*.mcap"))
     logs, alarms = [], []
@@ -57,7 +57,7 @@ def main() -> int:
         else:
             logs.append(log)
     chosen = [logs[i] for i in np.unique(np.linspace(0, len(logs) - 1, arguments.n).round().astype(int))]
-    # Shows, noticed, right advice; noticed though gentle.
+    # Visible, noticed, right advice; noticed although not visible.
     counts: dict[str, list[int]] = defaultdict(lambda: [0, 0, 0, 0])
     for name, contradiction in CONTRADICTIONS.items():
         for log in chosen:

@@ -1,7 +1,9 @@
-"""Make the pictures of docs/viewing.md: a film of the double flip and rerun's viewer on a recording.
+"""Make the images of docs/viewing.md: an animation of the double flip, and Rerun's viewer with a recording.
 
-python scripts/show.py             (a minute; the viewer's picture needs a display, or before the command
-                               xvfb-run -s '-screen 0 4000x3000x24', large so that no pointer is over it)
+python scripts/show.py
+
+Takes a minute. The image of the viewer needs a display. Without one, put `xvfb-run -s '-screen 0 4000x3000x24'` before
+the command; the screen is large so that the pointer is outside the image.
 """
 
 import argparse
@@ -18,14 +20,14 @@ FOLDER = ROOT / "docs" / "viewing"
 
 
 def main() -> None:
-    """Film, then take the picture."""
+    """Write the animation and the image of the viewer."""
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         log, recording, shot = (Path(name) / f for f in ("double-flip.mcap", "double-flip.rrd", "shot.png"))
         assert cfb(["fly", "double-flip", "--log", str(log)]) == 0
         _film(log, FOLDER / "double-flip.gif")
-        # Rotors that give a tenth less than the model thinks: something to see.
+        # A model with a tenth too much thrust, so that the recording shows a difference.
         assert cfb(["view", str(log), "-o", str(recording), "--set", "thrust_scale=1.1,1.1,1.1,1.1"]) == 0
         command = [sys.executable, "-m", "rerun", str(recording), "--screenshot-to", str(shot)]
         subprocess.run([*command, "--window-size", "1400x800"], check=True)

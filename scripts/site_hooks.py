@@ -1,11 +1,11 @@
-"""What the documentation site adds to docs/ while it is built (`hooks` in mkdocs.yml).
+"""Additions to docs/ while the documentation site is built (`hooks` in mkdocs.yml).
 
-- `cli.md` gets the help of every command, as the parsers print it: the page cannot be out of date.
+- `cli.md` gets the help of every command from the parsers, so the page is always up to date.
 - CHANGELOG.md becomes the page `changes.md`.
-- Notebooks become pages as they were executed: text, code, printed output, figures. (mkdocs-jupyter would do it too,
-  with forty more packages and pages that name scripts on other servers.)
-- Lists are indented as Python-Markdown wants them; pages are written for GitHub's rules.
-- Files of the repository that pages link to (``../configs/...``) become part of the site: no link leads out of it.
+- Notebooks become pages with their text, code, output and figures. (mkdocs-jupyter could do this too, but needs forty
+  more packages, and its pages load scripts from other servers.)
+- Lists are indented for Python-Markdown; the pages are written for GitHub.
+- Files of the repository that pages link to (``../configs/...``) become part of the site, so that no link leaves it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mkdocs.structure.files import File
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = "<!-- commands -->"
-"""In `cli.md`, where the commands belong."""
+"""Place of the commands in `cli.md`."""
 NOTEBOOK = re.compile(r"\]\(((?!https?:)[^)#\s]+)\.ipynb\)")
 OUTSIDE = re.compile(r"\]\(((?:\.\./)+[^)#\s]+)((?:#[^)\s]*)?)\)")
 WIDTH = "100"
@@ -45,7 +45,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """Fill in the commands; lead links out of docs/ to the copies."""
+    """Insert the commands; redirect links out of docs/ to the copies of the files."""
     if page.file.src_uri == "cli.md":
         markdown = markdown.replace(COMMANDS, commands())
 
@@ -60,7 +60,7 @@ def on_page_markdown(markdown, page, config, files):
 
 
 def _add_notebook(files, notebook: File, config) -> None:
-    """A page and its figures in place of a notebook, which stays beside it for whoever wants to run it."""
+    """Add the page and the figures of a notebook; the notebook itself stays available for download."""
     name = notebook.src_uri.removesuffix(".ipynb")
     cells = json.loads(Path(notebook.abs_src_path).read_text(encoding="utf-8"))["cells"]
     text, figures = notebook_page(cells, posixpath.basename(name))
@@ -70,7 +70,7 @@ def _add_notebook(files, notebook: File, config) -> None:
 
 
 def notebook_page(cells: list[dict], name: str) -> tuple[str, dict[str, bytes]]:
-    """Markdown of an executed notebook, and its figures by path."""
+    """Return the Markdown of an executed notebook, and its figures by path."""
     parts, figures = [], {}
     for cell in cells:
         source = "".join(cell["source"])
@@ -90,23 +90,23 @@ def notebook_page(cells: list[dict], name: str) -> tuple[str, dict[str, bytes]]:
 
 
 def _outside(page: str, target: str) -> str | None:
-    """Path from the repository's root of what a page links to outside docs/; None if it is inside or not there."""
+    """Return the path from the repository's root of a link target outside docs/; None if inside or not a file."""
     path = posixpath.normpath(posixpath.join("docs", posixpath.dirname(page), target))
     return None if path.startswith(("docs/", "../")) or not (ROOT / path).is_file() else path
 
 
 def _copied(path: str) -> str:
-    """Where the site keeps a file. As text, whatever it is: browsers then show it, and mkdocs does not read it."""
+    """Return the path of a copied file in the site; the suffix makes browsers show it and mkdocs ignore it."""
     return f"files/{path}.txt"
 
 
 def lists(markdown: str) -> str:
-    """Lists by GitHub's rules, made such by Python-Markdown's: four spaces a level, an empty line before the first."""
+    """Convert lists from GitHub's rules to Python-Markdown's: four spaces per level, an empty line before a list."""
     out, fenced, levels = [""], False, []
     for line in markdown.split("\n"):
         text, item = line.lstrip(" "), None if fenced else ITEM.match(line)
         indent = len(line) - len(text)
-        # Within a paragraph GitHub takes only these for the beginning of a list.
+        # Within a paragraph, only these begin a list on GitHub.
         if item and (levels or not out[-1] or text.startswith(("- ", "* ", "1. "))):
             if not levels and out[-1]:
                 out.append("")
@@ -128,7 +128,7 @@ def lists(markdown: str) -> str:
 
 
 def commands() -> str:
-    """The help of every command, as Markdown."""
+    """Return the help of every command, as Markdown."""
     from cfb_mjx.commands import COMMANDS
 
     parts = [f"| command | does |\n|---|---|\n{_rows({name: entry.summary for name, entry in COMMANDS.items()})}"]
@@ -141,7 +141,7 @@ def _rows(summary: dict[str, str]) -> str:
 
 
 def help_of(command: str) -> str:
-    """What ``cfb COMMAND --help`` prints, without colours, for a page of one width."""
+    """Return the output of ``cfb COMMAND --help``, without colours and with a fixed width."""
     from cfb_mjx.cli import main
 
     printed = io.StringIO()

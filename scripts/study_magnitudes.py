@@ -1,9 +1,9 @@
-"""How much randomisation? The paper's study, in simulation, with PPO and with back-propagation.
+"""Repeat the paper's study of the magnitude of randomisation in simulation, with PPO and with back-propagation.
 
     python scripts/study_magnitudes.py [--algorithms analytic ppo ppo-long] [--seeds 3] [--judge-anew | --page-only]
 
-Hours for all of it; what is done is kept in benchmarks/magnitudes-ALGORITHM.json and data/study, and a run begun
-anew goes on. Writes docs/magnitudes.md and its figure.
+The whole study takes hours. Finished trainings are kept in benchmarks/magnitudes-ALGORITHM.json and data/study, so an
+interrupted run continues. Writes docs/magnitudes.md and its figure.
 """
 
 import json
@@ -21,7 +21,7 @@ MAGNITUDES = (0.0, 0.5, 1.0, 1.5)
 
 @dataclass(frozen=True)
 class Trained:
-    """What every magnitude is trained by."""
+    """An algorithm of the study, with the configuration that all magnitudes share."""
 
     title: str
     config: str
@@ -36,13 +36,13 @@ ALGORITHMS = {
 }
 ELSEWHERE = "cfb-idsia"
 OTHERS = (*PAPER_FIRMWARE, "target", "target-analytic")
-"""Controllers beside the study's: the firmware's, and policies that ship, trained longer at magnitude 1."""
+"""Controllers that the same tests compare: the firmware's, and shipped policies trained longer."""
 
 
 def main() -> None:
-    """Train what is missing, judge, write."""
+    """Train the missing policies, evaluate them and write the page."""
     arguments = study_arguments(
-        __doc__, "--algorithms", ALGORITHMS, judge_anew="fly the kept policies again, train nothing"
+        __doc__, "--algorithms", ALGORITHMS, judge_anew="evaluate the stored policies again, without training"
     )
     from cfb_mjx.files import write_json, write_text
 
@@ -59,7 +59,7 @@ def main() -> None:
                 found = json.loads(results.read_text())
                 write_json(results, {n: run | {"score": judged(kept / f"{n}.npz")} for n, run in found.items()})
                 continue
-            # By seed, so that an unfinished study has every magnitude.
+            # Seed by seed, so that an unfinished study covers every magnitude.
             runs = [
                 Run(f"{m:g}-{seed}", by.config, (f"randomisation.magnitude={m}", *by.changes), seed)
                 for seed in range(min(arguments.seeds, by.most_seeds or arguments.seeds))
@@ -77,7 +77,10 @@ def main() -> None:
 
 
 def judge():
-    """Controller, or the name of one, to its score: nominal, randomised, off-nominal drones and one from elsewhere."""
+    """Return the function that scores a controller, or the file or name of one.
+
+    It scores on the nominal, randomised and off-nominal drones, and on the drone of `ELSEWHERE`.
+    """
     import numpy as np
 
     from cfb_mjx.control.controllers import find_controller
@@ -129,11 +132,11 @@ def _of(scores: list[dict]) -> dict[str, list]:
 
 
 def _span(values: list, digits: str) -> str:
-    """Mean of the seeds, and the least and greatest of them."""
+    """Format the mean, least and greatest value of the seeds."""
     there = [v for v in values if v is not None]
-    lost = f", {len(values) - len(there)} lost" if len(there) < len(values) else ""
+    lost = f", {len(values) - len(there)} failed" if len(there) < len(values) else ""
     if not there:
-        return "lost"
+        return "failed"
     if len(there) == 1:
         return format(there[0], digits) + lost
     mean = format(sum(there) / len(there), digits)
@@ -141,14 +144,14 @@ def _span(values: list, digits: str) -> str:
 
 
 def _best(runs: dict, key: str) -> str:
-    """Which magnitude holds some drones best: on the mean of the seeds, and seed by seed."""
+    """Format the magnitude with the least error: for the mean of the seeds, and in brackets for each seed."""
     best, each = _ranked(runs, key)
     return f"{best:g} ({', '.join(f'{m:g}' for m in each)})"
 
 
 def _ranked(runs: dict, key: str) -> tuple[float, list[float]]:
     errors = {m: _of(_scores(runs, m))[key] for m in MAGNITUDES if _scores(runs, m)}
-    # Who loses a drone is worse than who keeps it badly.
+    # A failure ranks behind any error.
     errors = {m: [math.inf if v is None else v for v in values] for m, values in errors.items()}
     best = min(errors, key=lambda m: sum(errors[m]) / len(errors[m]))
     each = zip(*errors.values(), strict=False)
@@ -156,27 +159,27 @@ def _ranked(runs: dict, key: str) -> tuple[float, list[float]]:
 
 
 def _agreement(runs: dict) -> str:
-    """Whether magnitude 1 is best on off-nominal drones, as on the paper's real one."""
+    """Say whether magnitude 1 is best on off-nominal drones, as on the paper's real drone."""
     said = []
     for words, key in (
-        ("in the mean distance", "away"),
-        ("horizontally", "off-nominal horizontal"),
-        ("vertically", "off-nominal vertical"),
+        ("mean distance", "away"),
+        ("horizontal error", "off-nominal horizontal"),
+        ("vertical error", "off-nominal vertical"),
     ):
         best, each = _ranked(runs, key)
         said.append(f"{words} {best:g} ({', '.join(f'{m:g}' for m in each)} by seed)")
     agrees = [_ranked(runs, key)[0] == 1.0 for key in ("away", "off-nominal horizontal", "off-nominal vertical")]
     verdict = "agrees with" if all(agrees) else "does not agree with" if not any(agrees) else "agrees in part with"
-    best = f"Off-nominal drones are held best with magnitude: {'; '.join(said)}."
-    return f"{best} The paper's real one is with 1: this {verdict} it."
+    best = f"Best magnitude on off-nominal drones: {'; '.join(said)}."
+    return f"{best} On the paper's real drone it is 1: the simulation {verdict} it."
 
 
 def _apart(runs: dict) -> list[str]:
-    """Horizontal and vertical error by magnitude, and which magnitude does best in each."""
+    """Table of the horizontal and vertical error by magnitude, and of the best magnitude for each."""
     columns = [f"{where} {axes}" for where in APART for axes in ("horizontal", "vertical")]
     lines = [
         "",
-        "Horizontal (from the vertical through the target) and vertical error apart, mm:",
+        "Horizontal error (distance from the vertical through the target, xy) and vertical error (z), mm:",
         "",
         "| magnitude | "
         + " | ".join(f"{column.replace('horizontal', 'xy').replace('vertical', 'z')}" for column in columns)
@@ -192,33 +195,45 @@ def _apart(runs: dict) -> list[str]:
 
 
 def _settled(runs: dict) -> list[str]:
-    """How much the error that a training judged itself by changed over its second half."""
+    """Say how much the hover error still fell in the second half of each training."""
     changes = {}
     for name, run in runs.items():
-        on, key = "drones of its own", "random_mm"
+        on, key = "randomised drones", "random_mm"
         if key not in run["curve"][-1]:
             on, key = "the nominal drone", "hover_mm"
         half, end = run["curve"][len(run["curve"]) // 2 - 1][key], run["curve"][-1][key]
         changes.setdefault(f"magnitude {name.rpartition('-')[0]} (on {on})", []).append(f"{half:.0f} to {end:.0f}")
     told = "; ".join(f"{which}: {', '.join(texts)}" for which, texts in sorted(changes.items()))
-    return ["", f"How settled: hover error from the middle of each training to its end, mm. {told}."]
+    text = "Convergence: hover error in the middle and at the end of each training, mm (randomised drones have the "
+    return ["", f"{text}training's own magnitude). {told[0].upper()}{told[1:]}."]
 
 
 def page(found: dict, others: dict) -> str:
     """The Markdown page."""
     runs = [run for algorithm in found.values() for run in algorithm.values()]
     lines = [
-        "# How much randomisation",
+        "# How much randomisation to use",
+        "",
+        "This page is for users who choose the magnitude of the randomisation for their own training:",
+        "",
+        "```sh",
+        "cfb train target --set randomisation.magnitude=0.5 -o out/half",
+        "```",
         "",
         facts_line("python scripts/study_magnitudes.py", runs),
         "",
         "The paper trains its position controller with its randomisation scaled by 0, 0.5, 1 and 1.5, flies each on "
-        "the real drone, and finds 1 best. Here the same networks fly in simulation: on the nominal drone, on ten "
-        "drones with effects of the catalogue that no randomisation contains (`configs/plants/off-nominal.yaml`; they "
-        "stand in for the real one), on 512 drones of the paper's full randomisation, and on a drone identified "
-        f"elsewhere (`{ELSEWHERE}`). Hover test of the paper: "
-        "mean distance over the last 5 of 6 s, std of the commands. Mean of the seeds with the least and the greatest; "
-        "over randomised drones the median of those that did not fail. The paper's columns are its real flights.",
+        "the real drone, and finds 1 best. Here networks of the same shape are trained and tested in simulation:",
+        "",
+        "- on the nominal drone;",
+        "- on ten off-nominal drones with effects that no randomisation contains (`configs/plants/off-nominal.yaml`); "
+        "they take the place of the real drone;",
+        "- on 512 drones of the paper's full randomisation;",
+        f"- on a drone that another laboratory identified (`{ELSEWHERE}`).",
+        "",
+        "The test is the paper's hover test: mean distance over the last 5 of 6 s, and the standard deviation of the "
+        "commands (std). Cells give the mean of the seeds [least, greatest]. Values on randomised drones are medians "
+        "over those that did not fail. The paper's columns are its real flights.",
         "",
         "![hover error over magnitude](magnitudes.png)",
     ]
@@ -230,7 +245,7 @@ def page(found: dict, others: dict) -> str:
             f"## {ALGORITHMS[algorithm].title}",
             "",
             f"Configuration `{' '.join((ALGORITHMS[algorithm].config, *ALGORITHMS[algorithm].changes))}`: "
-            f"{last['commands'] / 1e6:.0f} M commands per policy, "
+            f"{last['commands'] / 1e6:.0f} M commands per policy, training time "
             f"{min(r['curve'][-1]['seconds'] for r in of.values()):.0f} to "
             f"{max(r['curve'][-1]['seconds'] for r in of.values()):.0f} s.",
             "",
@@ -257,8 +272,8 @@ def page(found: dict, others: dict) -> str:
         "",
         "## Other controllers, same tests",
         "",
-        "The firmware's, and two policies that ship: `target`, trained by PPO at magnitude 1 for longer and in two "
-        "parts, and `target-analytic`, by back-propagation ([controllers](controllers.md)).",
+        "The firmware's controllers and two shipped policies: `target`, trained by PPO at magnitude 1, longer and in "
+        "two parts, and `target-analytic`, trained by back-propagation ([controllers](controllers.md)).",
         "",
         "| controller | nominal, mm | std | off-nominal, mm | xy | z | std | randomised, mm | failed | paper, mm "
         "| paper, std |",
@@ -277,7 +292,7 @@ def page(found: dict, others: dict) -> str:
             "",
             f"## {ALGORITHMS[algorithm].title}, drone by drone",
             "",
-            "Hover error in mm, mean of the seeds with the least and the greatest.",
+            "Hover error, mm: mean of the seeds [least, greatest].",
             "",
             "| drone | " + " | ".join(f"x {m:g}" for m in MAGNITUDES if _scores(of, m)) + " |",
             "|---|" + "---|" * sum(bool(_scores(of, m)) for m in MAGNITUDES),

@@ -1,4 +1,4 @@
-"""Refit the model to flights: ``cfb fit`` as a script, to copy and change.
+"""Fit the model to flights: ``cfb fit`` as a script, to copy and change.
 
 python scripts/sysid_fit.py LOG... -o model.yaml [--set mass=0.045] [--compare] [--figure fit.png]
 """

@@ -1,8 +1,9 @@
-"""The campaigns of the tracing sweep: plain, mixed, outside the catalogue, clean, and hard ones.
+"""The campaigns of the tracing sweep: single effects, mixtures, effects outside the catalogue, clean and hard drones.
 
     python scripts/tracing_cases.py [--seed 97000]
 
-finds anew how weak an effect must be to buy between an eighth and a third of an error (benchmarks/tracing_mild.json).
+searches for the strengths at which effects cause between an eighth and a third of an error, and writes them to
+benchmarks/tracing_mild.json.
 """
 
 import argparse
@@ -18,14 +19,14 @@ from cfb_mjx.sysid.tracing.fits import ERRORS
 ROOT = Path(__file__).resolve().parents[1]
 MILD = ROOT / "benchmarks" / "tracing_mild.json"
 SEED = 97_000
-"""Of the sweep; the search was developed on others."""
+"""Seed of the sweep; the search for effects was developed on other seeds."""
 WEAK, BESIDE = 0.35, 0.5
 LEAST, MOST = 0.12, 0.30
-"""Share of an error that a mild effect buys."""
+"""Range of the share of an error that a mild effect causes."""
 MIDDLE = 0.2
 SEARCHED, ROUNDS = (1 / 256, 2.0), 7
 WEAKEST = {"motor_second_order": 0.1}
-"""The simulator's step is too long for a shorter second lag."""
+"""Least strength in the search; the step of the simulator is too long for a shorter second lag."""
 
 SINGLE = [name for name in EFFECTS if not name.startswith("outside")]
 SENSORS = [name for name in SINGLE if name.startswith("sensor")]
@@ -46,7 +47,7 @@ MIXTURES = [
     ("motor_second_order", "parasitic_drag"),
     ("thrust_scale", "ground_effect", "rotor_drag"),
 ]
-"""A strong effect and others of half the strength."""
+"""One strong effect and others of half the strength."""
 UNEVEN = [
     ("motor_gain_mismatch", "rotor_drag"),
     ("cog_offset", "inflow_thrust", "battery_sag"),
@@ -59,7 +60,7 @@ UNEVEN = [
     ("blade_flapping", "motor_asymmetry"),
     ("inertia", "thrust_tilt", "parasitic_drag"),
 ]
-"""A strong effect and weak ones."""
+"""One strong effect and weak ones."""
 FAULTY = [
     ("sensor_velocity_scale", "rotor_drag"),
     ("sensor_delay", "motor_gain_mismatch"),
@@ -68,14 +69,14 @@ FAULTY = [
 ]
 """A sensor fault and an effect of half the strength."""
 MANY = (6, 6, 8, 8, 10, 10, 12, 12)
-"""Effects at once, as on real drones: so many, of strengths between these."""
+"""Numbers of simultaneous effects, as on real drones; their strengths are drawn from `STRENGTHS`."""
 STRENGTHS = (0.3, 0.8)
 ALIKE = {"payload": ("thrust_scale", "payload_swing"), "motor_time_constant": ("motor_asymmetry",)}
-"""What no flight tells from these is not drawn beside them."""
+"""Effects that no flight can distinguish from the key; they are not drawn together with it."""
 
 
 def cases(nulls: int, seed: int) -> list[Case]:
-    """Every campaign of the sweep, in an order of no meaning, so that a sweep cut short is a sample of the whole."""
+    """Return every campaign of the sweep, in random order, so that an interrupted sweep is a random sample."""
     found = [Case(f"{name}-strong", seed + i, ((name, 1.0),)) for i, name in enumerate(SINGLE)]
     found += [Case(f"{name}-weak", seed + 100 + i, ((name, WEAK),)) for i, name in enumerate(SINGLE)]
     found += [_mixed("", seed + 200 + i, names, BESIDE) for i, names in enumerate(MIXTURES)]
@@ -89,7 +90,7 @@ def cases(nulls: int, seed: int) -> list[Case]:
 
 
 def hard_cases(seed: int) -> list[Case]:
-    """Mild effects, a strong one with weak ones beside it, sensor faults of several sizes and beside an effect."""
+    """Return the hard cases: mild effects, uneven mixtures, and sensor faults alone and with an effect."""
     mild = json.loads(MILD.read_text())
     found = [_mild(name, seed, mild[name]) for name in PHYSICAL if name in mild]
     found += [_mixed("uneven-", seed + 500 + i, names, WEAK) for i, names in enumerate(UNEVEN)]
@@ -102,7 +103,7 @@ def hard_cases(seed: int) -> list[Case]:
 
 
 def many(name: str, seed: int, count: int) -> Case:
-    """A drone with so many physical effects at once."""
+    """Return a drone with ``count`` physical effects at once."""
     rng = np.random.default_rng([seed, 3000])
     drawn = [str(effect) for effect in rng.permutation(PHYSICAL)]
     drawn = [effect for effect in drawn if not set(ALIKE.get(effect, ())) & set(drawn[:count])][:count]
@@ -110,7 +111,7 @@ def many(name: str, seed: int, count: int) -> Case:
 
 
 def alone(case: Case) -> dict[str, Case]:
-    """The drone of a case with one of its effects at a time, as strong as there."""
+    """Return the drones that have one effect of the case each, with the same strength."""
     return {
         name: Case(f"{case.name}, {name}", case.seed, tuple((n, s if n == name else 0.0) for n, s in case.effects))
         for name, _ in case.effects
@@ -126,12 +127,12 @@ def _mixed(kind: str, seed: int, names: tuple[str, ...], others: float) -> Case:
 
 
 def achievable(before: dict[str, float], perfect: dict[str, float]) -> float:
-    """Largest share by which a perfect model would lower an error."""
+    """Return the largest share by which a perfect model would lower an error."""
     return max(1 - perfect[key] / before[key] for key in ERRORS)
 
 
 def mild_strengths(seed: int) -> dict[str, float]:
-    """Strength of every physical effect that buys a share nearest `MIDDLE`; none where it is not mild then."""
+    """Return the strength at which each physical effect causes a share nearest `MIDDLE` of an error, if it is mild."""
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid.evaluation import evaluate
@@ -141,7 +142,7 @@ def mild_strengths(seed: int) -> dict[str, float]:
     def errors(flown):
         return [evaluate(model, campaign.held_out).metrics("commands_in") for campaign in flown]
 
-    # The same seed and so the same flights without the effect.
+    # The same seed gives the same flights without the effect.
     perfect = errors(fly_campaigns([replace(_mild(name, seed, 1.0), effects=()) for name in PHYSICAL]))
     low = np.log([WEAKEST.get(name, SEARCHED[0]) for name in PHYSICAL])
     high = np.full(len(PHYSICAL), np.log(SEARCHED[1]))

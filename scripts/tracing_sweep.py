@@ -1,12 +1,12 @@
-"""Trace drones of the reference simulator that nobody tuned to, and write docs/tracing.md: confusion, recovered error.
+"""Run `cfb close-loop` on many drones of the reference simulator, and write docs/tracing.md.
 
     python scripts/tracing_sweep.py [--null 100] [--results benchmarks/tracing.jsonl] [--page-only] [--from-end]
     python scripts/tracing_sweep.py --only esc_rate_limit --again
     python scripts/tracing_sweep.py --null 10 --seed 98000 --results benchmarks/tracing-98000.jsonl
 
-The plants (cfb_mjx.reference_simulator) are an independent simulator with effects of other functional forms than the
-catalogue's. Results are kept campaign by campaign: an interrupted sweep goes on where it was. What lies beside
-benchmarks/tracing.jsonl as tracing-SEED.jsonl is the same on other seeds; the page sums it up.
+The drones are those of an independent simulator (cfb_mjx.reference_simulator), whose effects have other functional
+forms than the catalogue's; the search was not tuned on them. Results are stored after every campaign, so an interrupted
+sweep continues. Files benchmarks/tracing-SEED.jsonl are sweeps on other seeds, which the page summarises.
 """
 
 import argparse
@@ -30,11 +30,11 @@ RESULTS = ROOT / "benchmarks" / "tracing.jsonl"
 NULLS = 100
 BATCH = 8
 MATTERS = 0.05
-"""Of many effects at once those must be found that alone buy so much."""
+"""Of many simultaneous effects, those that alone cause at least this share of an error must be found."""
 
 
 def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
-    """Fly, trace and append one line per campaign; those traced before too if ``again``."""
+    """Run the campaigns and append one line each; with ``again``, also those that are done."""
     import jax
 
     from cfb_mjx.model import Quadrotor
@@ -44,20 +44,20 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
     base = load_model_file("cfb-guards")
     declared = Quadrotor.from_file(base)
     while True:
-        # Read anew: another process may be at the other end.
+        # Read the file again, because another process may work from the other end.
         done = traced(results, again)
         rest = [case for case in wanted if case.name not in done]
         batch = rest[-BATCH:] if from_end else rest[:BATCH]
         if not batch:
             return
-        # The same flights without the effect: what the declared model scores there, a perfect one would score here.
+        # The declared model's errors on the same flights without the effect are those of a perfect model.
         twins = [Case(case.name, case.seed, ()) for case in batch if case.effects]
         flown = fly_campaigns(batch + twins)
         perfect = {c.case.name: c for c in flown[len(batch) :]}
         for campaign in flown[: len(batch)]:
             if campaign.case.name in traced(results, again):
                 continue
-            # Programs of every shape met would pile up until the process may map no more memory; they are kept on disk.
+            # Compiled programs would accumulate until the process can map no more memory; they are cached on disk.
             jax.clear_caches()
             began = time.perf_counter()
             outcome = close_loop(campaign.fit, campaign.held_out, base)
@@ -82,7 +82,7 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
                     ones = [evaluate(declared, one.held_out) for one in fly_campaigns(list(each.values()))]
                     before = [_pick(one.metrics("commands_in")) for one in ones]
                     line["alone"] = {n: achievable(b, line["perfect"]) for n, b in zip(each, before, strict=True)}
-            if campaign.case.name in traced(results, again):  # by the other process, meanwhile
+            if campaign.case.name in traced(results, again):  # done by another process in the meantime
                 continue
             with results.open("a") as file:
                 file.write(json.dumps(line, default=float) + "\n")
@@ -91,12 +91,12 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
 
 
 def traced(results: Path, again: bool) -> set[str]:
-    """Names of the campaigns that are done, or done ``again``."""
+    """Return the names of the campaigns that are done, or with ``again`` of those done again."""
     return {line["name"] for line in read(results) if line.get("again") or not again}
 
 
 def read(results: Path) -> list[dict]:
-    """One entry per campaign that is done, the last where it was traced again."""
+    """Return one result per campaign, the last one if it ran several times."""
     lines = [json.loads(line) for line in results.read_text().splitlines()] if results.exists() else []
     return list({line["name"]: line for line in lines}.values())
 
@@ -106,7 +106,7 @@ def _pick(metrics: dict) -> dict:
 
 
 def recovered(line: dict) -> float:
-    """Share of the achievable improvement reached, mean over errors a perfect model lowers by a tenth or more."""
+    """Return the reached share of the achievable improvement, mean over errors that it lowers by a tenth or more."""
     shares = [
         (line["before"][key] - line["after"][key]) / (line["before"][key] - line["perfect"][key])
         for key in ERRORS
@@ -116,7 +116,7 @@ def recovered(line: dict) -> float:
 
 
 def page(results: Path, planned: int, again: dict[str, Path]) -> str:
-    """The page, from the results of so many planned campaigns, and those of other seeds."""
+    """Return the page, from the results of ``planned`` campaigns and of sweeps on other seeds (``again``)."""
     lines = read(results)
     _, outside, single, mixed = _sorts(lines)
     text = [
@@ -125,23 +125,40 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
         "Written by `python scripts/tracing_sweep.py`; do not edit. "
         + ", ".join(f"{name} {value}" for name, value in environment().items()),
         "",
+        "This page says how often `cfb close-loop` names the right effect, and how much of the error it removes. Read",
+        "it to judge how far you can trust a report. To measure it again (this takes hours):",
+        "",
+        "```sh",
+        "python scripts/tracing_sweep.py",
+        "```",
+        "",
         f"All {planned} campaigns of the sweep have been traced."
         if len(lines) == planned
-        else f"{len(lines)} of {planned} campaigns of the sweep have been traced so far, in an order of no meaning; "
-        "the command goes on with the rest.",
+        else f"{len(lines)} of {planned} campaigns of the sweep have been traced so far, in random order; the command "
+        "continues with the rest.",
         *_traced_by(lines),
         *_traced_again(lines),
         "",
-        "Campaigns of 10 to 11 flights by an independent simulator (`cfb_mjx.reference_simulator`, NumPy, closed loop)",
-        "whose effects have other functional forms than the catalogue's. The search was developed on other seeds.",
-        "*Buys* is the largest share by which a perfect model would lower one of eight held-out errors (position,",
-        "velocity, attitude, rate; 0.2 and 0.5 s), measured on the same flights flown without the effect; *recovered*",
-        "is the share of that improvement the corrected model reaches.",
+        "A campaign is 10 to 11 flights of one drone in an independent simulator (`cfb_mjx.reference_simulator`,",
+        "NumPy, with feedback control). The simulator's effects have other functional forms than the catalogue's, and",
+        "the search was developed on other seeds.",
+        "",
+        "| term | meaning |",
+        "|---|---|",
+        "| strong, weak | strength 1, strength 0.35 |",
+        "| strongest right | the first effect of the report is present |",
+        "| every effect found | all effects that are present are reported; of six to twelve effects those that alone "
+        f"buy {MATTERS:.0%} or more |",
+        "| wrong names | reported effects that are not present |",
+        "| buys | largest share by which a perfect model would lower one of eight held-out errors (position, velocity, "
+        "attitude, rate; 0.2 and 0.5 s), measured on the same flights flown without the effect |",
+        "| recovered | share of that improvement that the corrected model reaches, mean over the errors that a perfect "
+        "model would lower by a tenth or more; nan: there is none |",
         "",
         *_summary(lines),
         *_of_many(lines),
         "",
-        "## What was found for what was there (single effects)",
+        "## Single effects",
         "",
         "| effect | strength | buys | found | recovered | unexplained |",
         "|---|---|---|---|---|---|",
@@ -156,41 +173,44 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
         "|---|---|---|---|---|---|",
     ]
     text += [_detail(line, ", ".join(line["labels"])) for line in mixed if not _many(line)]
-    text += ["", "## Confusion (strong and weak single effects)", "", *_confusion(single)]
+    text += ["", "## Confusion matrix (single effects)", "", *_confusion(single)]
     for seed, path in again.items():
         lines = read(path)
-        text += ["", f"## Again: {len(lines)} campaigns on seed {seed}", ""]
+        text += ["", f"## Second sweep: {len(lines)} campaigns on seed {seed}", ""]
         text += [
-            "Traced after the above by the same configuration. What is not as it should be there may have led to",
-            "changes since (CHANGELOG.md); it is not traced anew, for a change is not judged by what it was made for.",
+            "These campaigns were traced after those above with the same configuration. Their failures may have led to",
+            "changes since (CHANGELOG.md). They are not traced again: a change must not be judged by the cases it was",
+            "made for.",
             "",
             *_summary(lines),
         ]
-        text += ["", "Not as it should be there:", "", "| there | strengths | buys | found | recovered | unexplained |"]
+        text += ["", "Campaigns with a wrong result:", ""]
+        text += ["| campaign | strengths | buys | found | recovered | unexplained |"]
         text += ["|---|---|---|---|---|---|", *(_detail(x, x["name"]) for x in lines if not _right(x))]
     return "\n".join([*text, ""])
 
 
 def _traced_by(lines: list[dict]) -> list[str]:
-    """Which versions of the search traced how many."""
+    """Say how many campaigns each version of the library ran."""
     counts = Counter(line.get("version", "0.1.0") for line in lines)
-    return ["Traced by " + ", ".join(f"cfb_mjx {version}: {count}" for version, count in sorted(counts.items())) + "."]
+    told = ", ".join(f"cfb_mjx {version}: {count}" for version, count in sorted(counts.items()))
+    return [f"Campaigns by version: {told}."]
 
 
 def _traced_again(lines: list[dict]) -> list[str]:
     names = sorted(line["name"] for line in lines if line.get("again"))
-    return [f"Once more after a change of the search (CHANGELOG.md): {', '.join(names)}."] if names else []
+    return [f"Traced again after a change of the search (CHANGELOG.md): {', '.join(names)}."] if names else []
 
 
 def _sorts(lines: list[dict]) -> tuple[list[dict], list[dict], list[dict], list[dict]]:
-    """Campaigns of clean drones, of what the catalogue lacks, of one effect and of more."""
+    """Sort campaigns: clean drones, effects outside the catalogue, single effects, several effects."""
     outside = [line for line in lines if "outside" in line["labels"]]
     single = [line for line in lines if len(line["labels"]) == 1 and line not in outside]
     return [x for x in lines if not x["labels"]], outside, single, [x for x in lines if len(x["labels"]) > 1]
 
 
 def _right(line: dict) -> bool:
-    """Whether all that was there was found, and nothing else."""
+    """Whether exactly the effects that are present were found."""
     outside = line["labels"] == ["outside"]
     names = {item["name"] for item in line["found"]}
     if _many(line):
@@ -199,7 +219,7 @@ def _right(line: dict) -> bool:
 
 
 def _summary(lines: list[dict]) -> list[str]:
-    """How often the search was right, kind by kind."""
+    """Return the table of how often the search was right, by kind of campaign."""
     clean, outside, single, mixed = _sorts(lines)
     text = [
         "| kind | campaigns | strongest right | every effect found | wrong names | recovered, mean | median | least |",
@@ -220,17 +240,17 @@ def _summary(lines: list[dict]) -> list[str]:
     for name, group in groups.items():
         if group:
             text.append(f"| {name} | {len(group)} | {_row(group)} |")
-    # An empty list of formulas is a flag too: lines in the spectrum no formula describes.
+    # An empty list of formulas is also a flag: lines in the spectrum that no formula describes.
     wrong = sum(bool(line["found"]) or line["unexplained"] is not None for line in clean)
     flagged = sum(line["unexplained"] is not None for line in outside)
     false_flags = sum(line["unexplained"] is not None for line in single + mixed)
     return [
         *text,
         "",
-        f"**Clean drones**: {wrong} of {len(clean)} campaigns reported anything.",
-        f"**Outside the catalogue**: {flagged} of {len(outside)} flagged as unexplained; {false_flags} of "
+        f"**Clean drones** (no effect present): {wrong} of {len(clean)} campaigns reported anything.",
+        f"**Effects outside the catalogue**: {flagged} of {len(outside)} flagged as unexplained; {false_flags} of "
         f"{len(single + mixed)} campaigns with effects of the catalogue were flagged too.",
-        f"**Time**: median {np.median([x['seconds'] for x in lines]):.0f} s a campaign, longest "
+        f"**Time**: median {np.median([x['seconds'] for x in lines]):.0f} s per campaign, longest "
         f"{max(x['seconds'] for x in lines):.0f} s.",
     ]
 
@@ -244,12 +264,12 @@ def _many(line: dict) -> bool:
 
 
 def _expected(line: dict) -> set[str]:
-    """What must be found: everything there, of many effects what matters."""
+    """Return the effects that must be found: all, or of many simultaneous ones those that matter."""
     return {name for name in line["labels"] if line.get("alone", {}).get(name, 1.0) >= MATTERS}
 
 
 def _of_many(lines: list[dict]) -> list[str]:
-    """Drones with many effects, one by one."""
+    """Return the table of the drones with many effects."""
     many = [line for line in lines if _many(line)]
     if not many:
         return []
@@ -257,7 +277,7 @@ def _of_many(lines: list[dict]) -> list[str]:
         "",
         "## Six to twelve effects at once",
         "",
-        "As real drones have them. In brackets what an effect buys on a drone that has it alone.",
+        "Real drones have many effects at once. In brackets: what an effect buys on a drone that has it alone.",
         "",
         "| drone | found | missed | wrong names | recovered | unexplained |",
         "|---|---|---|---|---:|---|",
@@ -309,7 +329,7 @@ def _confusion(single: list[dict]) -> list[str]:
     for line in single:
         table[line["labels"][0]][_strongest(line)["name"] if line["found"] else "nothing"] += 1
     columns = sorted({name for row in table.values() for name in row})
-    out = ["| there \\ strongest reported | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
+    out = ["| present \\ reported first | " + " | ".join(columns) + " |", "|---" * (len(columns) + 1) + "|"]
     out += [
         f"| {name} | " + " | ".join(str(row[c] or "") for c in columns) + " |" for name, row in sorted(table.items())
     ]
@@ -317,15 +337,19 @@ def _confusion(single: list[dict]) -> list[str]:
 
 
 def main() -> None:
-    """Run what is missing, then write the page."""
+    """Run the missing campaigns, then write the page."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--null", type=int, default=NULLS)
     parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--only", default="", help="campaigns whose name contains this")
+    parser.add_argument("--only", default="", help="only campaigns whose name contains this")
     parser.add_argument("--results", type=Path, default=RESULTS)
-    parser.add_argument("--again", action="store_true", help="after a change: also those that are done, once more")
+    parser.add_argument(
+        "--again", action="store_true", help="also repeat campaigns that are done, after a change of the search"
+    )
     parser.add_argument("--page-only", action="store_true")
-    parser.add_argument("--from-end", action="store_true", help="begin at the other end: two processes share a sweep")
+    parser.add_argument(
+        "--from-end", action="store_true", help="start from the other end, so that two processes share a sweep"
+    )
     arguments = parser.parse_args()
     configure_jax(x64=True)
     planned = cases(arguments.null, arguments.seed)

@@ -2,7 +2,7 @@
 
     python scripts/train_ppo.py out/ppo [--config target] [--set KEY=VALUE ...] [--resume]
 
-Run it again with --resume after an interruption; it ends with the same policy.
+After an interruption, run it again with --resume. It ends with the same policy.
 """
 
 import argparse
@@ -13,12 +13,12 @@ from cfb_mjx.runtime import configure_jax, environment
 
 
 def main() -> None:
-    """Train, printing a line per checkpoint."""
+    """Train, and print a line at every checkpoint."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", type=Path, help="folder for policy.npz, curve.csv and the checkpoint")
     parser.add_argument("--config", default="target", help="a shipped training or a YAML file")
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="changes to the configuration")
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in the folder")
+    parser.add_argument("--resume", action="store_true", help="continue from the checkpoint in the folder")
     arguments = parser.parse_args()
     configure_jax(x64=False)
     from cfb_mjx.train.config import load_config

@@ -1,4 +1,4 @@
-"""The ``cfb`` command: which command is asked for, what becomes of its faults, and the list of all of them."""
+"""Entry point of ``cfb``: it selects the command, and turns each error into one sentence and an exit status."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from cfb_mjx.terminal import shown
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Entry point.
+    """Run one ``cfb`` command line and return its exit status.
 
-    Exit status: 0 done, 1 a fault in the library, 2 bad input, 3 another process of several gone, 130 interrupted.
+    0: success. 1: an error in the library. 2: bad input. 3: another process of a training over several processes is
+    gone. 130: interrupted.
     """
     set_up_xla()
     try:
@@ -32,7 +33,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         return _fail("interrupted; earlier results are as they were.", 130)
     except BrokenPipeError:
-        # The reader of our output has gone (`cfb ... | head`); say nothing, and nothing at exit either.
+        # The reader of the output has closed it (`cfb ... | head`): print no error, neither now nor at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
@@ -46,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 @contextmanager
 def unusual_said_once() -> Iterator[None]:
-    """Print every `CfbWarning` once, as a sentence on standard error; others go where they went."""
+    """Print every `CfbWarning` once, as one sentence on standard error. Other warnings are shown as before."""
     said, before = set(), warnings.showwarning
 
     def show(message, category, *where, **more):
@@ -78,7 +79,7 @@ def _dispatch(arguments: list[str]) -> int:
         print(install(*rest[:1] or [os.path.basename(os.environ.get("SHELL", ""))]))
         return 0
     if name not in COMMANDS:
-        raise CfbError(f"there is no command {name!r}; the commands are {', '.join(COMMANDS)}.")
+        raise CfbError(f"unknown command {name!r}; the commands are {', '.join(COMMANDS)}.")
     from cfb_mjx.commands.line import run_line
 
     return run_line(name, rest)
@@ -90,7 +91,7 @@ def _help() -> str:
     return (
         f"usage: cfb COMMAND ...\n\nCrazyflie Brushless: simulate, identify, train. cfb_mjx {__version__}\n\n"
         f"commands:\n{rows}\n\n"
-        "'cfb help COMMAND' explains a command; 'cfb --install-completion bash' (zsh, fish) completes lines."
+        "'cfb help COMMAND' explains a command. 'cfb --install-completion bash' (or zsh, fish) installs completion."
     )
 
 

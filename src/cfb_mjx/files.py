@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from hashlib import sha256
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from cfb_mjx import __version__
 from cfb_mjx.errors import CfbError
@@ -220,6 +220,7 @@ def require_folder(*paths: str | os.PathLike | None) -> None:
 
 
 FIGURES = (".svg", ".png", ".pdf")
+VectorFormat = Literal["pdf", "svg"]
 """Formats that figures are written in."""
 
 

@@ -141,7 +141,7 @@ def test_every_drone_of_a_set_is_flown(cfb, tmp_path):
         (["fly", "nobody.npz"], "nobody.npz: there is no such file"),
         (["fly", "pid", "--plants", "0"], "at least one drone"),
         (["fly", "pid", "--model", "nothing"], "nothing: no such model"),
-        (["fly", "pid", "--task", "flip"], "pid: is no flip policy"),
+        (["fly", "pid", "--task", "flip"], "pid: is not a flip policy"),
         (["fly", "flip", "--task", "hover"], "cannot fly --task hover"),
         (["fly", "target", "--set", "climb_s=1"], "are for flips"),
         (["fly", "flip", "--knobs", "double-flip"], "turn 2 times"),

@@ -101,7 +101,7 @@ def test_plants_say_nothing_and_unknown_kinds_are_refused(tmp_path):
         (["--effects", "rotor_drag", "--weight", "square=2"], ["no flight", "square"]),
         (["--effects", "rotor_drag", "--predictor", "--estimator", "innovations"], ["--predictor"]),
         (["--effects", "rotor_drag", "--weight", "drag=2", "--estimator", "innovations"], ["--weight"]),
-        (["--effects", "rotor_drag", "--held-out", str(LOG)], ["drag.mcap", "judged on what it was fitted to"]),
+        (["--effects", "rotor_drag", "--held-out", str(LOG)], ["drag.mcap", "evaluated on flights it was fitted to"]),
     ],
 )
 def test_bad_requests_are_refused(cfb, tmp_path, arguments, needles):

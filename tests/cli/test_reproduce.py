@@ -13,10 +13,10 @@ from cfb_mjx.reproduce.item import Item, Result, Row, write_csv
 
 
 def test_what_is_asked_for_is_made_and_nothing_else(cfb, tmp_path):
-    done = cfb("reproduce", "rotor-curves", "parameters", "-o", tmp_path / "paper")
+    done = cfb("reproduce", "rotor-curves", "parameters", "--format", "pdf", "-o", tmp_path / "paper")
     assert done.returncode == 0, done.stderr
     names = {path.name for path in (tmp_path / "paper").iterdir()}
-    made = {"parameters.csv", "rotor-curves.csv", "rotor-curves.png"}
+    made = {"parameters.csv", "rotor-curves.csv", "rotor-curves.png", "rotor-curves.pdf"}
     assert names == {"index.html", "paper.md", "paper.json", *made}
     rows = json.loads((tmp_path / "paper" / "paper.json").read_text())["rows"]
     assert list(rows) == ["parameters", "rotor-curves"]  # in the paper's order, whatever was typed
@@ -85,7 +85,7 @@ def test_a_run_stopped_at_the_third_item_shows_two_and_goes_on_with_the_third(it
     stopped.clear()
     assert cli.main(arguments) == 0
     assert made == ["one", "two", "three"]
-    assert "going on with the rest" in capsys.readouterr().err
+    assert "continuing with the rest" in capsys.readouterr().err
     continued = {name: (tmp_path / name).read_bytes() for name in ("index.html", "paper.md", "paper.json")}
     assert b"Not made yet" not in continued["index.html"]
     # One that came to its end is made anew, and comes out the same.
@@ -131,10 +131,13 @@ def test_an_item_that_fails_leaves_its_own_figures_as_they_were(items, tmp_path,
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["all", "--flights", "."], "--flights: name what they are for, of brushed, hover-to-forward, yaw-disturbance"),
-        (["brushed", "yaw-disturbance", "--flights", "."], "brushed alone"),
-        (["parameters", "--flights", "."], "name what they are for"),
-        (["brushed", "--mass", "0.03"], "--mass is of the drone of --flights"),
+        (
+            ["all", "--flights", "."],
+            "--flights: name the items that use them, of brushed, hover-to-forward, yaw-disturbance",
+        ),
+        (["brushed", "yaw-disturbance", "--flights", "."], "name brushed alone"),
+        (["parameters", "--flights", "."], "name the items that use them"),
+        (["brushed", "--mass", "0.03"], "--mass is the mass of the drone of --flights"),
         (["brushed", "--flights", ".", "--mass", "34.7"], "--mass 34.7: must be in kg"),
         (["brushed", "--flights", "nowhere"], "nowhere: there is no such folder"),
         (["brushed", "--flights", "."], "holds no flight logs"),

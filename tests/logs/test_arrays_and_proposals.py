@@ -64,9 +64,7 @@ def test_a_mapping_is_proposed_and_reads_the_flight(flight, tmp_path, name):
     path = tmp_path / "mine.csv"
     rows = np.stack(list(columns.values()), axis=1)
     path.write_text("\n".join([",".join(columns), *(",".join(repr(float(x)) for x in row) for row in rows), ""]))
-    with pytest.raises(
-        UnknownNames, match=r"mine\.csv: its columns have names of their own, .*--mapping FILE"
-    ) as error:
+    with pytest.raises(UnknownNames, match=r"mine\.csv: its columns have unknown names, .*--mapping FILE") as error:
         read_log(path)
     proposed = tmp_path / "mine.yaml"
     proposed.write_text(error.value.mapping)

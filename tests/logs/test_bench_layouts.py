@@ -74,7 +74,7 @@ def test_how_many_rotors(tmp_path):
     (table,), _ = read(tmp_path, alone, rotors=4)
     assert np.allclose(table.force, KF * SPEED**2)
     parts, notes = read(tmp_path, vehicle())
-    assert any("is what 4 rotors give together" in n for n in notes)
+    assert any("is the sum of 4 rotors" in n for n in notes)
     parts, _ = read(tmp_path, vehicle(), rotors=1)
     assert np.allclose(parts[-1].force, 4 * KF * parts[-1].rotor_speed ** 2, rtol=1e-3)
 
@@ -163,7 +163,7 @@ def test_readings_that_are_counted_double_at_a_command_that_is_held(tmp_path):
     columns = {"pwm": 65535 * u, "vbat[V]": 3.7} | {f"rpm{i}": wrong[:, i - 1] * RPM for i in (1, 2, 3, 4)}
     (points,), notes = read(tmp_path, columns)
     assert np.allclose(points.rotor_speed, speed)
-    assert any("80 of 320 readings of speed are far from what most" in n for n in notes)
+    assert any("80 of 320 readings of speed differ strongly from most others" in n for n in notes)
 
 
 def test_sensors_that_count_blades_twice(tmp_path):
@@ -222,11 +222,11 @@ def test_a_stand_that_counts_a_pull_as_negative(tmp_path):
     parts, notes = read(tmp_path, RC | {"Thrust (gf)": -GRAMS / 4})
     table = points_and_map(parts)[1]
     assert np.allclose(table.force, KF * table.rotor_speed**2, rtol=1e-3)
-    assert any("counts a pull as negative" in n for n in notes)
+    assert any("falls with speed; its sign was changed" in n for n in notes)
 
 
 def test_a_rotor_of_another_size_is_refused_for_its_size(tmp_path):
-    with pytest.raises(CfbError, match=r"Thrust \(N\) comes to 18 N a rotor, more than any of a Crazyflie"):
+    with pytest.raises(CfbError, match=r"Thrust \(N\) comes to 18 N per rotor, more than any rotor of a Crazyflie"):
         read(tmp_path, {k: v for k, v in RC.items() if "gf" not in k} | {"Thrust (N)": 18 * U / U.max()})
 
 
@@ -244,7 +244,7 @@ def test_a_clock_that_stands_at_first(tmp_path):
     (record,) = [p for p in parts if isinstance(p, MotorRecord)]
     assert len(record.time) in (76, 77)  # one more row where its command belongs to the row before
     assert any("3 rows whose time does not go on" in n for n in notes)
-    assert any("in no row do speed and Thrust (gf) stand still together" in n for n in notes)
+    assert any("in no row are both speed and Thrust (gf) steady" in n for n in notes)
     with pytest.raises(CfbError, match="t does not increase"):
         read(tmp_path, {"Time (s)": 0.02 * (np.arange(80) % 20)} | RC)
 

@@ -148,7 +148,7 @@ def test_compressed_quaternion_needs_doubles(flight, path, tmp_path):
         if doubles:
             assert np.abs(read_log(path, topics_yaml=file).quaternion - flight.quaternion).max() < 1.3e-3
         else:
-            with pytest.raises(CfbError, match=r"quaternion \(missing .*stateEstimateZ.quat travelled as float32"):
+            with pytest.raises(CfbError, match=r"quaternion \(missing .*stateEstimateZ.quat was sent as float32"):
                 read_log(path, topics_yaml=file)
 
 

@@ -114,7 +114,7 @@ def test_markers_taken_for_others_are_left_out_and_what_is_lost_is_a_gap(flown, 
         assert not np.any((log.time > start) & (log.time < stop))
     assert off(log, flown)[2] < 4e-3
     (note,) = [n for n in log.metadata["notes"] if "motion capture" in n]
-    assert "60 that turn otherwise than the gyro left out" in note
+    assert "60 that turn differently from the gyro left out" in note
 
 
 def test_what_has_none_is_refused(flown, tmp_path, capsys):

@@ -207,10 +207,10 @@ def test_two_drones_in_one_table(flight, path):
             f"{drone}/{name}": values + shift * (name == "stateEstimate.x") for name, values in firmware(flight).items()
         }
     table(path, columns)
-    with pytest.raises(CfbError, match=r"several drones \(cf1, cf2\); say whose with --robot cf1"):
+    with pytest.raises(CfbError, match=r"several drones \(cf1, cf2\); choose one with --robot cf1"):
         read_log(path)
     assert np.abs(read_log(path, robot="cf2").position - flight.position - [1.0, 0.0, 0.0]).max() < 1e-9
-    with pytest.raises(CfbError, match="has no columns of cf7; they are those of cf1, cf2"):
+    with pytest.raises(CfbError, match="has no columns of cf7, only those of cf1, cf2"):
         read_log(path, robot="cf7")
 
 

@@ -105,7 +105,7 @@ def test_missing_cell_is_named(short, path, tmp_path):
 def test_unreadable_files(short, path, tmp_path):
     with pytest.raises(CfbError, match="there is no such file"):
         read_log(tmp_path / "nothing.parquet")
-    with pytest.raises(CfbError, match="this is a folder and not one of a ROS 2 bag"):
+    with pytest.raises(CfbError, match="this is a folder, but not the folder of a ROS 2 bag"):
         read_log(tmp_path)
     path.write_bytes(b"")
     with pytest.raises(CfbError, match="the file is empty"):

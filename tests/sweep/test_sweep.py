@@ -149,7 +149,7 @@ def test_a_sweep_goes_on_after_its_driver_died_and_past_a_bad_task(start):
     assert "already" in err
     *_, last = err.splitlines()
     assert last.startswith("cfb: 1 of 11 tasks failed; model=no-such-model: no-such-model: no such model")
-    assert last.endswith("out/failed says why for each, and the same command tries them again.")
+    assert last.endswith("all reasons are in out/failed; run the same command again to retry.")
     assert "Traceback" not in err
     assert Path("out/failed/model=no-such-model.txt").read_text().startswith("no-such-model: no such model")
     assert "results: out/results.csv" in out
@@ -167,7 +167,7 @@ def test_a_sweep_that_is_stopped_says_so_and_leaves_no_worker(start, kill, how):
     assert driver.returncode == 130, err
     *_, told, last = err.splitlines()
     assert told.startswith("... stopped with ")
-    assert told.endswith(" of 40 tasks done; the same command goes on from here")
+    assert told.endswith(" of 40 tasks done; run the same command again to continue")
     assert last == "cfb: interrupted; earlier results are as they were."
     end = time.monotonic() + 20
     while alive(worker) and time.monotonic() < end:

@@ -76,7 +76,8 @@ def test_another_training_is_not_gone_on_with(sweep):
 def test_results_of_no_task_any_more_are_left_alone(sweep):
     land("seed=7", "cfb fly pid --seed 7 --json result.json")
     _, said = sweep()
-    assert "1 results in out/done are of no task any more (seed=7 ...)" in said.replace(str(Path.cwd()) + "/", "")
+    said = said.replace(str(Path.cwd()) + "/", "")
+    assert "1 results in out/done belong to no task of this sweep (seed=7 ...)" in said
     assert Path("out/done/seed=7/result.json").exists()
 
 

@@ -61,7 +61,8 @@ def test_a_search_of_something_else_is_kept_aside_and_said(tmp_path, nothing, lo
                 patched.setattr(checkpoint, "code_identity", lambda: "0.0.0")
             opened = Checkpoint.open(path, flights, model, said.append)
         assert opened.restore(nothing) is None
-        assert f"was interrupted with other {what}: beginning anew; it is kept as search.json.old" in said.pop()
+        why = f"was interrupted with different {what}: starting again; the old file is kept as search.json.old"
+        assert why in said.pop()
         assert not path.exists()
         assert (tmp_path / "search.json.old").read_text() == kept
 
@@ -71,7 +72,7 @@ def test_a_file_that_is_no_search_is_kept_aside_and_said(tmp_path, nothing, logs
     said, path = [], tmp_path / "search.json"
     path.write_text(text)
     assert Checkpoint.open(path, logs, load_model_file("cfb"), said.append).restore(nothing) is None
-    assert "cannot be read: beginning anew" in said[0]
+    assert "cannot be read: starting again" in said[0]
     assert (tmp_path / "search.json.old").read_text() == text
 
 

@@ -60,7 +60,7 @@ def test_what_cannot_be_told_by_flying_is_refused(names, said):
     [
         ("separate --between wind,payload --rate-limit 6 --repetitions 3", "leave out --rate-limit, --repetitions"),
         ("separate --between wind,payload --parameters inertia", "leave out --parameters"),
-        ("roll-pitch --between wind,payload", "roll-pitch tells no effects apart"),
+        ("roll-pitch --between wind,payload", "roll-pitch does not use --between"),
     ],
 )
 def test_options_that_would_be_ignored_are_refused(command, said, tmp_path, capsys):

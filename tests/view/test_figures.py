@@ -13,7 +13,7 @@ import pytest
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.sysid import evaluate
-from cfb_mjx.view import Section, html_page, prediction_figure, spread_figure
+from cfb_mjx.view import Section, html_page, prediction_figure, spread_figure, style
 from cfb_mjx.view.prediction import euler_deg
 from cfb_mjx.view.spread import tilt_deg
 from tests.simulated_log import simulated_log
@@ -61,6 +61,21 @@ def test_svg_is_wellformed_and_reproducible(tmp_path):
     text = "".join(ElementTree.parse(tmp_path / "a.svg").getroot().itertext())
     for expected in ("50 drones", "tilt, deg", "position z, m", "time, s", "5 to 95 %", "measured"):
         assert expected in text
+
+
+@pytest.mark.parametrize(("form", "begin"), [("pdf", b"%PDF"), ("svg", b"<?xml")])
+def test_vector_copies_lie_beside_the_figure_or_in_a_folder(tmp_path, form, begin):
+    figure, elsewhere = style.new_figure(2, 1), tmp_path / "figures"
+    elsewhere.mkdir()
+    with style.with_vector_copies(form):
+        style.save(figure, tmp_path / "a.png")
+        style.save(figure, tmp_path / f"b.{form}")
+        with style.with_vector_copies(form, elsewhere):
+            style.save(figure, tmp_path / "c.png")
+    style.save(figure, tmp_path / "d.png")
+    found = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")}
+    assert found == {"a.png", f"a.{form}", f"b.{form}", "c.png", f"figures/c.{form}", "d.png"}
+    assert (tmp_path / f"a.{form}").read_bytes().startswith(begin)
 
 
 def test_bad_requests_are_refused(evaluation, tmp_path):

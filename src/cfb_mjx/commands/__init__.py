@@ -1,11 +1,11 @@
-"""The commands of ``cfb`` as objects::
+"""The commands of ``cfb`` as Python classes::
 
     from cfb_mjx.commands import Evaluate
     evaluated = Evaluate("flight.mcap", model="cfb").run()
     print(evaluated)
 
-A command is a frozen dataclass of its arguments; ``run()`` does it and returns what was found. The classes are imported
-on first use: help and typing errors answer without loading anything.
+A command is a frozen dataclass of its arguments; ``run()`` executes it and returns a `Result`. The classes are imported
+on first use, so that ``cfb --help`` and a misspelt command name load nothing else.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ if TYPE_CHECKING:
 
 
 class Entry(NamedTuple):
-    """What is known of a command without loading it."""
+    """What is known about a command before its class is imported."""
 
     place: str
-    """Module and class."""
+    """Module and class, ``module.Class``."""
     summary: str
     examples: tuple[str, ...]
 
@@ -53,17 +53,17 @@ COMMANDS = {
     ),
     "check": Entry(
         "check.Check",
-        "say what recordings hold, whether their signals agree, what they are good for",
+        "report what recordings contain, whether their signals agree, and their uses",
         ("cfb check flight.mcap", "cfb check *.csv -o out/check --json check.json"),
     ),
     "evaluate": Entry(
         "evaluate.Evaluate",
-        "measure how well a model predicts flights, open loop",
+        "measure how well a model predicts flights in open loop",
         ("cfb evaluate flight.mcap", "cfb evaluate a.mcap b.mcap --model cfb --json errors.json --figure errors.png"),
     ),
     "benchmark-nanodrone": Entry(
         "benchmark_nanodrone.BenchmarkNanodrone",
-        "judge a model by the rules of the IDSIA nano-drone benchmark",
+        "evaluate a model by the rules of the IDSIA nano-drone benchmark",
         (
             "cfb benchmark-nanodrone data/real/processed --official",
             "cfb benchmark-nanodrone flights --model my_drone.yaml --json nanodrone.json",
@@ -71,7 +71,7 @@ COMMANDS = {
     ),
     "fit": Entry(
         "fit.Fit",
-        "refit the model to flights, with uncertainty",
+        "fit the parameters of a model to flights, with uncertainty",
         (
             "cfb fit flight.mcap -o my_drone.yaml --set mass=0.042",
             "cfb fit a.mcap b.mcap -o my_drone.yaml --held-out c.mcap --parameters inertia,motor --figure fit.png",
@@ -79,7 +79,7 @@ COMMANDS = {
     ),
     "fit-rotors": Entry(
         "fit_rotors.FitRotors",
-        "fit motors and rotor maps, from flights or a bench",
+        "fit motors, thrust and torque curves to flights or bench measurements",
         (
             "cfb fit-rotors thrust_stand.csv -o my_rotors.yaml",
             "cfb fit-rotors steps.csv flight.mcap -o my_rotors.yaml --per-motor --figure rotors.png",
@@ -87,7 +87,7 @@ COMMANDS = {
     ),
     "excite": Entry(
         "excite.Excite",
-        "design a manoeuvre that identifies the drone, and predict what a fit will know",
+        "design a manoeuvre that identifies the drone, and predict the fit's uncertainty",
         (
             "cfb excite roll-pitch -o out/roll-pitch",
             "cfb excite separate -o out/separate --between wind,cog_offset --model out/loop/model.yaml",
@@ -95,7 +95,7 @@ COMMANDS = {
     ),
     "close-loop": Entry(
         "close_loop.CloseLoop",
-        "find the physical effect a model lacks, and add it",
+        "find the physical effects a model lacks, and correct the model",
         (
             "cfb close-loop --fit a.mcap b.mcap --held-out c.mcap -o out/loop",
             "cfb close-loop --fit a.mcap b.mcap --held-out c.mcap -o out/loop --model my_drone.yaml --set mass=0.042",
@@ -103,7 +103,7 @@ COMMANDS = {
     ),
     "refine": Entry(
         "refine.Refine",
-        "fit the numbers of named effects, to innovations or to predictions",
+        "fit the parameters of effects that you name",
         (
             "cfb refine a.mcap b.mcap -o refined.yaml --effects rotor_drag,wind",
             "cfb refine a.mcap -o refined.yaml --effects plant --held-out b.mcap --json refined.json",
@@ -111,7 +111,7 @@ COMMANDS = {
     ),
     "train": Entry(
         "train.Train",
-        "train a controller, by PPO or by back-propagation through the model",
+        "train a controller with PPO or by back-propagation through the model",
         (
             "cfb train target -o out/target --config quick",
             "cfb train target -o out/target --model my_drone.yaml --set randomisation.magnitude=0.5 --seed 1",
@@ -119,45 +119,45 @@ COMMANDS = {
     ),
     "fly": Entry(
         "fly.Fly",
-        "fly a controller in simulation and measure it",
+        "fly a controller in simulation and measure its performance",
         ("cfb fly target --task hover", "cfb fly out/target/policy.npz --plants 4096 --magnitude 1 --json flown.json"),
     ),
     "sweep": Entry(
         "sweep.Sweep",
-        "run a command many times over, on this machine or a cluster",
+        "run a command with many combinations of arguments, here or on a cluster",
         ("cfb sweep firmware-pid -o out/sweep --dry-run", "cfb sweep my_sweep.yaml -o out/sweep --workers 4"),
     ),
     "export": Entry(
         "export.Export",
-        "write a policy as C for the drone, and check that it does the same there",
+        "export a policy as C for the drone, and check the C against JAX",
         ("cfb export target -o out/target_c", "cfb export out/target/policy.npz -o out/policy_c --check"),
     ),
     "view": Entry(
         "view.View",
-        "show flights: a rerun recording with predictions and residuals, or a film",
+        "show flights in rerun, with predictions and residuals, or as a video",
         ("cfb view flight.mcap -o flight.rrd", "cfb view flight.mcap --video flight.mp4"),
     ),
     "bench": Entry(
         "bench.Bench",
-        "measure throughput, compile time and memory",
+        "measure simulation speed, compile time and memory",
         ("cfb bench --quick", "cfb bench --drones 64 4096 --json bench.json --markdown bench.md"),
     ),
     "reproduce": Entry(
         "reproduce.Reproduce",
-        "make the paper's figures and tables, its numbers beside ours",
+        "reproduce the paper's figures and tables, with its numbers beside ours",
         ("cfb reproduce all -o out/paper", "cfb reproduce rotor-curves -o out/paper --real flights"),
     ),
     "demo-loop": Entry(
         "demo_loop.DemoLoop",
-        "fly a drone the model does not know, diagnose it, retrain, and fly it again",
+        "fly a drone with an unmodelled effect, correct the model, retrain, fly again",
         ("cfb demo-loop -o out/loop", "cfb demo-loop -o out/loop --effects payload --seeds 2"),
     ),
     "demo": Entry(
         "demo.Demo",
-        "evaluate a flight, fly 4096 randomised drones, write a page",
+        "evaluate a flight, fly 4096 randomised drones, write a page with the results",
         ("cfb demo -o out/demo", "cfb demo -o out/demo --real flights"),
     ),
-    "version": Entry("version.Version", "print versions", ("cfb version",)),
+    "version": Entry("version.Version", "print the versions of cfb_mjx and of its dependencies", ("cfb version",)),
 }
 _CLASSES = {entry.place.rpartition(".")[2]: name for name, entry in COMMANDS.items()}
 __all__ = [
@@ -189,7 +189,7 @@ __all__ = [
 
 
 def load(name: str) -> type[Command]:
-    """The class of a command."""
+    """Import and return the class of a command."""
     module, _, kind = COMMANDS[name].place.rpartition(".")
     return getattr(importlib.import_module(f"cfb_mjx.commands.{module}"), kind)
 

@@ -1,4 +1,4 @@
-"""``cfb bench``: throughput beside the peers, from one run on one machine."""
+"""``cfb bench``: speed of the library beside other simulators, measured in one run on one machine."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from cfb_mjx.files import require_folder, write_json, write_text
 
 @dataclass(frozen=True)
 class Measured(Result):
-    """Speeds of this machine.
+    """Speeds measured on this machine.
 
     Attributes:
-        numbers: as ``--json`` writes them: ``numbers["rows"][0]["steps_per_s"]`` and the like.
+        numbers: the results as ``--json`` writes them, for instance ``numbers["rows"][0]["steps_per_s"]``.
     """
 
     numbers: Mapping[str, Any]
@@ -32,15 +32,17 @@ class Measured(Result):
 
 @command
 class Bench(Command):
-    """Measure throughput: simulation steps per second of every body, compile time and memory.
+    """Measure simulation speed: steps per second with every body, compile time and memory.
+
+    Prints a table. --json and --markdown also write the results to files.
 
     Attributes:
-        drones: batch sizes; 1, 64, 1024, 8192 and 65536 if none are given.
-        json: write the results here.
-        markdown: write the results as a Markdown page here.
-        peer_python: a Python that has crazyflow installed, to measure it side by side.
-        quick: fewer rows and repetitions, for a first look.
-        roofline: measure also what this machine can do at most, and how much of it the hot paths use.
+        drones: batch sizes, at least 1 each. Default: 1 64 1024 8192 65536.
+        json: JSON file for the results.
+        markdown: Markdown file for the results.
+        peer_python: Python interpreter in whose environment crazyflow is installed; crazyflow is then measured too.
+        quick: measure fewer cases with fewer repetitions, for a quick look.
+        roofline: also measure the peak speed of this machine, and what share of it the main computations reach.
     """
 
     drones: Annotated[tuple[int, ...], tyro.conf.arg(metavar="N...")] = (1, 64, 1024, 8192, 65536)
@@ -51,17 +53,17 @@ class Bench(Command):
     roofline: bool = False
 
     def run(self) -> Measured:
-        """Measure, and write what was asked for.
+        """Measure, and write the files that were asked for.
 
         Raises:
-            CfbError: impossible batch sizes, no such peer, outputs that cannot be written.
+            CfbError: invalid batch sizes, a Python without crazyflow, or files that cannot be written.
         """
         if not self.drones or min(self.drones) < 1:
-            raise CfbError("--drones must be whole numbers from 1.")
+            raise CfbError("--drones: every batch size must be a whole number, at least 1.")
         require_folder(self.json, self.markdown)
         from cfb_mjx.runtime import configure_jax, cores
 
-        # A CPU shows itself as one device per core, where the backend has not started yet.
+        # Makes a CPU count as one device per core, if the backend of jax has not started yet.
         configure_jax(x64=False, devices=cores())
         from cfb_mjx.bench.benchmark import benchmark
         from cfb_mjx.bench.page import page

@@ -1,4 +1,4 @@
-"""``cfb benchmark-nanodrone``: a model judged by the rules of the IDSIA nano-drone benchmark."""
+"""``cfb benchmark-nanodrone``: evaluate a model by the rules of the IDSIA nano-drone benchmark."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _UNITS = {"position": "m", "velocity": "m/s", "attitude": "rad", "rate": "rad/s"
 
 @dataclass(frozen=True)
 class Judged(Result):
-    """Errors of a model beside those of others.
+    """Errors of a model beside those of other models and of the published results.
 
     Attributes:
-        numbers: as ``--json`` writes them: ``numbers["rows"]["model"]["position_sum_m"]`` and the like.
-        files: what was written, by what it is.
+        numbers: the results as ``--json`` writes them, for instance ``numbers["rows"]["model"]["position_sum_m"]``.
+        files: paths of the files written, by kind; None for a file that was not asked for.
     """
 
     numbers: Mapping[str, Any]
@@ -39,19 +39,22 @@ class Judged(Result):
 
 @command
 class BenchmarkNanodrone(Command):
-    """Judge a model by the rules of the IDSIA nano-drone benchmark, beside the published results.
+    """Evaluate a model by the rules of the IDSIA nano-drone benchmark, beside the published results.
 
-    Predictions of 50 steps at 100 Hz from every row, rotor speeds in, and only those measured by then. The preset
-    cfb-idsia, the plant fitted to flights of that drone, stands beside the model.
+    From every row of a flight, 50 steps at 100 Hz are predicted. The inputs are the measured rotor speeds; each step
+    uses only speeds that were measured up to its time. The table also has the preset cfb-idsia, a plant that was fitted
+    to flights of the benchmark's drone.
 
     Attributes:
-        folder: holds the flights, raw 100 Hz merges or processed files (parquet or csv).
-        model: preset or model YAML; judged alone and with a disturbance observer. The default was fitted to flights of
-            the benchmark's drone, none of them its test flights.
-        json: write the results here.
-        stride: rows from one prediction's start to the next.
-        official: the folder holds the benchmark's processed files (data/real/processed): every row counts as it is, as
-            in the benchmark's own evaluation, and the published rows are comparable. Raw merges are cleaned otherwise.
+        folder: folder with the flights of the benchmark: raw 100 Hz merges or processed files (parquet or csv).
+        model: preset or model YAML. It is evaluated alone and with a disturbance observer.
+            The default was fitted to flights of the benchmark's drone, but not to its test flights.
+        json: JSON file for the results.
+        stride: number of rows between the starts of two predictions.
+        official: the folder holds the benchmark's processed files (data/real/processed).
+            Every row is then used as it is, as in the benchmark's own evaluation.
+            Only then are the errors comparable with the published ones.
+            Without this option, raw merges are cleaned.
     """
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FOLDER")]
@@ -61,15 +64,15 @@ class BenchmarkNanodrone(Command):
     official: bool = False
 
     def run(self) -> Judged:
-        """Run the benchmark, and write the results if that was asked for.
+        """Run the benchmark, and write the results if a file was asked for.
 
         Raises:
-            CfbError: a folder without flights of the benchmark, a bad model or output.
+            CfbError: a folder without flights of the benchmark, an invalid model, or a file that cannot be written.
         """
         from cfb_mjx.runtime import Progress, configure_jax, environment
 
         require_folder(self.json)
-        logs = _flights(self.folder, self.official)  # before jax loads: a bad log is refused at once
+        logs = _flights(self.folder, self.official)  # before jax loads, so that a bad log is refused at once
         configure_jax(x64=True)
         from cfb_mjx.sysid.nanodrone import STEPS, benchmark, published_rows, usual_contestants
 
@@ -92,18 +95,18 @@ def _flights(folder: Path, official: bool) -> list[FlightLog]:
     from cfb_mjx.logs.idsia import read_as_published
 
     if not folder.is_dir():
-        raise CfbError(f"{folder}: is not a folder; name one that holds the benchmark's flights (parquet or csv).")
+        raise CfbError(f"{folder}: is not a folder; give one with the flights of the benchmark (parquet or csv).")
     paths = sorted(path for path in folder.iterdir() if path.suffix in _ENDINGS)
     if not paths:
-        raise CfbError(f"{folder}: holds no .parquet or .csv file; name a folder with the benchmark's flights.")
+        raise CfbError(f"{folder}: has no .parquet or .csv file; give a folder with the flights of the benchmark.")
     logs = [read_as_published(path) if official else read_log(path, "idsia") for path in paths]
     if len({log.name for log in logs}) < len(logs):
-        raise CfbError(f"{folder}: two flights have one name; keep each flight as parquet or as csv.")
+        raise CfbError(f"{folder}: two files hold the same flight; keep each flight as parquet or as csv, not both.")
     return logs
 
 
 def errors_table(numbers: Mapping[str, Any]) -> str:
-    """Mean errors of every contestant after 1, 10 and 50 steps and their sums, and the published sums below."""
+    """A table of the mean errors of every model after 1, 10 and 50 steps, their sums, and the published sums."""
     from cfb_mjx.sysid.nanodrone import DECLARED, PLANT, QUANTITIES, SHOWN, STEPS
 
     labels = {

@@ -1,4 +1,4 @@
-"""``cfb check``: what recordings hold, what their signals say about each other, what they are good for."""
+"""``cfb check``: what recordings contain, whether their signals agree, and what they can be used for."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Checked(Result):
     """Recordings that were checked.
 
     Attributes:
-        recordings: one for each log: the flight, what its signals say about each other, or why it was refused.
-            ``recordings[0].report()`` is what ``--json`` writes of it.
-        files: what was written, by what it is.
+        recordings: one for each log: the flight and the agreement of its signals, or the reason why it was refused.
+            ``recordings[0].report()`` is what ``--json`` writes about it.
+        files: paths of the files written, by kind; None for a file that was not asked for.
     """
 
     recordings: tuple[Recording, ...]
@@ -34,23 +34,24 @@ class Checked(Result):
 
     @property
     def complaint(self) -> str | None:
-        """That recordings were refused; None where all were read."""
+        """How many recordings were refused; None if all were read."""
         refused = sum(one.refusal is not None for one in self.recordings)
         if not refused:
             return None
-        return f"{refused} of {len(self.recordings)} recordings were refused, for the reasons above."
+        return f"{refused} of {len(self.recordings)} recordings were refused; the reasons are listed above."
 
 
 @command
 class Check(ReadingOptions):
-    """Say what recordings hold, whether their signals agree, what they are good for and what to log next time.
+    """Report what recordings contain, whether their signals agree, what they are good for and what to log next time.
 
-    Every recording is read as by import, by itself; one that is refused stops none of the others.
+    Each recording is read on its own, as `cfb import` reads it. If one is refused, the others are still checked, and
+    the exit status is 2.
 
     Attributes:
-        logs: recordings of any format.
+        logs: recordings in any format that `cfb import` reads.
         output: folder for a page with figures (index.html).
-        json: write the results here.
+        json: JSON file for the results.
     """
 
     logs: Logs
@@ -58,10 +59,10 @@ class Check(ReadingOptions):
     json: File = None
 
     def run(self) -> Checked:
-        """Check every recording by itself, and write what was asked for.
+        """Check each recording on its own, and write the files that were asked for.
 
         Raises:
-            CfbError: no logs, or outputs that cannot be written.
+            CfbError: no logs, or files that cannot be written.
         """
         if not self.logs:
             raise CfbError("check needs at least one log; see 'cfb check --help'.")

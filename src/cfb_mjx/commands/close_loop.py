@@ -1,4 +1,4 @@
-"""``cfb close-loop``: which physical effect a model lacks."""
+"""``cfb close-loop``: find the physical effects that a model lacks, and correct the model."""
 
 from __future__ import annotations
 
@@ -9,25 +9,26 @@ from typing import TYPE_CHECKING, Any
 
 from cfb_mjx.commands.command import Command, Model, OtherLogs, OutputFolder, Pairs, Result, command
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import output_folder, require_no_file, together, write_json
+from cfb_mjx.files import VectorFormat, output_folder, require_no_file, together, write_json
 
 if TYPE_CHECKING:
     from cfb_mjx.logs import FlightLog
 
 LEAST_SECONDS = 10.0
-"""Of flight to fit: below this nothing could be told from chance."""
+"""Shortest total duration of the flights to fit, s: with less, no effect can be distinguished from chance."""
 
 
 @dataclass(frozen=True)
 class Closed(Result):
-    """What a model lacks.
+    """The effects that a model lacks.
 
     Attributes:
-        numbers: as report.json has them: ``numbers["effects"]`` were found, ``numbers["held_out"]["after"]`` are the
-            errors of the corrected model.
-        report: page to read.
-        model: the corrected model.
-        to_fly: for an effect that these flights hardly tell from others, the command that finds a flight that does.
+        numbers: the results as in report.json: ``numbers["effects"]`` are the effects found,
+            ``numbers["held_out"]["after"]`` the held-out errors of the corrected model.
+        report: path of the report, an HTML page.
+        model: path of the corrected model.
+        to_fly: for each effect that these flights can hardly distinguish from others, the command that finds a flight
+            which can.
     """
 
     numbers: Mapping[str, Any]
@@ -38,14 +39,18 @@ class Closed(Result):
     def __str__(self) -> str:
         numbers, lines = self.numbers, []
         if not numbers["effects"]:
-            lack = "no effect of the catalogue stands" if numbers["unexplained"] else "nothing is missing beyond chance"
+            lack = (
+                "no effect of the catalogue passes the test"
+                if numbers["unexplained"]
+                else "nothing is missing beyond chance"
+            )
             lines.append(lack)
         for effect in numbers["effects"]:
             lines.append(f"{effect['name']}: {_values(effect)} (p = {effect['p_value']:.1g})")
             if effect.get("confusable_with"):
-                lines.append(f"  these flights hardly tell it from {', '.join(effect['confusable_with'])}")
+                lines.append(f"  these flights can hardly distinguish it from {', '.join(effect['confusable_with'])}")
             if effect["name"] in self.to_fly:
-                lines.append(f"  what to fly: {self.to_fly[effect['name']]}")
+                lines.append(f"  to find a flight that can: {self.to_fly[effect['name']]}")
         if numbers["unexplained"]:
             lines.append(f"unexplained: {numbers['unexplained_because']}")
         held = numbers["held_out"]
@@ -58,18 +63,23 @@ class Closed(Result):
 
 @command
 class CloseLoop(Command):
-    """Find which physical effect a model lacks, add it, and report the error before and after on other flights.
+    """Find the physical effects that a model lacks, correct the model, and report its held-out error before and after.
 
-    The sensors are compared with each other first; then effects of the catalogue are proposed, fitted together, and
-    accepted only if they improve data they were not fitted on beyond chance. Writes report.html, report.json,
-    residual.rrd and model.yaml. An interrupted run goes on where it was when started again.
+    First the sensors are compared with each other. Then effects of the catalogue are proposed and fitted together. An
+    effect is accepted only if it improves predictions of data it was not fitted to by more than chance.
+
+    Needs flights of one drone: with --fit at least 10 s with different manoeuvres, with --held-out others for the
+    evaluation. Writes report.html, report.json, residual.rrd and model.yaml (the corrected model). If the run was
+    interrupted, the same command continues it.
 
     Attributes:
         output: folder to write to.
-        fit: flights to learn from, of one drone, with different manoeuvres.
-        held_out: other flights of it, to be judged on; nothing is fitted to them.
-        model: preset or model YAML the flights are compared with.
-        set: parameters to change, for instance mass=0.045.
+        fit: flights of one drone to fit, with different manoeuvres; at least 10 s in total. Required.
+        held_out: other flights of the same drone, for the evaluation; nothing is fitted to them. Required.
+        model: preset or model YAML that is compared with the flights and corrected.
+        set: changes to the model's parameters, for instance mass=0.045 (kg).
+        format: also write the report's figures as vector graphics, pdf or svg, into the folder figures.
+            Default: none; the report holds its figures itself.
     """
 
     output: OutputFolder
@@ -77,12 +87,14 @@ class CloseLoop(Command):
     held_out: OtherLogs = ()
     model: Model = "cfb-guards"
     set: Pairs = ()
+    format: VectorFormat | None = None
 
     def run(self) -> Closed:
-        """Trace, judge, and write the report and the corrected model.
+        """Search for effects, evaluate the corrected model, and write it and the report.
 
         Raises:
-            CfbError: bad logs, a log on both sides, a bad model, or a folder that cannot be written.
+            CfbError: bad logs, a log given both to fit and as held-out, an invalid model, or a folder that cannot be
+                written.
         """
         logs, judged = self._read()
         require_no_file(self.output)
@@ -95,6 +107,7 @@ class CloseLoop(Command):
         from cfb_mjx.sysid.tracing.closing import close_loop
         from cfb_mjx.view.closing import write_report
         from cfb_mjx.view.closing_words import separating, verdict
+        from cfb_mjx.view.style import with_vector_copies
 
         base = load_model_file(self.model, self.set)
         folder = output_folder(self.output)
@@ -109,7 +122,9 @@ class CloseLoop(Command):
         numbers |= {"model": base.name, "environment": facts}
         say("writing the report")
         model = folder / "model.yaml"
-        with together():
+        if self.format is not None:
+            output_folder(folder / "figures")
+        with together(), with_vector_copies(self.format, folder / "figures"):
             save_model_file(corrected, model)
             write_report(outcome, folder, facts, logs, judged)
             write_json(folder / "report.json", numbers)
@@ -124,18 +139,20 @@ class CloseLoop(Command):
         from cfb_mjx.logs import read_log, require_own_names
 
         if not self.fit or not self.held_out:
-            raise CfbError("close-loop needs --fit LOG... to learn from and --held-out LOG... to be judged on.")
+            raise CfbError(
+                "close-loop needs flights to fit (--fit LOG...) and other flights to evaluate on (--held-out LOG...)."
+            )
         require_apart(self.fit, self.held_out)
         logs, judged = [read_log(path) for path in self.fit], [read_log(path) for path in self.held_out]
         for group in (logs, judged):
             require_own_names(group)
         if sum(log.duration for log in logs) < LEAST_SECONDS:
-            raise CfbError(f"--fit: less than {LEAST_SECONDS:g} s of flight; give longer or more logs.")
+            raise CfbError(f"--fit: the logs hold less than {LEAST_SECONDS:g} s of flight; give longer or more logs.")
         return logs, judged
 
 
 def _values(effect: Mapping[str, Any]) -> str:
-    """An effect's numbers with their standard deviations."""
+    """The parameters of an effect as text, with their standard deviations."""
     values = []
     for key, value in effect["parameters"].items():
         std = effect["uncertainty"].get(key)

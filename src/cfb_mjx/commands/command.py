@@ -1,6 +1,7 @@
-"""What a command is: a frozen dataclass of its arguments with ``run() -> Result``, and the kinds of its arguments.
+"""The base classes `Command` and `Result`, and the types of the arguments of commands.
 
-Light, as everything that ``cfb --help`` loads: what a command needs is imported when it runs.
+A command is a frozen dataclass of its arguments with a method ``run() -> Result``. This module imports nothing heavy;
+a command imports jax and the rest of the library only when it runs.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from cfb_mjx.plugins import plugged
 
 @dataclass(frozen=True)
 class Within:
-    """The range of a number; other numbers are refused where the command is made."""
+    """The allowed range of a number. A command with a number outside it raises `CfbError` when it is constructed."""
 
     least: float
     most: float = float("inf")
@@ -46,7 +47,7 @@ class Within:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a file's name must end; other names are refused where the command is made."""
+    """The allowed endings of a file name. Other names raise `CfbError` when the command is constructed."""
 
     endings: tuple[str, ...]
     demand: str
@@ -72,34 +73,34 @@ Devices = Annotated[int, Within(1)]
 if TYPE_CHECKING:
     Pairs = tuple[str, ...]
     Spans = tuple[str, ...]
-else:  # As the parser sees them.
+else:  # The types that the parser reads.
     Pairs = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE...")]
     Spans = Annotated[tuple[tuple[str, ...], ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="A:B...")]
 """``--set A=1 B=2`` and ``--set A=1 --set B=2`` mean the same, and so do ``set={"A": 1, "B": 2}`` and
-``set=("A=1", "B=2")``; the later of two of one name counts. A command holds the words, ``("A=1", "B=2")``. Likewise a
-path may be given as text, and one log alone in place of several."""
+``set=("A=1", "B=2")``. If a name is given twice, the last value is used. The command stores the words,
+``("A=1", "B=2")``. Likewise a path may be given as a string, and a single log instead of a sequence of logs."""
 
-_PLUGIN = "a Python file with effects of your own, known to this command; may be given several times."
+_PLUGIN = "Python file that defines effects of your own, for use in models; may be given several times."
 _METAVARS = {float: "NUMBER", int: "INT", str: "TEXT", Path: "PATH"}
 _Class = TypeVar("_Class", bound=type)
 
 
 class Result:
-    """What a command found. ``str(result)`` is what ``cfb`` prints; files are written when the command has run."""
+    """The result of a command. ``str(result)`` is the text that ``cfb`` prints; ``run()`` has written all files."""
 
     @property
     def complaint(self) -> str | None:
-        """Why ``cfb`` exits with an error although there is a result, in a sentence; None if it does not."""
+        """One sentence on why ``cfb`` exits with status 2 although there is a result; None if it does not."""
         return None
 
 
 @dataclass(frozen=True)
 class Written(Result):
-    """A result that is text, and the files it stands in.
+    """A result that consists of text, and of the files that were written.
 
     Attributes:
-        text: what ``cfb`` prints.
-        files: what was written, by what it is; None: was not asked for.
+        text: the text that ``cfb`` prints.
+        files: paths of the files written, by kind; None for a file that was not asked for.
     """
 
     text: str
@@ -110,17 +111,20 @@ class Written(Result):
 
 
 def lines_of(files: Mapping[str, Path | None]) -> list[str]:
-    """A line for each file that was written (None: was not asked for), after what it is."""
+    """One line ``kind: path`` for each file that was written; a path of None was not asked for."""
     return [f"{what}: {path}" for what, path in files.items() if path is not None]
 
 
 @dataclass(frozen=True)
 class Command:
-    """What every command has."""
+    """Base class of all commands.
+
+    A subclass is a frozen dataclass whose fields are the arguments of the command.
+    """
 
     lists_in_yaml: ClassVar[bool] = False
-    """Whether a list on the right side of NAME=VALUE is YAML, as in trainings, and not numbers with commas, as in
-    models."""
+    """Whether a list on the right side of NAME=VALUE is written as YAML, as for trainings. Otherwise it is written as
+    numbers separated by commas, as for models."""
 
     plugin: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="FILE.py", help=_PLUGIN)] = (
         field(default=(), kw_only=True)
@@ -137,16 +141,16 @@ class Command:
             object.__setattr__(self, one.name, value)
 
     def run(self) -> Result:
-        """Do it, write the files that were asked for, and return what was found.
+        """Run the command, write the files that were asked for, and return the result.
 
         Raises:
-            CfbError: bad input, in one sentence; nothing is written then.
+            CfbError: bad input, described in one sentence. In this case nothing is written.
         """
         raise NotImplementedError
 
     @classmethod
     def changed(cls, value: Any) -> str:
-        """The right side of NAME=VALUE."""
+        """A value as text, for the right side of NAME=VALUE."""
         if isinstance(value, list | tuple) and not cls.lists_in_yaml:
             return ",".join(map(text, value))
         return text(value)
@@ -160,7 +164,7 @@ class Command:
         return tuple(chain.from_iterable((one,) if isinstance(one, str) else one for one in value))
 
     def words(self) -> list[str]:
-        """The words of a command line that mean the same, without ``cfb`` and the command's name."""
+        """The arguments as the words of an equivalent command line, without ``cfb`` and the command's name."""
         hints = get_type_hints(type(self), include_extras=True)
         first, rest = [], []
         for one in sorted(fields(self), key=lambda one: one.name == "plugin"):
@@ -182,7 +186,7 @@ class Command:
 
 @dataclass_transform(frozen_default=True, kw_only_default=False, field_specifiers=(field,))
 def command(cls: _Class) -> _Class:
-    """Make a class of arguments a command: a frozen dataclass whose ``run`` knows the effects of its plugins."""
+    """Make a class a command: a frozen dataclass whose ``run`` loads the effects of its plugins first."""
     run = cls.run
 
     @functools.wraps(run)
@@ -195,7 +199,7 @@ def command(cls: _Class) -> _Class:
 
 
 def text(value: Any) -> str:
-    """A value as it is typed."""
+    """A value as it is written on a command line."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, list | tuple | dict):
@@ -205,22 +209,22 @@ def text(value: Any) -> str:
 
 
 def default_of(one: Field) -> Any:
-    """What a field holds where nothing is said; `dataclasses.MISSING` where something must be."""
+    """The default value of a field; `dataclasses.MISSING` if the field has none."""
     return one.default_factory() if one.default_factory is not MISSING else one.default
 
 
 def is_positional(hint: Any) -> bool:
-    """Whether an argument is given without its name."""
+    """Whether an argument is positional."""
     return tyro.conf.Positional in _marks(hint)
 
 
 def held(hint: Any) -> Any:
-    """What an argument holds if it is given, without what the parser is told of it."""
+    """The type of an argument's value if it is given, without the annotations for the parser."""
     return _plain(_bare(hint))
 
 
 def told(hint: Any) -> Any:
-    """An annotation as the parser gets it: with a word for the value, and no default where that is nothing."""
+    """The annotation for the parser: with a placeholder for the value, and without a default of None or ()."""
     if get_origin(hint) is not Annotated:
         hint = Annotated[hint, None]
     kind, marks = get_args(hint)[0], _marks(hint)
@@ -262,7 +266,7 @@ def _bare(hint: Any) -> Any:
 
 
 def _plain(kind: Any) -> Any:
-    """What an optional argument is if it is given."""
+    """The type of an optional argument without None."""
     if get_origin(kind) in (Union, UnionType):
         left = [one for one in get_args(kind) if one is not NoneType]
         return left[0] if len(left) == 1 else kind
@@ -270,10 +274,10 @@ def _plain(kind: Any) -> Any:
 
 
 def _taken(value: Any, hint: Any, option: str) -> Any:
-    """A value as a command holds it: one path for a path's name, a tuple for one of several.
+    """A value as the command stores it: a string becomes a path where a path is expected, a single value a tuple.
 
     Raises:
-        CfbError: a number out of its range, or a choice that there is not.
+        CfbError: a number outside its range, a file name with the wrong ending, or an invalid choice.
     """
     kind = held(hint)
     if get_origin(kind) is tuple:

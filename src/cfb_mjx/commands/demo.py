@@ -1,4 +1,4 @@
-"""``cfb demo``: what the library does, on one page, in about a minute."""
+"""``cfb demo``: a page that shows the library at work, made in about a minute."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from cfb_mjx.files import output_folder, together, write_json, write_text
 
 @dataclass(frozen=True)
 class Shown(Result):
-    """What was shown.
+    """The results of the demonstration.
 
     Attributes:
-        numbers: as demo.json has them: errors of predictions of a ``flight`` and a ``real`` one, and ``rollouts``.
-        page: to open in a browser.
-        figures: PNG files.
-        json: file with the numbers.
+        numbers: the results as in demo.json: the prediction errors on a ``flight`` and on a ``real`` one, and the
+            speed of the ``rollouts``.
+        page: path of the page, to open in a browser.
+        figures: paths of the figures (PNG).
+        json: path of the JSON file with the results.
     """
 
     numbers: Mapping[str, Any]
@@ -30,7 +31,7 @@ class Shown(Result):
 
     def __str__(self) -> str:
         flown, real = self.numbers["rollouts"], self.numbers["real"]
-        skipped = [f"A real flight. Skipped: {real['skipped']}"] if "skipped" in real else []
+        skipped = [f"real flight: skipped; {real['skipped']}"] if "skipped" in real else []
         return "\n".join(
             [
                 *_errors(self.numbers["flight"]),
@@ -47,21 +48,23 @@ class Shown(Result):
 
 @command
 class Demo(Command):
-    """Show the library at work: evaluate a flight, draw it, fly 4096 randomised drones, write a page.
+    """Evaluate a flight that comes with the library, fly 4096 randomised drones, and write a page with the results.
+
+    Writes index.html, demo.json and the figures.
 
     Attributes:
         output: folder to write to.
-        real: folder with real flights in the IDSIA layout (validation/*.parquet), to evaluate one of them too.
+        real: folder with real flights in the IDSIA layout (validation/*.parquet); one of them is then evaluated too.
     """
 
     output: OutputFolder = Path("out/demo")
     real: Path | None = None
 
     def run(self) -> Shown:
-        """Show, and write figures, numbers and page.
+        """Run the demonstration, and write the figures, the numbers and the page.
 
         Raises:
-            CfbError: the output cannot be written or a flight cannot be read.
+            CfbError: a flight that cannot be read, or a file that cannot be written.
         """
         folder = output_folder(self.output)
         from cfb_mjx.runtime import configure_jax, environment, say

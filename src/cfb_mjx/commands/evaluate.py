@@ -1,4 +1,4 @@
-"""``cfb evaluate``: how well a model predicts flights."""
+"""``cfb evaluate``: measure how well a model predicts flights."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ _UNITS = {"m": "m", "mps": "m/s", "deg": "deg", "radps": "rad/s"}
 
 @dataclass(frozen=True)
 class Evaluated(Result):
-    """Errors of a model's predictions.
+    """Prediction errors of a model.
 
     Attributes:
-        numbers: as ``--json`` writes them: ``numbers["commands_in"]["position_rmse_m@0.5s"]`` and the like.
-        files: what was written, by what it is.
+        numbers: the results as ``--json`` writes them, for instance
+            ``numbers["commands_in"]["position_rmse_m@0.5s"]``.
+        files: paths of the files written, by kind; None for a file that was not asked for.
     """
 
     numbers: Mapping[str, Any]
@@ -45,19 +46,20 @@ class Evaluated(Result):
 
 @command
 class Evaluate(Command):
-    """Measure how well a model predicts flights, open loop, at 50, 100, 200 and 500 ms.
+    """Measure the open-loop prediction error of a model on flights, at 50, 100, 200 and 500 ms.
 
-    Windows start from measured states; the logged commands (and, where measured, the rotor speeds) go in; errors are
-    compared with "hold", which assumes constant velocity and constant body rate.
+    Every 0.2 s a prediction starts from the measured state and takes the logged commands as input. Where rotor speeds
+    were measured, a second prediction takes those instead. The errors are printed beside those of "hold", which assumes
+    constant velocity and constant body rate.
 
     Attributes:
         logs: flight logs (MCAP, parquet, csv).
         model: preset (cfb-guards, cfb, cfb-fleet, cfb-idsia, cf21b-500, cf2x) or model YAML.
-        set: parameters to change, for instance mass=0.045.
-        json: write the results here.
-        figure: draw prediction against measurement here (.png, .svg, .pdf).
-        observer: add predictions with disturbances estimated from the data before each window starts.
-        devices: of this machine that share the windows.
+        set: changes to the model's parameters, for instance mass=0.045 (kg).
+        json: JSON file for the results.
+        figure: file for a figure of predictions and measurements (.png, .svg, .pdf).
+        observer: add predictions with disturbances estimated from the data before each prediction starts.
+        devices: number of devices of this machine over which the predictions are divided.
     """
 
     logs: Logs
@@ -69,10 +71,10 @@ class Evaluate(Command):
     devices: Devices = 1
 
     def run(self) -> Evaluated:
-        """Evaluate, and write what was asked for.
+        """Evaluate the model, and write the files that were asked for.
 
         Raises:
-            CfbError: bad logs, a bad model, or outputs that cannot be written.
+            CfbError: bad logs, an invalid model, or files that cannot be written.
         """
         from cfb_mjx.logs import estimate_command_shift, read_log
         from cfb_mjx.runtime import Progress, configure_jax, environment
@@ -80,7 +82,7 @@ class Evaluate(Command):
         if not self.logs:
             raise CfbError("evaluate needs at least one log; see 'cfb evaluate --help'.")
         require_folder(self.json, self.figure)
-        logs = [read_log(path) for path in self.logs]  # before jax loads: a bad log is refused at once
+        logs = [read_log(path) for path in self.logs]  # before jax loads, so that a bad log is refused at once
         configure_jax(x64=True, devices=self.devices)
         from cfb_mjx.devices import Devices
         from cfb_mjx.model import Quadrotor
@@ -118,7 +120,7 @@ class Evaluate(Command):
 
 
 def errors_table(numbers: Mapping[str, Any]) -> str:
-    """RMSE of every quantity and variant at every horizon, with 95 % intervals."""
+    """A table of the RMS error of every quantity and kind of prediction at every horizon, with 95 % intervals."""
     horizons = [key.partition("@")[2] for key in numbers["hold"] if key.startswith("position_rmse")]
     rows = [["", "", *(f"{float(h[:-1]) * 1e3:.0f} ms" for h in horizons)]]
     for quantity, unit in _ROWS:
@@ -134,5 +136,5 @@ def errors_table(numbers: Mapping[str, Any]) -> str:
     head = f"RMS error of {numbers['windows']} open-loop predictions by {numbers['model']} [95 % interval]"
     lines = [head, aligned(rows)]
     if numbers["rotor_speed_in"] is not None and numbers["windows"] > numbers["rotor_speed_in_windows"]:
-        lines.append(f"rotor speed was measured in {numbers['rotor_speed_in_windows']} of the windows.")
+        lines.append(f"rotor speed was measured in {numbers['rotor_speed_in_windows']} of these windows.")
     return "\n".join(lines)

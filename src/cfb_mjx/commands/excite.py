@@ -1,4 +1,4 @@
-"""``cfb excite``: what to fly so that a fit knows the drone."""
+"""``cfb excite``: design flights that identify the drone."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from cfb_mjx.commands.command import (
     lines_of,
 )
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import output_folder, require_folder, require_no_file, together, write_json, write_text
+from cfb_mjx.files import VectorFormat, output_folder, require_folder, require_no_file, together, write_json, write_text
 
 if TYPE_CHECKING:
     from cfb_mjx.logs import FlightLog
     from cfb_mjx.sysid.excitation.conditions import Conditions
 
-_NOT_OF_PATHS = ("duration", "rate_limit", "altitude_loss", "parameters", "repetitions")
-"""What separate has no use for."""
+_NOT_OF_PATHS = ("duration", "rate_limit", "altitude_loss", "parameters", "repetitions", "format")
+"""Options that ``separate`` does not use."""
 
 
 @dataclass(frozen=True)
 class Excited(Result):
-    """A manoeuvre, and what a fit will know of its flight.
+    """A manoeuvre, and the uncertainty that a fit to its flight will have.
 
     Attributes:
-        numbers: as excitation.json has them: ``numbers["parameters"]["inertia_xx"]["std"]`` and the like.
-        parameters: names of what will be fitted, whether it can be told or not.
-        files: commands.csv, flight.mcap and excitation.png.
-        results: JSON files.
+        numbers: the results as in excitation.json, for instance ``numbers["parameters"]["inertia_xx"]["std"]``.
+        parameters: names of the parameters that will be fitted, identifiable or not.
+        files: paths of commands.csv, flight.mcap and excitation.png.
+        results: paths of the JSON files.
     """
 
     numbers: Mapping[str, Any]
@@ -65,10 +65,10 @@ class Excited(Result):
         )
 
     def _expected(self) -> list[str]:
-        """A row for every parameter, with the other manoeuvres beside it."""
+        """A table with a row for every parameter, and a column for each of the other manoeuvres."""
         numbers, others = self.numbers, self.numbers["compared_with"]
         heads = "".join(f"{name:>15}" for name in others)
-        lines = [f"{'expected of cfb fit':<22}{'value':>12}{'std':>11}  {'unit':<8}{'std, %':>8}{heads}"]
+        lines = [f"{'expected from cfb fit':<22}{'value':>12}{'std':>11}  {'unit':<8}{'std, %':>8}{heads}"]
         for name in self.parameters:
             cells = "".join(f"{_share(other['parameters'].get(name)):>15}" for other in others.values())
             e = numbers["parameters"].get(name)
@@ -76,8 +76,8 @@ class Excited(Result):
             lines.append(f"{name:<22}{number}{_share(e):>8}{cells}")
         if numbers["unidentifiable"]:
             together = ", ".join(numbers["identifiable_together"])
-            known = f"; known together: {together}" if together else ""
-            lines.append(f"cannot be told: {', '.join(numbers['unidentifiable'])}{known}")
+            known = f"; identifiable in combination: {together}" if together else ""
+            lines.append(f"not identifiable: {', '.join(numbers['unidentifiable'])}{known}")
         return lines
 
     def _attained(self) -> list[str]:
@@ -92,21 +92,21 @@ class Excited(Result):
             f"within limits {rough['within_limits']}, caught {rough['caught']} of {rough['repetitions']}",
         ]
         if not calm["within_limits"]:
-            lines.append("warning: the undisturbed manoeuvre with its catch exceeds the limits.")
+            lines.append("warning: the undisturbed manoeuvre, including the catch, exceeds the limits.")
         if rough["caught"] < rough["repetitions"] or not calm["caught"]:
-            lines.append("warning: the stabiliser does not always catch the drone; ask for less.")
+            lines.append("warning: the stabiliser does not always catch the drone; choose lower limits.")
         return lines
 
 
 @dataclass(frozen=True)
 class Separated(Result):
-    """What every path tells about effects that are hard to tell apart.
+    """How well each path distinguishes effects that are easily confused.
 
     Attributes:
-        numbers: as separation.json has them; ``numbers["fly"]`` is the path to fly, ``numbers["flights"]`` how often
-            (None: no path tells the effects apart, and nothing was written).
-        files: setpoints.csv, flight.mcap and separation.json.
-        json: where the numbers were written too.
+        numbers: the results as in separation.json. ``numbers["fly"]`` is the path to fly, ``numbers["flights"]`` the
+            number of flights needed (None: no path distinguishes the effects, and nothing was written).
+        files: paths of setpoints.csv, flight.mcap and separation.json.
+        json: path of the copy of the results, if one was asked for.
     """
 
     numbers: Mapping[str, Any]
@@ -117,16 +117,16 @@ class Separated(Result):
         from cfb_mjx.sysid.excitation.paths import PATHS
 
         between = " against ".join(self.numbers["between"])
-        lines = [f"what one flight of each path tells about {between}, in nats (10 settle it):\n"]
+        lines = [f"evidence from one flight of each path for {between}, in nats (10 are enough):\n"]
         for path, told in self.numbers["paths"].items():
             count = told["flights"]
-            flights = f"{count} flight{'s' * (count != 1)}" if count else "does not tell them"
+            flights = f"{count} flight{'s' * (count != 1)}" if count else "cannot distinguish"
             worst = min(told["nats"].values()) if told["followed"] else 0.0
             lines.append(f"{path:<16}{max(worst, 0.0):>9.1f}   {flights:<20} {PATHS[path][0]}")
         if self.complaint is None:
             count = self.numbers["flights"]
             lines += [
-                f"\nfly: {self.numbers['fly']}, {count} time{'s' * (count != 1)}, then cfb close-loop again",
+                f"\nfly: {self.numbers['fly']}, {count} time{'s' * (count != 1)}, then run cfb close-loop again",
                 f"files: {', '.join(map(str, self.files))}",
                 *lines_of({"results": self.json}),
             ]
@@ -134,39 +134,45 @@ class Separated(Result):
 
     @property
     def complaint(self) -> str | None:
-        """That no path tells the effects apart."""
+        """That no path distinguishes the effects; None if one does."""
         if self.numbers["flights"] is not None:
             return None
         names = " from ".join(self.numbers["between"])
-        return f"no path tells {names} at the strengths assumed; weigh, remove a part or measure it apart."
+        return f"no path distinguishes {names} at the assumed strengths; weigh, remove a part or measure it separately."
 
 
 @command
 class Excite(Command):
-    """Design a manoeuvre that identifies the drone, fly it in simulation, and predict what a fit will know.
+    """Design a manoeuvre that identifies the drone, fly it in simulation, and predict the uncertainty of a fit.
 
-    A stabiliser like the firmware's hovers, hands over to open-loop commands and catches the drone. Writes the commands
-    (commands.csv), the simulated flight (flight.mcap), a figure and the expected uncertainty (excitation.json).
+    roll-pitch, single-motor and optimised are open-loop manoeuvres. A stabiliser like the firmware's hovers, hands over
+    to the open-loop commands, and catches the drone afterwards. Writes commands.csv (the commands), flight.mcap (a
+    simulated flight), excitation.png (a figure) and excitation.json (the expected uncertainty).
 
-    separate looks for the path a position controller should fly to tell apart effects that cfb close-loop calls
-    confusable, and writes its set-points (setpoints.csv), a simulated flight and what every path tells
-    (separation.json).
+    separate is for effects that `cfb close-loop` reports as confusable. It finds the path that distinguishes them best
+    when a position controller flies it. Writes setpoints.csv (the set-points), flight.mcap (a simulated flight) and
+    separation.json (the evidence that each path gives). If no path distinguishes the effects, it writes nothing, and
+    the exit status is 2.
 
     Attributes:
-        manoeuvre: roll-pitch (doublets, for the inertia about x and y), single-motor (for J_z and J_m), optimised
-            for the chosen parameters and compared with the other two, or separate.
+        manoeuvre: kind of flight to design.
+            roll-pitch: doublets, for the inertia about x and y. single-motor: for J_z and J_m.
+            optimised: for the parameters of --parameters; compared with the other two.
+            separate: a path that distinguishes effects.
         output: folder to write to.
-        parameters: what will be fitted, as for cfb fit; by default what cfb fit would choose.
-        model: preset or model YAML: the best guess of the drone before the flight.
-        set: parameters to change, for instance mass=0.045.
-        repetitions: of the manoeuvre in one flight.
-        duration: of the open-loop part, s.
-        rate_limit: body rate not to exceed, rad/s.
-        altitude_loss: height that may be lost until the drone is caught, m.
-        measured_rotors: rotor speed will be logged.
-        disturbance: rms of the unmodelled torque over inertia to expect, rad/s^2.
-        between: effects to tell apart (separate); those the model has are taken at its strengths.
-        json: write the results here too.
+        parameters: parameters that will be fitted, as for `cfb fit`. Default: those that `cfb fit` fits by default.
+        model: preset or model YAML, the best guess of the drone before the flight.
+        set: changes to the model's parameters, for instance mass=0.045 (kg).
+        repetitions: repetitions of the manoeuvre in one flight.
+        duration: duration of the open-loop part, s, from 0.1 to 2.
+        rate_limit: largest body rate that is allowed, rad/s, above 0.
+        altitude_loss: largest loss of height that is allowed until the drone is caught, m, above 0.
+        measured_rotors: assume that rotor speed will be logged.
+        disturbance: expected RMS of the unmodelled torque divided by the inertia, rad/s^2.
+        between: effects that separate shall distinguish, two or more, with commas between them.
+            Effects of the model have their strength in the model, others a typical strength.
+        json: JSON file for a copy of the results.
+        format: also write every figure as a vector graphic, pdf or svg. Default: PNG only.
     """
 
     manoeuvre: Annotated[Literal["roll-pitch", "single-motor", "optimised", "separate"], tyro.conf.Positional]
@@ -182,12 +188,14 @@ class Excite(Command):
     disturbance: Annotated[float, Within(0, 1000)] = 4.0
     between: Annotated[str | None, tyro.conf.arg(metavar="EFFECT,EFFECT")] = None
     json: File = None
+    format: VectorFormat | None = None
 
     def run(self) -> Excited | Separated:
-        """Find what to fly, and write it with what it will tell.
+        """Design the manoeuvre or find the path, and write it with its expected results.
 
         Raises:
-            CfbError: options that would be ignored, impossible limits, parameters, effects or outputs.
+            CfbError: options that would have no effect, invalid limits, parameters or effects, or files that cannot be
+                written.
         """
         names = self._effects()
         require_no_file(self.output)
@@ -203,15 +211,15 @@ class Excite(Command):
         return self._excite(conditions, Progress("simulating"), Progress("optimising"))
 
     def _effects(self) -> list[str]:
-        """Those to tell apart, none but for separate.
+        """The effects to distinguish; an empty list for all manoeuvres but separate.
 
         Raises:
-            CfbError: an option the manoeuvre has no use for, or too few effects.
+            CfbError: an option that the manoeuvre does not use, or fewer than two effects.
         """
         if self.manoeuvre != "separate":
             if self.between is not None:
                 raise CfbError(
-                    f"cfb excite {self.manoeuvre} tells no effects apart: leave out --between, or say separate."
+                    f"cfb excite {self.manoeuvre} does not use --between: leave it out, or use cfb excite separate."
                 )
             return []
         usual = {one.name: default_of(one) for one in fields(self)}
@@ -222,7 +230,7 @@ class Excite(Command):
         names = [name.strip() for name in (self.between or "").split(",") if name.strip()]
         if len(names) < 2:
             raise CfbError(
-                "cfb excite separate needs --between A,B: the effects to tell apart, as cfb close-loop names them."
+                "cfb excite separate needs --between A,B: two or more effects, by the names that cfb close-loop prints."
             )
         return names
 
@@ -232,17 +240,18 @@ class Excite(Command):
         from cfb_mjx.sysid.excitation.manoeuvres import Limits
         from cfb_mjx.sysid.excitation.trials import excite
         from cfb_mjx.view.excitation import excitation_figure
+        from cfb_mjx.view.style import with_vector_copies
 
         described = load_model_file(self.model, self.set)
         limits = Limits(rate=self.rate_limit, altitude_loss=self.altitude_loss)
         about = (self.parameters, self.repetitions, self.duration, limits, conditions)
-        assert self.manoeuvre != "separate"  # that names effects to tell apart, and `_separate` does it
+        assert self.manoeuvre != "separate"  # separate names effects, and `run` calls `_separate` for them
         excitation = excite(self.manoeuvre, described, *about, progress, designing)
         numbers = excitation.to_json() | {"model": described.name, "environment": environment()}
         chosen = excitation.chosen
         figure = self.output / "excitation.png"
         bounds = {"tilt": limits.tilt_deg, "rate": limits.rate, "height": limits.altitude_loss}
-        with together():
+        with together(), with_vector_copies(self.format):
             table, flight, results = self._write(
                 "commands.csv", chosen.commands_csv(), chosen.flown.log, "excitation.json", numbers
             )
@@ -276,7 +285,7 @@ class Excite(Command):
         return Separated(numbers, files, self.json)
 
     def _write(self, table: str, text: str, log: FlightLog, results: str, numbers: dict) -> tuple[Path, Path, Path]:
-        """The table to fly, the simulated flight and the numbers; their paths in that order."""
+        """Write the table to fly, the simulated flight and the results; return their paths in this order."""
         from cfb_mjx.logs import write_mcap
 
         folder = output_folder(self.output)
@@ -291,5 +300,5 @@ class Excite(Command):
 
 def _share(expected: dict | None) -> str:
     if expected is None:
-        return "cannot tell"
+        return "no estimate"
     return f"{100 * expected['std'] / expected['value']:.2g}" if expected["value"] else ""

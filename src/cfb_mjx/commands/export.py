@@ -1,4 +1,4 @@
-"""``cfb export``: a policy as C for the drone."""
+"""``cfb export``: write a policy as C for the drone."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Exported(Result):
-    """A policy as C, and how that was found to be.
+    """A policy as C, and the results of the check.
 
     Attributes:
-        name: of the policy.
-        step_s: time from one of its commands to the next.
-        weights_sha256: of its networks, by what they do.
-        folder: with sources, firmware app and contract.
-        check: what was found (``check.numbers``, ``check.faults``); None: it was not asked for.
-        results: the file with these numbers.
+        name: name of the policy.
+        step_s: time between two of its commands, s.
+        weights_sha256: SHA-256 of the weights of its networks, by their role.
+        folder: folder with the sources, the firmware app and the contract.
+        check: results of the check (``check.numbers``, ``check.faults``); None if no check was asked for.
+        results: path of the file with these numbers; None if no check was asked for.
     """
 
     name: str
@@ -43,13 +43,13 @@ class Exported(Result):
             f"C sources, firmware app and contract: {self.folder}",
         ]
         if self.check is not None:
-            lines += [f"  {text}" if good else f"  {text}   <- too much" for text, good in self.check.findings]
+            lines += [f"  {text}" if good else f"  {text}   <- outside the limit" for text, good in self.check.findings]
             lines.append(f"results: {self.results}")
         return "\n".join(lines)
 
     @property
     def complaint(self) -> str | None:
-        """That it is not to be flown."""
+        """Why the export must not be flown; None if nothing is wrong with it, or if it was not checked."""
         faults = [] if self.check is None else self.check.faults
         return f"{self.folder}: do not fly this; {faults[0]}." if faults else None
 
@@ -58,17 +58,20 @@ class Exported(Result):
 class Export(Command):
     """Write a policy as C for the drone: a plain library, an app for the Crazyflie's firmware, and its contract.
 
-    C11, single precision, static memory. contract.json says what every number means; README.md how to fly it, and what
-    it does when an estimate cannot be.
+    The code is C11 in single precision with static memory. contract.json defines every input and output. README.md
+    explains how to fly the policy, and what it does when an estimate is invalid.
 
     Attributes:
-        policy: a shipped policy (target, target-analytic, target-adaptive, flip), a policy file of `cfb train`, or
-            the name of a flip (double-flip, triple-flip ...).
+        policy: a shipped policy, a policy file of `cfb train`, or the name of a flip.
+            Shipped policies: target, target-analytic, target-adaptive, flip, flip-analytic.
+            Flips: double-flip, triple-flip ...
         output: folder to write to.
-        knobs: of a flip policy: a shipped manoeuvre or a YAML file (`cfb fly --keep`); flip by default.
-        holder: the target policy that climbs and catches in a flip; by default the one its knobs were found with.
-        check: compile it, compare it with JAX on 10 000 random sequences and in closed loop, and measure what it costs
-            on the drone's processor (sizes need arm-none-eabi-gcc, instruction counts also qemu-system-arm).
+        knobs: settings of the flip, for a flip policy: a shipped manoeuvre or a YAML file of `cfb fly --keep`.
+            Default: flip.
+        holder: target policy that climbs before a flip and catches the drone after it.
+            Default: the one with which the settings of the flip were found.
+        check: compile the C, compare it with JAX on 10 000 random sequences and in closed loop, and measure its cost.
+            The size on the drone's processor needs arm-none-eabi-gcc, the number of instructions also qemu-system-arm.
     """
 
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
@@ -78,10 +81,10 @@ class Export(Command):
     check: bool = False
 
     def run(self) -> Exported:
-        """Write the export, and check it if that is asked for.
+        """Write the C, and check it if a check was asked for.
 
         Raises:
-            CfbError: no such policy, a folder that cannot be written, or no compiler for the check.
+            CfbError: no such policy, a folder that cannot be written, or no C compiler for the check.
         """
         from cfb_mjx.runtime import configure_jax, environment
 

@@ -1,4 +1,4 @@
-"""``cfb fit``: the model's parameters from flights."""
+"""``cfb fit``: fit the parameters of a model to flights."""
 
 from __future__ import annotations
 
@@ -35,21 +35,22 @@ if TYPE_CHECKING:
     from cfb_mjx.sysid import Evaluation, identification
 
 FITTED_SHARE = 0.75
-"""Without --held-out, this first share of every log is fitted, and the rest judged on."""
+"""Without --held-out, this first share of every log is fitted, and the rest is used for the evaluation."""
 _NAMES = {"innovation": "innovations", "shooting": "multiple shooting"}
 
 
 @dataclass(frozen=True)
 class Fitted(Result):
-    """A model refitted to flights.
+    """A model that was fitted to flights.
 
     Attributes:
-        fit: ``fit.estimates["mass"].value``, ``.std`` and the like, and why others have no number.
-        other: the same by the estimator that was not chosen; None: was not asked for, or cannot run.
-        before: errors on the held-out flights of the model that was started from.
-        after: the same of the fitted model.
+        fit: the estimates, for instance ``fit.estimates["mass"].value`` and ``.std``, and the reasons why other
+            parameters have no estimate.
+        other: the fit by the other estimator; None if it was not asked for, or cannot run on these flights.
+        before: held-out errors of the model that the fit started from.
+        after: held-out errors of the fitted model.
         model: the fitted model, as written.
-        files: what was written, by what it is.
+        files: paths of the files written, by kind; None for a file that was not asked for.
     """
 
     fit: identification.Fit
@@ -61,7 +62,7 @@ class Fitted(Result):
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """As ``--json`` writes them."""
+        """The results as ``--json`` writes them."""
         from cfb_mjx.runtime import environment
         from cfb_mjx.sysid.evaluation import before_and_after
 
@@ -93,13 +94,13 @@ class Fitted(Result):
         for reason in dict.fromkeys(self.fit.unidentifiable.values()):
             yield f"not identifiable: {reason}"
         for name, e in self.fit.combinations.items():
-            yield f"known better together: {name} = {e.value:.6g} +- {e.std:.2g}"
+            yield f"known better in combination: {name} = {e.value:.6g} +- {e.std:.2g}"
         for name in self.fit.contradicted:
-            yield f"{name} was to be held, but the flights contradict its value: it was fitted too."
+            yield f"{name} was meant to stay fixed, but the flights contradict its value; it was fitted too."
         feedback = self.fit.feedback or (self.other and self.other.feedback)
         if feedback and feedback.present:
             yield (
-                f"flown under feedback: the commands answer the gyro (correlation {feedback.correlation:.2f}); "
+                f"flown under feedback: the commands respond to the gyro (correlation {feedback.correlation:.2f}); "
                 "multiple shooting is biased on such flights."
             )
 
@@ -111,7 +112,7 @@ class Fitted(Result):
             old, new = self.before.metrics(variant), self.after.metrics(variant)
             if old is None:
                 continue
-            # The same logs as before.
+            # Not None: both are evaluated on the same logs.
             new, still = not_none(new), not_none(hold)
             for key in ("velocity_rmse_mps", "attitude_rmse_deg", "rate_rmse_radps"):
                 for horizon in ("0.2", "0.5"):
@@ -123,30 +124,34 @@ class Fitted(Result):
 
 @command
 class Fit(Command):
-    """Refit the model to flights, with uncertainty, and judge it on data kept from the fit.
+    """Fit the parameters of a model to flights, with uncertainty, and evaluate the result on held-out data.
 
-    The estimator allows for feedback and for unmodelled disturbances. What the flights cannot tell is named instead of
-    being given a number.
+    The default estimator is not biased by feedback and allows for unmodelled disturbances. A parameter that the flights
+    do not identify gets no estimate; it is listed with the reason. Prints the estimates and the held-out errors before
+    and after the fit. Writes the fitted model.
 
     Attributes:
-        logs: flight logs to fit.
+        logs: flight logs to fit (MCAP, parquet, csv).
         output: model YAML to write.
-        parameters: names or groups, comma separated: inertia (or inertia_xx, ...), rotor_inertia (J_m), motor
-            (motor_time_constant, motor_gain), motor_speed_offset, thrust_scale, torque_scale, mass, cog (cog_x, cog_y),
-            pose_delay. By default inertia, rotor_inertia, motor_time_constant, motor_gain, cog and both scales.
-        held_out: logs to judge on; without them the last quarter of every log is kept from the fit.
+        parameters: names or groups of parameters, with commas between them.
+            Groups: inertia (inertia_xx, inertia_yy, inertia_zz), motor (motor_time_constant, motor_gain), cog (x, y).
+            Names: rotor_inertia (J_m), motor_speed_offset, thrust_scale, torque_scale, mass, pose_delay.
+            Default: inertia, rotor_inertia, motor_time_constant, motor_gain, cog, thrust_scale and torque_scale.
+        held_out: logs for the evaluation. Without them, the last quarter of every log is held out from the fit.
         model: preset or model YAML to start from.
-        set: parameters to set before, for instance mass=0.045 (weigh the drone: flights cannot tell it).
-        json: write the results here.
-        figure: draw the estimates and the held-out errors before and after here (.png, .svg, .pdf).
-        estimator: innovation (safe under feedback) or shooting (predictions over 200 ms; for flights without feedback);
-            auto takes innovation unless pose_delay is asked for.
-        robust: let outliers count linearly instead of squared.
-        commands_only: do not use measured rotor speeds to drive the body.
-        compare: show what the other estimator would say; multiple shooting is blind to feedback.
-        devices: of this machine that share the flights.
-        mass_std: standard deviation of the mass as weighed, kg; 5 % of it where nothing is said. Inertia, J_m and the
-            scales of thrust and torque are known no better than the mass.
+        set: changes to the model's parameters before the fit, for instance mass=0.045 (kg).
+            Weigh the drone: flights do not identify its mass.
+        json: JSON file for the results.
+        figure: file for a figure of the estimates and the held-out errors before and after (.png, .svg, .pdf).
+        estimator: innovation (not biased by feedback) or shooting (predictions over 200 ms; biased by feedback).
+            auto chooses innovation, unless pose_delay is to be fitted.
+        robust: let the loss of outliers grow linearly instead of quadratically.
+        commands_only: do not use measured rotor speeds as input of the body, even where the logs have them.
+        compare: also fit with the other estimator, and print its estimates.
+        devices: number of devices of this machine over which the flights are divided.
+        mass_std: standard deviation of the mass as weighed, kg, 0 or more.
+            It limits the accuracy of inertia, J_m and the scales of thrust and torque.
+            Default: the value in the model file, or 5 % of the mass if it has none.
     """
 
     logs: Logs
@@ -165,10 +170,10 @@ class Fit(Command):
     mass_std: float | None = None
 
     def run(self) -> Fitted:
-        """Fit, judge, and write the model and what else was asked for.
+        """Fit the model, evaluate it, and write it and the other files that were asked for.
 
         Raises:
-            CfbError: bad logs, parameters or outputs.
+            CfbError: bad logs, invalid parameters, or files that cannot be written.
         """
         from cfb_mjx.runtime import Progress, configure_jax
 
@@ -211,7 +216,7 @@ class Fit(Command):
         return result
 
     def _flights(self) -> tuple[list[FlightLog], list[FlightLog]]:
-        """Flights to fit and flights to judge on; the arguments are checked first."""
+        """Check the arguments, and read the flights to fit and the held-out flights."""
         from cfb_mjx.logs import read_log
 
         if not self.logs:
@@ -239,7 +244,7 @@ class Fit(Command):
     def _other(
         self, found: identification.Fit, logs: list[FlightLog], base: ModelFile, over: Shared | None
     ) -> identification.Fit | None:
-        """The estimator that was not chosen, for comparison; None where it cannot run."""
+        """The fit by the other estimator, for comparison; None if it cannot run on these flights."""
         from cfb_mjx.runtime import Progress
         from cfb_mjx.sysid.identification import fit
 

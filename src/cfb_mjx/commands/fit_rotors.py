@@ -1,4 +1,4 @@
-"""``cfb fit-rotors``: motors and rotor maps on their own, from flights with rotor speed and from bench tables."""
+"""``cfb fit-rotors``: fit motors and thrust and torque curves to flights with rotor speed and to bench tables."""
 
 from __future__ import annotations
 
@@ -39,13 +39,14 @@ _UNITS = {"thrust": "N", "torque": "N m"}
 
 @dataclass(frozen=True)
 class FittedRotors(Result):
-    """Motors and rotor maps fitted to files.
+    """Motors, thrust curves and torque curves that were fitted to files.
 
     Attributes:
-        fit: ``fit.estimates["motor_gain"].value``, ``.std`` and the like, and all else in ``fit.motors``, ``fit.maps``.
-        model: the model with them, as written.
-        asked: what the motors were to have beside gain and lag: offset, asymmetric, dead_time.
-        files: what was written, by what it is.
+        fit: the estimates, for instance ``fit.estimates["motor_gain"].value`` and ``.std``; ``fit.motors`` and
+            ``fit.maps`` have the details.
+        model: the model with the fitted motors and curves, as written.
+        asked: which of offset, asymmetric and dead_time the motors were fitted with on request.
+        files: paths of the files written, by kind; None for a file that was not asked for.
     """
 
     fit: RotorFit
@@ -55,7 +56,7 @@ class FittedRotors(Result):
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """As ``--json`` writes them."""
+        """The results as ``--json`` writes them."""
         from cfb_mjx.runtime import environment
 
         return self.fit.to_json() | {"environment": environment()}
@@ -71,8 +72,8 @@ class FittedRotors(Result):
         if fit.flown is not None:
             lines.append(
                 f"thrust in flight: {fit.flown.ratio:.3f} +- {fit.flown.ratio_std:.3f} times the curve of "
-                f"{fit.base.name} at the same rotor speeds, by the specific force of {1e3 * fit.flown.mass:.1f} g (not "
-                "written: cfb refine takes thrust_scale from predictions)"
+                f"{fit.base.name} at the same rotor speed, by the specific force at {1e3 * fit.flown.mass:.1f} g (not "
+                "written to the model: cfb refine fits thrust_scale to predictions)"
             )
         lines += [*fit.notes, f"model: {self.files['model']} ({', '.join(fit.entries)})"]
         if fit.motors and fit.motors.common.extras - {"offset"}:
@@ -81,7 +82,7 @@ class FittedRotors(Result):
 
     @property
     def _groups(self) -> dict[str, GroupFit]:
-        """What was fitted of motors, by what stands behind the names of its constants."""
+        """The fits of the motors, by the suffix of the names of their constants."""
         motors = self.fit.motors
         return {"": motors.common, **{f" M{n}": group for n, group in motors.motors.items()}} if motors else {}
 
@@ -101,7 +102,7 @@ class FittedRotors(Result):
                 yield f"not identifiable{suffix}: {reason}"
         for test in motors.common.tests:
             verdict = "supported by the data" if test.supported else "not supported by the data"
-            hint = "; the fit allows for it" if test.supported and test.name not in self.asked else ""
+            hint = "; the fit includes it" if test.supported and test.name not in self.asked else ""
             yield f"{test.name.replace('_', ' ')}: {verdict} (p = {test.p_value:.2g}, BIC {-test.bic_gain:+.1f}){hint}"
         for name, p in motors.differences.items():
             if p < 0.01:
@@ -114,13 +115,13 @@ class FittedRotors(Result):
 
 
 def _of_steady(steady: SteadyFit) -> Iterator[str]:
-    out = f", {steady.outliers:.0%} of them left out as outliers" if steady.outliers else ""
-    yield f"steady speed: {steady.points} points about a line, spread {steady.spread:.1f} rad/s{out}"
+    out = f", with {steady.outliers:.0%} of the points left out as outliers" if steady.outliers else ""
+    yield f"steady speed: {steady.points} points, spread about a line {steady.spread:.1f} rad/s{out}"
     if steady.per_volt is not None:
         yield (
-            f"steady speed follows command times voltage, omega = {steady.offset:.0f} + {steady.per_volt:.0f} u "
-            f"V; a line in u alone leaves {steady.spread_without_voltage:.1f} rad/s. The gain is that at 3.7 V; "
-            f"the effect battery_sag with slope {steady.sag_slope:.2f} makes a model follow the voltage."
+            f"steady speed follows command times voltage, omega = {steady.offset:.0f} + {steady.per_volt:.0f} u V; "
+            f"a line in u alone leaves a spread of {steady.spread_without_voltage:.1f} rad/s. The gain holds at 3.7 V; "
+            f"with the effect battery_sag of slope {steady.sag_slope:.2f} a model follows the voltage."
         )
 
 
@@ -129,9 +130,9 @@ def _of_map(name: str, fitted: MapFit) -> Iterator[str]:
     yield f"{name}: {len(fitted.value)} points, noise {fitted.noise[0]:.2g} {unit}, {len(fitted.outliers)} outliers"
     if fitted.offset_std:
         yield (
-            f"{name}: every point reads {fitted.offset:+.3g} {unit} too much "
-            f"({abs(fitted.offset) / fitted.offset_std:.0f} std): a scale that was not tared; fitted as an offset and "
-            "left out of the curve."
+            f"{name}: every reading has an offset of {fitted.offset:+.3g} {unit} "
+            f"({abs(fitted.offset) / fitted.offset_std:.0f} std), as if the scale was not tared; the curve is fitted "
+            "without this offset."
         )
     for note in fitted.shape.notes():
         yield f"{name}: {note}"
@@ -142,27 +143,30 @@ def _of_map(name: str, fitted: MapFit) -> Iterator[str]:
 
 @command
 class FitRotors(Command):
-    """Fit motors and rotor maps on their own, from flights with rotor speed and from bench tables.
+    """Fit motors, thrust curves and torque curves to flights with measured rotor speed and to bench tables.
 
-    What a file holds is seen from its content: a flight log, command steps (t, u or u1..u4, omega or omega1..omega4),
-    steady points (u, omega, vbat), steady force and torque (omega, force, torque, optionally motor), or any of these
-    under the names of Bitcraze's, RCbenchmark's or Tyto's tools. What the data cannot tell is named.
+    The kind of each file is found from its columns: a flight log, command steps (t, u or u1..u4, omega or
+    omega1..omega4), steady points (u, omega, vbat), or steady force and torque (omega, force, torque, optionally
+    motor). Bench tables may also have the column names of the tools of Bitcraze, RCbenchmark and Tyto.
+
+    Prints the estimates, and which constants the data do not identify. Writes the model with the fitted motors and
+    curves.
 
     Attributes:
-        files: flight logs and bench tables (csv, parquet).
+        files: flight logs, and bench tables (csv, parquet).
         output: model YAML to write.
         model: preset or model YAML to start from.
-        set: parameters to set before, for instance mass=0.045.
-        offset: fit the steady rotor speed at zero command as well (needs commands over a wide range).
-        asymmetric: separate time constants for spin-up and spin-down (reported, not written to the model).
-        dead_time: time from a command to its first effect (reported, not written to the model).
-        per_motor: every motor on its own as well, and a thrust and torque factor for each.
-        robust: weigh outliers among the bench points of force and torque down.
-        json: write the results here.
-        figure: draw fits and residuals here (.png, .svg, .pdf).
-        tared: the scale read zero at rest, so that no offset of its readings is tried and none is in the error bars.
-        rotors: of how many rotors force and torque are; without it of four where several rotors' speeds stand beside
-            them, else of one.
+        set: changes to the model's parameters before the fit, for instance mass=0.045 (kg).
+        offset: also fit the steady rotor speed at zero command, rad/s; needs commands over a wide range.
+        asymmetric: fit separate time constants for spin-up and spin-down (reported, not written to the model).
+        dead_time: fit the time from a command to its first effect (reported, not written to the model).
+        per_motor: also fit every motor on its own, with a factor on thrust and on torque for each.
+        robust: reduce the weight of outliers among the bench points of force and torque.
+        json: JSON file for the results.
+        figure: file for a figure of the fits and residuals (.png, .svg, .pdf).
+        tared: the scale read zero at rest. No offset of its readings is then fitted, or counted in the uncertainty.
+        rotors: number of rotors whose force and torque were measured together.
+            Default: 4 if the file has the speeds of several rotors beside one force, else 1.
     """
 
     files: Files
@@ -180,10 +184,10 @@ class FitRotors(Command):
     rotors: Annotated[int | None, Within(1)] = None
 
     def run(self) -> FittedRotors:
-        """Fit what the files hold, and write the model and what else was asked for.
+        """Fit the contents of the files, and write the model and the other files that were asked for.
 
         Raises:
-            CfbError: bad files, nothing that can be fitted, or outputs that cannot be written.
+            CfbError: bad files, files to which nothing can be fitted, or files that cannot be written.
         """
         from cfb_mjx.logs.rotor_files import read_rotor_files
         from cfb_mjx.runtime import Progress, configure_jax
@@ -191,7 +195,7 @@ class FitRotors(Command):
         if not self.files:
             raise CfbError("fit-rotors needs at least one file; see 'cfb fit-rotors --help'.")
         require_folder(self.output, self.json, self.figure)
-        read = read_rotor_files(self.files, self.rotors)  # before jax loads: a bad file is refused at once
+        read = read_rotor_files(self.files, self.rotors)  # before jax loads, so that a bad file is refused at once
         configure_jax(x64=True)
         from cfb_mjx.parameters import load_model_file, save_model_file
         from cfb_mjx.sysid.rotors.fitting import fit_rotors
@@ -220,7 +224,7 @@ class FitRotors(Command):
         names = ", ".join(path.name for path in self.files)
         if not found.entries:
             reasons = "; ".join(found.motors.common.unidentifiable.values()) if found.motors else ""
-            raise CfbError(f"{names}: cannot tell any constant of the model ({reasons}).")
+            raise CfbError(f"{names}: no constant of the model can be identified from these files ({reasons}).")
         return replace(
             found.model_file(f"cfb fit-rotors on {len(self.files)} file(s), {date.today().isoformat()}"),
             name=self.output.stem,

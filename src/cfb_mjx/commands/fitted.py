@@ -1,4 +1,4 @@
-"""What every command that fits a model does alike: what it may be judged on, and what the model says of its origin."""
+"""Shared by all commands that fit a model: the check of the held-out logs, and the provenance of the model."""
 
 from __future__ import annotations
 
@@ -12,25 +12,28 @@ from cfb_mjx.errors import CfbError
 
 
 def require_apart(fit: Sequence[Path], held_out: Sequence[Path]) -> None:
-    """Refuse a log that is to be fitted and judged on.
+    """Check that no log is both fitted and held out.
 
     Raises:
-        CfbError: a file is on both sides.
+        CfbError: a file is in both lists.
     """
     both = {path.resolve() for path in fit} & {path.resolve() for path in held_out}
     if both:
         names = ", ".join(sorted(path.name for path in both))
-        raise CfbError(f"{names}: given to fit and as --held-out; nothing may be judged on what it was fitted to.")
+        raise CfbError(
+            f"{names}: given both to fit and as --held-out; a model must not be evaluated on flights it was fitted to, "
+            "so leave them out of one of the two."
+        )
 
 
 def provenance(words: Sequence[str], base: str, hashes_name: str, paths: Sequence[Path], **more) -> dict:
-    """Where a fitted model comes from: command line without folders, hashes of the fitted files, versions.
+    """Where a fitted model comes from: the command line without folders, hashes of the fitted files, versions.
 
     Args:
-        words: of the command line, without ``cfb``: ``["fit", *self.words()]``.
-        base: name of the model started from.
-        hashes_name: what the hashes are called.
-        paths: fitted files.
+        words: words of the command line without ``cfb``: ``["fit", *self.words()]``.
+        base: name of the model that the fit started from.
+        hashes_name: key of the entry with the hashes.
+        paths: the fitted files.
         **more: further entries.
     """
     from cfb_mjx.runtime import environment

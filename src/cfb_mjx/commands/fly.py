@@ -1,4 +1,4 @@
-"""``cfb fly``: how a controller flies in simulation."""
+"""``cfb fly``: fly a controller in simulation and measure its performance."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
 
 _UNITS = {"mm": "mm", "s": "s", "mps": "m/s", "m": "m", "radps": "rad/s"}
 _FLOWN = ("controller", "task", "model", "plants", "magnitude", "gyro", "knobs", "environment")
-"""Of the numbers: what was flown."""
+"""Keys of the results that say what was flown."""
 _ROUNDS = 20
 
 
 @dataclass(frozen=True)
 class Flown(Result):
-    """How a controller flew.
+    """How well a controller flew.
 
     Attributes:
-        numbers: as ``--json`` writes them: ``numbers["mean_distance_mm"]``, ``numbers["success_rate"]`` and the like;
-            for a set of drones in ``numbers["on"]`` by its names.
-        files: what was written, by what it is.
-        searched: whether the knobs of a flip (``numbers["knobs"]``) were looked for.
+        numbers: the results as ``--json`` writes them, for instance ``numbers["mean_distance_mm"]`` and
+            ``numbers["success_rate"]``. For a set of drones they are in ``numbers["on"]``, by the names of the drones.
+        files: paths of the files written, by kind; None for a file that was not asked for.
+        searched: whether the settings of a flip (``numbers["knobs"]``) were found by a search.
     """
 
     numbers: Mapping[str, Any]
@@ -59,38 +59,50 @@ class Flown(Result):
 
 @command
 class Fly(Command):
-    """Fly a controller in simulation and measure it.
+    """Fly a controller in simulation and measure its performance.
 
-    hover: 6 s at the target, the first second not counted. step: 6 m to one side. recover: thrown at 3 m/s, tilted 60
-    deg. flip, double-flip, triple-flip: climb, turn about the x axis, return to the start; `cfb fly double-flip` is
-    short for `cfb fly flip --task double-flip`.
+    The tasks, chosen with --task:
+
+    - hover: 6 s at the target; the first second is not counted.
+    - step: a step of the target by 6 m to one side.
+    - recover: the drone starts thrown at 3 m/s and tilted by 60 deg.
+    - flip, double-flip, triple-flip: climb, turn about the x axis, and return to the start. `cfb fly double-flip` is
+      short for `cfb fly flip --task double-flip`.
+
+    Prints the measured numbers; over several flights these are means, with quantiles and the success rate.
 
     Attributes:
-        controller: pid or mellinger (the firmware's), a shipped policy, a policy file of `cfb train`, or the name of a
-            flip.
-        task: what to fly; hover by default, and flip with a flip policy.
+        controller: a shipped policy, a policy file of `cfb train`, the name of a flip, or pid or mellinger.
+            pid and mellinger are the controllers of the firmware.
+        task: task to fly. Default: hover, or flip for a flip policy.
         model: preset or model YAML of the drone, with its effects.
-        plants: number of flights, each on a drone drawn anew.
-        magnitude: factor on the randomisation of the drones; 0 flies the model itself.
-        randomisation: which ranges: a shipped name, a YAML file, or a model whose numbers have a spread (cfb-fleet).
+        plants: number of flights, at least 1, each on a drone drawn from the randomisation.
+        magnitude: factor on the ranges of the randomisation; 0 flies the model itself.
+        randomisation: ranges of the randomisation: a shipped name, a YAML file or a model.
+            The parameters of such a model must have a spread between drones (cfb-fleet).
         on: fly the model with each list of effects of a set in turn: off-nominal (shipped) or a YAML file.
-        noise: with the noise of state and estimates that policies are trained with.
-        seed: of everything random.
-        json: write the results here.
-        figure: draw the flights here.
-        recording: write the flights here, for rerun (.rrd).
-        video: film the first flight here (.mp4 or .gif).
-        log: write the first flight here as a flight log (.mcap), for cfb view, evaluate, fit.
-        knobs: of a flip: when it switches and what it asks for, a shipped manoeuvre (flip-wide, double-flip-low ...) or
-            a YAML file; the task's own by default.
-        set: changes to the knobs of a flip, for instance rate_radps=18 climb_s=0.4; a search leaves these alone.
-        holder: the target policy that climbs and catches in a flip; by default the one its knobs were found with.
-        search: look for the knobs of a flip first: least height on the model; largest margin on drones of the
-            randomisation; or the most of these that complete it within 1.8 m.
-        keep: write the knobs that were flown here, for --knobs.
-        devices: of this machine that share the flights of many plants.
-        gyro: late: as late as the pose, the model's pose_delay, as in the paper; local: on the drone, gyro_delay late.
-            By default a policy flies as it was trained, and pid and mellinger with a local one, as in the firmware.
+        noise: add the noise of the state and the estimates that policies are trained with.
+        seed: seed of all random numbers.
+        json: JSON file for the results.
+        figure: file for a figure of the flights (.png, .svg, .pdf).
+        recording: file for a recording of the flights for rerun (.rrd).
+        video: file for a video of the first flight (.mp4 or .gif).
+        log: file for a flight log of the first flight (.mcap), which cfb view, evaluate and fit can read.
+        knobs: settings of a flip: when it switches phase, and its set-points.
+            A shipped manoeuvre (flip-wide, double-flip-low ...) or a YAML file. Default: those of the task.
+        set: changes to the settings of a flip, for instance rate_radps=18 climb_s=0.4; --search does not change these.
+        holder: target policy that climbs before a flip and catches the drone after it.
+            Default: the one with which the settings of the flip were found.
+        search: search for the settings of a flip before flying.
+            height: smallest height needed on the model.
+            margin: most randomised drones that complete the flip, as high above the floor as possible.
+            The model itself then keeps within 1.8 m.
+            within: most randomised drones that complete the flip within 1.8 m.
+        keep: YAML file for the settings of the flip that were flown, for --knobs.
+        devices: number of devices of this machine over which the flights are divided.
+        gyro: delay of the gyro. late: as late as the pose, by the model's pose_delay, as in the paper.
+            local: read on the drone, late by gyro_delay only.
+            Default: for a policy as it was trained; local for pid and mellinger, as in the firmware.
     """
 
     controller: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONTROLLER")]
@@ -116,11 +128,11 @@ class Fly(Command):
     gyro: Literal["late", "local"] | None = None
 
     def run(self) -> Flown:
-        """Fly, measure, and write what was asked for.
+        """Fly, measure, and write the files that were asked for.
 
         Raises:
-            CfbError: an unknown controller, model or randomisation, impossible numbers, options that do nothing, or
-                outputs that cannot be written.
+            CfbError: an unknown controller, model or randomisation, numbers outside their range, options that would
+                have no effect, or files that cannot be written.
         """
         from cfb_mjx.runtime import configure_jax, environment
 
@@ -145,7 +157,7 @@ class Fly(Command):
         nominal = Quadrotor.from_file(described)
         spread = load_randomisation(self.randomisation)
         require_possible(nominal, spread, self.magnitude, "--magnitude")
-        # Scaled for the model that was named, whatever it is flown on.
+        # The controller is scaled for the model that was named, also if --on flies it on other drones.
         controller, manoeuvre = find_controller(name, nominal), None
         course = TargetTask(
             noise=Noise() if self.noise else QUIET,
@@ -181,34 +193,34 @@ class Fly(Command):
                 from cfb_mjx.view.flown import write_flights
 
                 title = f"{name}, {task}, {self.model}"
-                # Of one model, as `_check` demands.
+                # Not None: `_check` allows these files only for flights of one model.
                 write_flights(not_none(flown), controller.control_dt_s, nominal, title, flips, **self._shown)
         return Flown(numbers, {"knobs": self.keep, "results": self.json, **self._shown}, self.search is not None)
 
     @property
     def _shown(self) -> dict[str, Path | None]:
-        """Files that show the flights of one model."""
+        """Paths of the files that show the flights of one model."""
         return {"figure": self.figure, "recording": self.recording, "video": self.video, "log": self.log}
 
     def _check(self) -> None:
         require_folder(self.json, *self._shown.values(), self.keep)
         if self.on is not None and any(self._shown.values()):
             raise CfbError(
-                "--figure, --recording, --video and --log show the flights of one model; leave out --on, or give the "
-                "drone with --model."
+                "--figure, --recording, --video and --log show flights of one model; leave out --on, or give one drone "
+                "with --model."
             )
         if self.video is not None:
             from cfb_mjx.view.film import check_film
 
             check_film(self.video)
         if self.plants < 1:
-            raise CfbError(f"--plants {self.plants}: at least one drone must fly.")
+            raise CfbError(f"--plants {self.plants}: must be 1 or more; at least one drone must fly.")
         require_seed(self.seed, "--seed")
 
     def _measured(
         self, fly: Callable[[Quadrotor], tuple[dict[str, Any], Flight]], described: ModelFile, nominal: Quadrotor
     ) -> tuple[dict[str, Any], Flight | None]:
-        """What was measured on the model, and its flights; or on each of a set of drones."""
+        """The results on the model and its flights; with --on the results on each drone of the set, and None."""
         if self.on is None:
             return fly(nominal)
         from cfb_mjx.runtime import Progress
@@ -223,17 +235,17 @@ class Fly(Command):
     def _manoeuvre(
         self, turner: Controller, controller: str, task: str, wild: TargetTask, nominal: Quadrotor
     ) -> Manoeuvre:
-        """What flies a flip, searched for if that is asked, and kept.
+        """The controller of a flip, with its settings found by a search and written to a file if asked for.
 
         Args:
             turner: the flip policy.
-            controller: its name.
-            task: which flip.
-            wild: with the randomisation that a search for margin is about.
+            controller: name of the flip policy.
+            task: name of the flip.
+            wild: task with the randomisation that the searches margin and within use.
             nominal: the drone.
 
         Raises:
-            CfbError: no flip policy, no target policy, or bad knobs.
+            CfbError: not a flip policy, a holder that is not a target policy, or invalid settings of the flip.
         """
         from cfb_mjx.control.controllers import find_controller, is_flip_policy
         from cfb_mjx.control.manoeuvre import Manoeuvre
@@ -245,7 +257,7 @@ class Fly(Command):
 
         if not isinstance(turner, NeuralController) or not is_flip_policy(turner):
             raise CfbError(
-                f"{controller}: is no flip policy and cannot fly --task {task}; give flip, or one of cfb train flip."
+                f"{controller}: is not a flip policy and cannot fly --task {task}; give flip or one of cfb train flip."
             )
         described = load_manoeuvre(self.knobs or task, self.set)
         described = replace(described, holder=self.holder or described.holder)
@@ -256,7 +268,7 @@ class Fly(Command):
             )
         if described.rotations != FLIPS[task]:
             raise CfbError(
-                f"--knobs {self.knobs}: turn {described.rotations} times, --task {task} {FLIPS[task]} times."
+                f"--knobs {self.knobs}: turn {described.rotations} times, but --task {task} turns {FLIPS[task]} times."
             )
         manoeuvre = Manoeuvre(holder, turner, described.knobs)
         if self.search is not None:
@@ -278,9 +290,9 @@ class Fly(Command):
 
 
 def _table(numbers: Mapping[str, Any]) -> list[str]:
-    """What was measured on one model, a line for each number."""
+    """The results on one model, a line for each number."""
     drones = "drone" if numbers["plants"] == 1 else "drones"
-    gyro = "the gyro as late as the pose" if numbers["gyro"] == "late" else "the gyro on the drone"
+    gyro = "gyro as late as the pose" if numbers["gyro"] == "late" else "gyro on the drone"
     lines = [f"{numbers['controller']}, {numbers['task']}: {numbers['plants']} {drones}, {numbers['model']}, {gyro}"]
     for key, value in numbers.items():
         if key in (*_FLOWN, "quantiles", "diverged"):
@@ -295,7 +307,7 @@ def _table(numbers: Mapping[str, Any]) -> list[str]:
 
 
 def _row(name: str, measured: Mapping[str, Any], width: int) -> str:
-    """What was measured on one of a set of drones."""
+    """The results on one drone of a set, in one line."""
     shown = [
         f"{_label(key)} {value:.4g}"
         for key, value in measured.items()
@@ -309,7 +321,7 @@ def _row(name: str, measured: Mapping[str, Any], width: int) -> str:
 
 
 def _diverged(measured: Mapping[str, Any]) -> str:
-    return f"{measured['diverged']} diverged: their states are no numbers, they failed and are in no mean"
+    return f"{measured['diverged']} diverged (states not finite): they count as failed and are left out of the means"
 
 
 def _label(key: str) -> str:

@@ -1,4 +1,4 @@
-"""``cfb import``: a flight log of any kind, as MCAP."""
+"""``cfb import``: convert a flight log of any supported format to MCAP."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadingOptions(Command):
-    """How to read logs that do not speak for themselves.
+    """Options for reading logs whose content is not clear from the file alone.
 
     Attributes:
-        mapping: YAML saying which logged variable, column or field is what.
+        mapping: YAML file that says which logged variable, column or field holds which quantity.
         topics_yaml: crazyflies.yaml with the variable names of the custom topics of a Crazyswarm2 bag.
-        robot: whose flight to read from a Crazyswarm2 bag or a table of several.
-        time_unit: unit of the time column of a radio csv: s, ms, us or ns.
+        robot: name of the robot whose flight is read, for a Crazyswarm2 bag or a table with several robots.
+        time_unit: unit of the time column of a radio csv: s, ms, us or ns. Default: found from the column.
         motion_capture: take pose and velocity from motion capture that was logged beside the estimate.
-        keep_ground: leave in what was recorded on the ground and in the hand.
-        cut: seconds of the recording to leave out, for instance 12.5:15, :3 (all up to 3 s) or 40: (all from then on).
-        fix: a change of unit, axes or order, as a refusal names it, for instance velocity-frame=body.
+        keep_ground: keep the rows that were recorded on the ground or in the hand.
+        cut: time spans to leave out, s of the recording: 12.5:15, :3 (all up to 3 s) or 40: (all from 40 s on).
+        fix: change of unit, axes or order, by the name that an error message gives, for instance velocity-frame=body.
     """
 
     mapping: File = None
@@ -43,7 +43,7 @@ class ReadingOptions(Command):
     fix: Pairs = ()
 
     def reading(self) -> dict[str, Any]:
-        """The options for `cfb_mjx.logs.read_log`."""
+        """The options as keyword arguments of `cfb_mjx.logs.read_log`."""
         return {
             "mapping": self.mapping,
             "topics_yaml": self.topics_yaml,
@@ -61,9 +61,9 @@ class Imported(Result):
     """A flight that was converted.
 
     Attributes:
-        log: the flight, as it was written.
-        verdict: what its signals say about each other.
-        output: the MCAP file.
+        log: the flight, as written.
+        verdict: the agreement of its signals.
+        output: path of the MCAP file.
     """
 
     log: FlightLog
@@ -97,17 +97,20 @@ _LOGGING = {"sd": "config.txt", "radio": "radio.json"}
 class Import(ReadingOptions):
     """Convert a flight log to MCAP.
 
-    Checks units, frames and time stamps on the way, and says what it changed.
+    Checks units, frames and time stamps, and prints what was changed. A log whose signals contradict each other is
+    refused; the error says which option corrects it.
 
     Attributes:
-        sources: log to read: parquet, csv, MCAP, Crazyflie micro SD card binary, ROS bag or its folder, radio csv,
-            .npz, .mat, PX4's ULog, an MCAP of others; several tables, as cfclient writes one per log block, are one
-            flight.
-        output: MCAP file to write.
-        format: layout of the source; auto looks at its content.
-        motor_shift: s by which to delay the motor columns of an IDSIA log instead of the estimated shift.
-        print_config: print what to log, and read nothing: the config.txt of the micro SD card deck, or the log
-            blocks of the radio for cfclient.
+        sources: flight log to read, in one of the formats listed in docs/logs.md.
+            Supported are parquet, csv, MCAP (also of other programs), micro SD card binaries of the Crazyflie,
+            ROS bags (file or folder), radio csv, .npz, .mat, and ULog of PX4.
+            Several tables, such as cfclient writes for each log block, are read as one flight.
+        output: MCAP file to write. Required, except with --print-config.
+        format: format of the source; auto finds it from the content.
+        motor_shift: time by which the motor columns of an IDSIA log are delayed, s; 0 leaves them as recorded.
+            Default: the shift is estimated.
+        print_config: print what to log, and read nothing.
+            sd: the config.txt of the micro SD card deck; radio: the log blocks for cfclient.
     """
 
     sources: Logs = ()
@@ -119,10 +122,10 @@ class Import(ReadingOptions):
     print_config: Literal["sd", "radio"] | None = None
 
     def run(self) -> Imported | Written:
-        """Convert, or find what to log if that was asked for.
+        """Convert the log, or return what to log if that was asked for.
 
         Raises:
-            CfbError: see `cfb_mjx.logs.read_log`; or the output is not an .mcap, or is the source itself.
+            CfbError: as `cfb_mjx.logs.read_log`; or the output does not end in .mcap, or is the source itself.
         """
         if self.print_config is not None:
             text = shipped("configs", "logs", _LOGGING[self.print_config]).read_text(encoding="utf-8")
@@ -149,11 +152,11 @@ def _require_output(output: Path, sources: tuple[Path, ...]) -> None:
     if output.suffix != ".mcap":
         raise CfbError(f"{output}: the output must end in .mcap.")
     if output.exists() and any(source.exists() and output.samefile(source) for source in sources):
-        raise CfbError(f"{output}: is the source itself; choose another name.")
+        raise CfbError(f"{output}: the output is the source itself; choose another name.")
 
 
 def _proposed(error: UnknownNames, mapping: Path) -> CfbError:
-    """The refusal of names of one's own, with the proposed mapping written."""
+    """Write the proposed mapping of a table with unknown column names, and return the error that names the file."""
     write_text(mapping, error.mapping)
     said = str(error).partition("; cfb import")[0]
     return CfbError(f"{said}; a mapping was written to {mapping}: check it, then add --mapping {mapping}.")

@@ -1,4 +1,4 @@
-"""A command's line: words to a command object, and its help."""
+"""Command lines: parsing them into command objects, running them, and the text of their help."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _DOCUMENTED = re.compile(r"\n\s*(Attributes|Examples):")
 
 
 def parse(name: str, words: Sequence[str]) -> Command:
-    """The command that a line asks for.
+    """Parse a command line into a command.
 
     Args:
-        name: of the command.
-        words: of its line, after the name.
+        name: name of the command.
+        words: the words of the line after the name.
 
     Raises:
-        CfbError: a number out of its range.
-        SystemExit: help was asked for, or the line cannot be read; the parser has explained itself.
+        CfbError: a number outside its range, or a file name with the wrong ending.
+        SystemExit: the user asked for help, or the line is invalid; the parser has printed the reason.
     """
     kind = load(name)
-    # The parser's own words are coloured; it repeats what was typed, or what the shell put there.
+    # The parser prints in colour and repeats the words of the line, which may contain control characters.
     harmless = all(shown(word) == word for word in words)
     with nullcontext() if harmless else escaped():
         values = tyro.cli(_arguments(kind), prog=f"cfb {name}", description=_description(name), args=list(words))
@@ -40,7 +40,7 @@ def parse(name: str, words: Sequence[str]) -> Command:
 
 
 def run_line(name: str, words: Sequence[str]) -> int:
-    """Do what a line asks for, print what was found, and return the status to exit with.
+    """Parse and run a command line, print the result, and return the exit status.
 
     Raises:
         CfbError: bad input, or a result with a `complaint`.
@@ -51,7 +51,7 @@ def run_line(name: str, words: Sequence[str]) -> int:
             found = asked.run()
             if text := str(found):
                 print(text)
-    except SystemExit as stop:  # the parser, or a process above this one, has already explained itself
+    except SystemExit as stop:  # the parser, or the supervising process, has already printed why
         return stop.code if isinstance(stop.code, int) else 2
     if found.complaint is not None:
         raise CfbError(found.complaint)
@@ -59,7 +59,7 @@ def run_line(name: str, words: Sequence[str]) -> int:
 
 
 def _arguments(kind: type[Command]):
-    """A function that takes a command's arguments as the parser should see them, and returns them by name."""
+    """A function with the signature and docstring for the parser; it returns a command's arguments by name."""
 
     def given(**values):
         return values
@@ -82,7 +82,7 @@ def _arguments(kind: type[Command]):
 
 
 def _description(name: str) -> str:
-    """What stands above the arguments: two examples, and what the command does."""
+    """The text above the arguments in the help: examples, and what the command does."""
     examples = "\n".join(f"  {line}" for line in COMMANDS[name].examples)
     text = _DOCUMENTED.split(not_none(inspect.getdoc(load(name))))[0].strip()
     return f"Examples:\n{examples}\n\n{text}"

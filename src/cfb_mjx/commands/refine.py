@@ -1,4 +1,4 @@
-"""``cfb refine``: numbers of named effects from flights."""
+"""``cfb refine``: fit the parameters of named effects to flights."""
 
 from __future__ import annotations
 
@@ -32,12 +32,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Refined(Result):
-    """A model with effects fitted to flights.
+    """A model with effects that were fitted to flights.
 
     Attributes:
-        numbers: as ``--json`` writes them: ``numbers["numbers"]["rotor_drag.coefficient"]["value"]`` and the like.
+        numbers: the results as ``--json`` writes them, for instance
+            ``numbers["numbers"]["rotor_drag.coefficient"]["value"]``.
         model: the model, as written.
-        files: what was written, by what it is.
+        files: paths of the files written, by kind; None for a file that was not asked for.
     """
 
     numbers: Mapping[str, Any]
@@ -60,25 +61,30 @@ class Refined(Result):
 
 @command
 class Refine(Command):
-    """Fit the numbers of effects you name, where close-loop would search for them.
+    """Fit the parameters of effects that you name. (`cfb close-loop` searches for the effects itself.)
 
-    Innovations are not biased by feedback. Predictions over half a second are what a model is used for, and feedback
-    biases them: every number stays within what is plausible, inertia within 25 %.
+    The parameters are fitted either to predictions over half a second, which is what a model is used for, or to
+    innovations. Feedback biases a fit to predictions, so every parameter is limited to its plausible range, and inertia
+    to 25 % of change. Feedback does not bias a fit to innovations.
+
+    Prints the fitted parameters, and the held-out errors before and after if --held-out is given. Writes the model.
 
     Attributes:
-        logs: flight logs to fit.
+        logs: flight logs to fit (MCAP, parquet, csv).
         output: model YAML to write.
-        effects: names, comma separated (docs/effects.md), or plant: all that a drone in one piece usually lacks. By
-            default those the model has.
-        held_out: other flights, to be judged on.
+        effects: names of effects (docs/effects.md) with commas between them. Default: the effects of the model.
+            plant stands for all effects that an undamaged drone without load usually needs.
+        held_out: other flights, for the evaluation; nothing is fitted to them.
         model: preset or model YAML to start from.
-        set: parameters to change, for instance mass=0.045.
-        estimator: what is fitted.
-        predictor: leave inertia and inflow free; the result predicts better, is a wrong plant, and is marked so.
-        weight: what flights whose names begin with NAME count against the others (predictions only).
-        as_logged: take no sensor fault out, even where sensors disagree or the model lists one. A stretched velocity is
-            then said to be an attitude's too, and only the position predicted is put right.
-        json: write the results here.
+        set: changes to the model's parameters before the fit, for instance mass=0.045 (kg).
+        estimator: what the parameters are fitted to.
+        predictor: let inertia and inflow leave their plausible range (--estimator predictions only).
+            The model then predicts better, but is wrong as a plant, and is marked as a predictor.
+        weight: weight of the flights whose names begin with NAME, above 0 (--estimator predictions only).
+            Other flights have weight 1.
+        as_logged: correct no sensor faults, even if sensors disagree or the model lists a fault.
+            If the velocity has a wrong scale, the attitude is assumed to share it; only positions are corrected.
+        json: JSON file for the results.
     """
 
     logs: Logs
@@ -94,10 +100,10 @@ class Refine(Command):
     json: File = None
 
     def run(self) -> Refined:
-        """Fit, judge, and write the model and what else was asked for.
+        """Fit the effects, evaluate the model, and write it and the other files that were asked for.
 
         Raises:
-            CfbError: bad logs, model, effects, weights or outputs.
+            CfbError: bad logs, an invalid model, effects or weights, or files that cannot be written.
         """
         from cfb_mjx.runtime import configure_jax, environment, say
 
@@ -130,7 +136,7 @@ class Refine(Command):
         return Refined(numbers, model, {"model": self.output, "results": self.json})
 
     def _flights(self) -> tuple[list[FlightLog], list[FlightLog]]:
-        """Flights to fit and flights to judge on; the arguments are checked first."""
+        """Check the arguments, and read the flights to fit and the held-out flights."""
         from cfb_mjx.logs import read_log, require_own_names
 
         if not self.logs:
@@ -139,7 +145,7 @@ class Refine(Command):
         require_apart(self.logs, self.held_out)
         if self.estimator == "innovations" and (self.predictor or self.weight):
             raise CfbError(
-                "--predictor and --weight are for --estimator predictions; leave them out, or the estimator."
+                "--predictor and --weight are for --estimator predictions; leave them out, or use that estimator."
             )
         logs, judged = ([read_log(path) for path in paths] for paths in (self.logs, self.held_out))
         for group in (logs, judged):
@@ -147,7 +153,7 @@ class Refine(Command):
         return logs, judged
 
     def _weights(self, logs: list[FlightLog]) -> dict[str, float]:
-        """What flights count, by their names."""
+        """The weights that were given, by the names of the flights."""
         found = {}
         for text in self.weight:
             name, _, value = text.partition("=")
@@ -164,7 +170,7 @@ class Refine(Command):
         return found
 
     def _names(self, base: ModelFile) -> list[str]:
-        """Of the effects to fit."""
+        """Names of the effects to fit."""
         from cfb_mjx.model.effects import CATALOGUE
         from cfb_mjx.sysid.refinement.numbers import PLANT
 
@@ -173,7 +179,7 @@ class Refine(Command):
         names = self.effects.split(",") if self.effects else [e["name"] for e in base.effects if e["name"] in CATALOGUE]
         if not names:
             raise CfbError(
-                f"model {base.name} has no effects; name some to fit, for instance --effects rotor_drag, or all a "
-                "drone usually lacks with --effects plant."
+                f"model {base.name} has no effects; name the effects to fit, for instance --effects rotor_drag, or fit "
+                "all that a drone usually needs with --effects plant."
             )
         return names

@@ -1,4 +1,4 @@
-"""``cfb reproduce``: the paper's figures and tables."""
+"""``cfb reproduce``: reproduce the figures and tables of the paper."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import tyro
 
 from cfb_mjx.commands.command import Command, OutputFolder, Result, command
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import code_identity, output_folder, together
+from cfb_mjx.files import VectorFormat, code_identity, output_folder, together
 
 if TYPE_CHECKING:
     from cfb_mjx import reproduce
@@ -23,14 +23,14 @@ _KINDS = {"result": "", "input": "   [input]", "own": "   [own flight]"}
 
 @dataclass(frozen=True)
 class Reproduced(Result):
-    """The paper's numbers beside ours.
+    """The numbers of the paper beside ours.
 
     Attributes:
-        results: by name of the item: ``results["motor-step"].rows`` hold the paper's numbers and ours.
+        results: the results by the name of the item; ``results["motor-step"].rows`` hold the paper's numbers and ours.
         environment: date, machine and versions.
-        seconds: that it took.
-        page: to open in a browser.
-        files: the rows as Markdown and as JSON.
+        seconds: how long it took, s.
+        page: path of the page, to open in a browser.
+        files: paths of the rows as Markdown and as JSON.
     """
 
     results: Mapping[str, reproduce.Result]
@@ -52,24 +52,26 @@ class Reproduced(Result):
 
 @command
 class Reproduce(Command):
-    """Make the paper's figures and tables, its numbers beside ours.
+    """Reproduce the figures and tables of the paper, with its numbers beside ours.
 
-    For each a figure (PNG), the numbers behind it (CSV) and rows of "paper, ours, how it differs and why"; index.html
-    shows all of it, paper.md and paper.json hold the rows. They are written after each; interrupted, the same command
-    goes on with what is left. Rows that repeat a constant of the paper, and predictions by the model of its own
-    flights, are marked.
+    The items are parameters, motor-step, rotor-curves, hover-to-forward, yaw-disturbance, brushed, back-and-forth,
+    controllers, randomisation, flips and double-flip. All of them together take minutes.
 
-    parameters, motor-step, rotor-curves, hover-to-forward, yaw-disturbance, brushed, back-and-forth, controllers,
-    randomisation, flips, double-flip; all of them by default, which takes minutes.
+    For each item it writes a figure (PNG), the numbers behind it (CSV), and rows with the paper's number, ours, and the
+    reason for the difference. index.html shows everything; paper.md and paper.json have the rows. Rows that only repeat
+    a constant of the paper, or in which the model predicts its own simulated flights, are marked. The files are updated
+    after each item. If the run was interrupted, the same command continues it.
 
     Attributes:
-        names: what to reproduce.
+        names: items to reproduce. Default: all.
         output: folder to write to.
-        real: folder with real flights in the IDSIA layout (fit/*.parquet, validation/*.parquet), to stand beside the
-            shipped ones.
-        flights: folder with flight logs of your drone: brushless for hover-to-forward and yaw-disturbance, whose useful
-            horizon is then measured on them; brushed for brushed.
-        mass: of the drone of --flights as weighed, kg; that of the preset by default.
+        real: folder with real flights in the IDSIA layout (fit/*.parquet, validation/*.parquet).
+            They are shown beside the shipped flights.
+        flights: folder with flight logs of your drone.
+            brushed needs flights of a brushed Crazyflie, hover-to-forward and yaw-disturbance those of a brushless one.
+            For the latter two the useful prediction horizon is then measured on these flights.
+        mass: weighed mass of the drone of --flights, kg, from 0.005 to 0.5. Default: the mass of the preset.
+        format: also write every figure as a vector graphic, pdf or svg. Default: PNG only.
     """
 
     names: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="NAME...")] = (ALL,)
@@ -77,13 +79,14 @@ class Reproduce(Command):
     real: Path | None = None
     flights: Path | None = None
     mass: float | None = None
+    format: VectorFormat | None = None
 
     def run(self) -> Reproduced:
-        """Make the items, each in turn, and after each the pages about those that are made.
+        """Reproduce the items one after another, and update the pages after each.
 
         Raises:
-            CfbError: an unknown name, no flights in ``real`` or ``flights``, flights that no item takes, an impossible
-                mass, or an output that cannot be written.
+            CfbError: an unknown name, no flights in ``real`` or ``flights``, flights that no item uses, an invalid
+                mass, or a file that cannot be written.
         """
         from cfb_mjx.runtime import configure_jax, environment, say
 
@@ -91,6 +94,7 @@ class Reproduce(Command):
         from cfb_mjx.reproduce import ITEMS
         from cfb_mjx.reproduce.flights import Given, require_real
         from cfb_mjx.reproduce.kept import NUMBERS, PAGE, TEXT, keep, kept_in
+        from cfb_mjx.view.style import with_vector_copies
 
         chosen = self._chosen(ITEMS)
         self._require_fitting(chosen, ITEMS)
@@ -99,16 +103,23 @@ class Reproduce(Command):
         folder, facts = output_folder(self.output), environment()
         told = f"cfb reproduce {ALL if len(chosen) == len(ITEMS) else ' '.join(chosen)}"
         real, flights = str(self.real), str(self.flights)
-        of = {"names": chosen, "code": code_identity(), "real": real, "flights": flights, "mass": self.mass}
+        of = {
+            "names": chosen,
+            "code": code_identity(),
+            "real": real,
+            "flights": flights,
+            "mass": self.mass,
+            "format": self.format,
+        }
         results = kept_in(folder, of)
         if results:
-            say(f"{len(results)} of {len(chosen)} were made before the interruption; going on with the rest")
+            say(f"{len(results)} of {len(chosen)} items were made before the interruption; continuing with the rest")
         begin = time.perf_counter()
         for name in [name for name in chosen if name not in results]:
             started = time.perf_counter()
             configure_jax(x64=ITEMS[name].x64)
             more = {"given": given} if ITEMS[name].given else {}
-            with together():
+            with together(), with_vector_copies(self.format):
                 results[name] = ITEMS[name].make(folder, self.real, **more)
                 results = {item: results[item] for item in chosen if item in results}
                 keep(folder, results, of, facts, told)
@@ -117,7 +128,7 @@ class Reproduce(Command):
         return Reproduced(results, facts, time.perf_counter() - begin, folder / PAGE, files)
 
     def _chosen(self, items: Mapping[str, Any]) -> list[str]:
-        """Names of what is asked for, in the paper's order.
+        """Names of the items that were asked for, in the order of the paper.
 
         Raises:
             CfbError: an unknown name, or none.
@@ -130,16 +141,16 @@ class Reproduce(Command):
         return [name for name in items if ALL in self.names or name in self.names]
 
     def _require_fitting(self, chosen: list[str], items: Mapping[str, reproduce.Item]) -> None:
-        """Refuse flights that would be taken for those of another drone, or not at all."""
+        """Check that the flights that were given can be used for the items that were asked for."""
         if self.flights is None:
             if self.mass is not None:
-                raise CfbError("--mass is of the drone of --flights; give those, or leave it out.")
+                raise CfbError("--mass is the mass of the drone of --flights; give --flights too, or leave --mass out.")
             return
         if self.mass is not None and not 0.005 <= self.mass <= 0.5:
             raise CfbError(f"--mass {self.mass:g}: must be in kg, from 0.005 to 0.5.")
         takers = {name for name, item in items.items() if item.given}
         if not set(chosen) <= takers or ("brushed" in chosen and len(chosen) > 1):
             raise CfbError(
-                f"--flights: name what they are for, of {', '.join(sorted(takers))}; brushed alone, for it takes "
-                "flights of a brushed drone and the others of a brushless one."
+                f"--flights: name the items that use them, of {', '.join(sorted(takers))}; name brushed alone, because "
+                "it needs flights of a brushed drone and the others need those of a brushless one."
             )

@@ -1,4 +1,4 @@
-"""``cfb sweep``: a command many times over."""
+"""``cfb sweep``: run a command with many combinations of arguments."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Swept(Result):
-    """Of a sweep.
+    """The outcome of a sweep.
 
     Attributes:
-        listed: the tasks with their command lines, where they were only listed.
-        results: tables of what came out, as CSV and as JSON.
-        failed: why tasks failed, by name.
-        tasks: how many there are.
-        folder: of the sweep.
+        listed: the tasks with their command lines, if they were only listed; else empty.
+        results: paths of the tables of results, as CSV and as JSON.
+        failed: the reasons why tasks failed, by the name of the task.
+        tasks: number of tasks.
+        folder: folder of the sweep.
     """
 
     listed: str
@@ -44,33 +44,37 @@ class Swept(Result):
 
     @property
     def complaint(self) -> str | None:
-        """That tasks failed."""
+        """How many tasks failed, and why; None if none did."""
         if not self.failed:
             return None
         name, why = next(iter(self.failed.items()))
         return (
             f"{len(self.failed)} of {self.tasks} tasks failed; {name}: {why.rstrip('.')}; "
-            f"{self.folder / 'failed'} says why for each, and the same command tries them again."
+            f"all reasons are in {self.folder / 'failed'}; run the same command again to retry."
         )
 
 
 @command
 class Sweep(Command):
-    """Run a command many times over: seeds, randomisation, refits of many drones; on this machine or a cluster.
+    """Run a command with many combinations of arguments (seeds, randomisations, drones), here or on a cluster.
 
-    Every task lands in DIR/done/NAME, once and whole; results.csv has a row for each, and grows as they land. A worker
-    that dies is replaced; a task with bad input is noted in DIR/failed and does not hold the others up. Started again,
-    it goes on where it was: what is done is kept, what failed is tried again. Needs Ray: pip install 'cfb_mjx[sweep]'.
+    The results of each task are written to DIR/done/NAME, where DIR is the folder of --output; they appear there only
+    when the task is complete. results.csv has a row for each finished task and is updated during the run. A worker
+    process that dies is replaced. A task with bad input is recorded in DIR/failed, and the others continue.
+
+    If the sweep was interrupted, the same command continues it: finished tasks are kept, and failed tasks are tried
+    again. Needs Ray: pip install 'cfb_mjx[sweep]'.
 
     Attributes:
-        config: sweep YAML, or the name of a shipped one (firmware-pid, randomisation, refits).
+        config: sweep YAML, or the name of a shipped sweep (firmware-pid, randomisation, refits).
         output: folder for the results.
-        address: of a Ray cluster to use (auto: the one this machine belongs to), in place of this machine alone; all
-            its machines must see the folder.
-        workers: most tasks at a time; by default as many as there is room for.
-        retries: more attempts at a task whose worker dies, or that breaks.
-        part: only every N-th task from the I-th on, for N jobs that share the folder and need no cluster.
-        dry_run: list the tasks with their command lines, and do nothing.
+        address: address of a Ray cluster to use instead of this machine alone; auto: the cluster of this machine.
+            All machines of the cluster must have access to the folder.
+        workers: largest number of tasks at a time. Default: as many as the processors and GPUs allow.
+        retries: number of further attempts at a task whose worker dies, or which ends with an error of the library.
+        part: run only every N-th task from the I-th on.
+            With it N jobs share the tasks of one folder without a cluster.
+        dry_run: list the tasks with their command lines, and run nothing.
     """
 
     config: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONFIG")]
@@ -82,11 +86,11 @@ class Sweep(Command):
     dry_run: bool = False
 
     def run(self) -> Swept:
-        """Run what is not done yet, and write the table of the results.
+        """Run the tasks that are not done yet, and write the table of results.
 
         Raises:
-            CfbError: a bad file, arguments that a command refuses, a folder with other results or with a sweep at work,
-                no Ray or no cluster.
+            CfbError: an invalid sweep file, arguments that the command refuses, a folder with other results or with
+                another sweep that is running, no Ray, or no cluster.
         """
         from cfb_mjx import plugins
         from cfb_mjx.commands import load
@@ -115,7 +119,7 @@ class Sweep(Command):
         return Swept("", (self.output / CSV, self.output / JSON), failed, len(share), self.output)
 
     def _carry_out(self, plan: Plan, tasks: tuple[Task, ...], folder: Folder, summary: Summary) -> dict[str, str]:
-        """Why tasks failed, by name."""
+        """Run the tasks that are left; return the reasons why tasks failed, by the name of the task."""
         from cfb_mjx.cli import main
         from cfb_mjx.runtime import Progress, say
         from cfb_mjx.sweep import drive
@@ -146,7 +150,7 @@ class Sweep(Command):
                 return drive(left, folder, summary, pool, main, self.workers, ended)
         except KeyboardInterrupt:
             bar.clear()
-            say(f"stopped with {done} of {len(tasks)} tasks done; the same command goes on from here")
+            say(f"stopped with {done} of {len(tasks)} tasks done; run the same command again to continue")
             raise
 
 
@@ -175,4 +179,4 @@ def _say_what_is_left_over(folder: Folder, tasks: tuple[Task, ...]) -> None:
     names = {task.name for task in tasks}
     if others := sorted(p.name for p in (folder.path / "done").iterdir() if p.name not in names):
         where = folder.path / "done"
-        say(f"{len(others)} results in {where} are of no task any more ({others[0]} ...); they stay there")
+        say(f"{len(others)} results in {where} belong to no task of this sweep ({others[0]} ...); they are kept")

@@ -1,4 +1,4 @@
-"""``cfb train``: a controller, trained in simulation."""
+"""``cfb train``: train a controller in simulation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import tyro
 
 from cfb_mjx.commands.command import Command, Devices, File, OutputFolder, Pairs, Result, command
 from cfb_mjx.errors import CfbError
-from cfb_mjx.files import require_no_file, together, write_json
+from cfb_mjx.files import VectorFormat, require_no_file, together, write_json
 
 NEWEST, EVENTS, FIGURE = "training.json", "events", "curve.png"
 _JUDGED = (
@@ -26,12 +26,12 @@ _JUDGED = (
 
 @dataclass(frozen=True)
 class Trained(Result):
-    """What a training came to.
+    """The outcome of a training.
 
     Attributes:
-        curve: the learning curve, a row of numbers by name for every checkpoint.
-        files: what was written, by what it is: policy, learning curve, figure. Of several processes that train one
-            policy the first alone writes.
+        curve: the learning curve, with a row of numbers by name for every checkpoint.
+        files: paths of the files written, by kind: policy, learning curve, figure. If several processes train one
+            policy, only the first writes files; it is empty for the others.
     """
 
     curve: Sequence[Mapping[str, float]]
@@ -45,30 +45,35 @@ class Trained(Result):
 
 @command
 class Train(Command):
-    """Train a controller. Interrupt it whenever you like: --resume goes on to the same result.
+    """Train a controller with PPO or by back-propagation through the model.
 
-    Writes policy.npz (what `cfb fly` flies), best.npz (what was judged best on the way), curve.csv and curve.png
-    (learning curve), updates.csv (what every update measured), config.yaml and checkpoint.npz.
+    A training can be interrupted at any time; with --resume it continues from its last checkpoint to the same result.
+
+    Writes policy.npz (the final policy, for `cfb fly` and `cfb export`), best.npz (the policy with the best evaluation
+    during the training), curve.csv and curve.png (the learning curve), updates.csv (the numbers of every update),
+    config.yaml and checkpoint.npz.
 
     Attributes:
-        task: what to learn: fly to a target and hold it, or turn about the x axis at a rate that is asked for.
+        task: task to learn: target (fly to a target and hold it) or flip (turn about the x axis at a given rate).
         output: folder for the results.
-        config: training YAML, or the name of a shipped one; the task's own by default.
-        model: preset or model YAML of the drone, with its effects; in place of the configuration's.
-        randomise: ranges from which drones are drawn: a shipped name, a YAML file, or a model whose numbers have a
-            spread (cfb-fleet); in place of the configuration's. How much of them: --set randomisation.magnitude.
-        algorithm: ppo (the paper's) or analytic (back-propagation through the model); in place of the configuration's.
-        seed: of everything random; in place of the configuration's.
+        config: training YAML, or the name of a shipped one. Default: the configuration with the name of the task.
+        model: preset or model YAML of the drone, with its effects. Default: that of the configuration.
+        randomise: ranges from which drones are drawn: a shipped name, a YAML file or a model.
+            The parameters of such a model must have a spread between drones (cfb-fleet).
+            Default: those of the configuration. --set randomisation.magnitude sets their factor.
+        algorithm: ppo (as in the paper) or analytic (back-propagation through the model).
+            Default: that of the configuration.
+        seed: seed of all random numbers. Default: that of the configuration.
         set: changes to the configuration, for instance randomisation.magnitude=0.5 ppo.steps=2e7.
-        start: policy to start from, in place of random weights: a file, or the name of a shipped one.
-        resume: go on from the checkpoint in the folder.
-        force: train on a model that is a predictor, not a plant.
-        devices: of this machine, or of each of several processes, over which the drones are spread.
-        coordinator: where several processes meet that train one policy together: the address of process 0, or auto
-            within srun or mpirun.
-        processes: how many they are; not with auto.
-        process: which of them this is, from 0; not with auto.
-        tensorboard: write the numbers of every update and checkpoint for TensorBoard too, into the folder's events.
+        start: policy to start from: a policy file, or the name of a shipped policy. Default: random weights.
+        resume: continue from the checkpoint in the folder.
+        force: train even if the model is a predictor and not a plant.
+        devices: number of devices over which the drones are divided; with several processes, of each process.
+        coordinator: address of process 0, to train one policy with several processes; auto within srun or mpirun.
+        processes: number of processes; not with auto.
+        process: index of this process, from 0; not with auto.
+        tensorboard: also write the numbers of every update and checkpoint for TensorBoard, into the folder events.
+        format: also write every figure as a vector graphic, pdf or svg. Default: PNG only.
     """
 
     lists_in_yaml = True
@@ -89,15 +94,17 @@ class Train(Command):
     processes: int | None = None
     process: int | None = None
     tensorboard: bool = False
+    format: VectorFormat | None = None
 
     def run(self) -> Trained:
-        """Train, and write policy, learning curve, configuration and checkpoint.
+        """Train, and write the policy, the learning curve, the configuration and the checkpoint.
 
-        With ``coordinator`` a child process does it, which is forked before jax is loaded; this one waits for it and
-        leaves by SystemExit.
+        With ``coordinator`` the training runs in a child process, which is forked before jax is loaded. This process
+        waits for it and then raises SystemExit.
 
         Raises:
-            CfbError: a bad configuration, model or policy; an earlier training in the folder; another one to resume.
+            CfbError: an invalid configuration, model or policy; an earlier training in the folder, without ``resume``;
+                or a training with other settings to resume.
         """
         from cfb_mjx.joining import Hosts, joined
 
@@ -118,12 +125,13 @@ class Train(Command):
         from cfb_mjx.train.config import load_config, with_changes
         from cfb_mjx.train.run import CURVE, POLICY, Training, train
         from cfb_mjx.view.learning import learning_events, learning_figure
+        from cfb_mjx.view.style import with_vector_copies
 
         ranges = () if self.randomise is None else (f"randomisation.ranges={self.randomise}",)
         settings = load_config(self.config or self.task, (*ranges, *self.set))
         settings = with_changes(settings, model=self.model, algorithm=self.algorithm, seed=self.seed)
         if settings.task != self.task:
-            raise CfbError(f"--config {self.config}: trains {settings.task}, not {self.task}.")
+            raise CfbError(f"--config {self.config}: trains {settings.task}, not {self.task}; give another one.")
         if settings.body == "mjx" and settings.algorithm == "analytic":
             differentiate_mjx()
         facts = environment()
@@ -152,16 +160,16 @@ class Train(Command):
             return Trained(rows, {})
         files = {"policy": POLICY, "learning curve": CURVE, "figure": FIGURE}
         files = {what: self.output / name for what, name in files.items()}
-        with together():
+        with together(), with_vector_copies(self.format):
             learning_figure(rows, files["figure"], f"{settings.algorithm}, {drone}")
             write_json(self.output / NEWEST, {"environment": facts, "last": rows[-1]})
         return Trained(rows, files)
 
 
 def _said(row: Mapping[str, float]) -> str:
-    """A row of the learning curve in words."""
+    """A row of the learning curve as text."""
     judged = "".join(
-        f", {label} {row[key]:.3g}{unit}" if isfinite(row[key]) else f", {label} most lost"
+        f", {label} {row[key]:.3g}{unit}" if isfinite(row[key]) else f", {label} most failed"
         for key, label, unit in _JUDGED
         if key in row
     )

@@ -1,4 +1,4 @@
-"""``cfb version``: what is installed."""
+"""``cfb version``: print the installed versions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cfb_mjx.commands.command import Command, Result, command
 
 @dataclass(frozen=True)
 class Versions(Result):
-    """What computes here.
+    """The installed versions.
 
     Attributes:
         environment: date, machine and versions, by name.
@@ -24,10 +24,10 @@ class Versions(Result):
 
 @command
 class Version(Command):
-    """Print the versions of the library and of what it computes with."""
+    """Print the versions of cfb_mjx and its dependencies, the machine and the date."""
 
     def run(self) -> Versions:
-        """Look them up."""
+        """Look up the versions."""
         from cfb_mjx.runtime import environment
 
         return Versions(environment())

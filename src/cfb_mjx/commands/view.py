@@ -1,4 +1,4 @@
-"""``cfb view``: flights, to look at."""
+"""``cfb view``: show flights in rerun or as a video."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from cfb_mjx.optional import not_none
 
 @dataclass(frozen=True)
 class Viewed(Result):
-    """What there is to look at.
+    """The files that show the flights.
 
     Attributes:
-        recording: that was written.
+        recording: path of the recording, if one was written.
         shown: whether rerun's viewer was opened.
-        video: that was written.
+        video: path of the video, if one was written.
     """
 
     recording: Path | None = None
@@ -36,20 +36,22 @@ class Viewed(Result):
 
 @command
 class View(Command):
-    """Show flights: a rerun recording, rerun's viewer, or a film.
+    """Show flights: write a recording for rerun, open rerun's viewer, or make a video.
 
-    The recording has the drone in 3D with the thrust of its rotors, the way it went, where the model thought it would
-    go (half a second from every window), the commands, and what the model misses (force and torque per mass and
-    inertia). Flights of `cfb fly --log` are shown like any other.
+    A recording shows the drone in 3D with the thrust of its rotors, the measured trajectory, the predictions of the
+    model over half a second, the commands, and the residuals of the model (force per mass and torque per inertia).
+    Flight logs of `cfb fly --log` can be shown too.
 
     Attributes:
         logs: flight logs (MCAP, parquet, csv), or one recording (.rrd) with --spawn.
-        output: recording to write (.rrd); the first log's name in this folder by default.
+        output: recording to write (.rrd).
+            Default: the name of the first log, in the current folder.
+            With --spawn the default is a temporary file, with --video alone no file.
         model: preset or model YAML, for thrust, predictions and residuals.
-        set: parameters to change, for instance mass=0.045.
+        set: changes to the model's parameters, for instance mass=0.045 (kg).
         spawn: open rerun's viewer.
-        video: film the first flight here (.mp4 or .gif).
-        slow: how many times slower the film is than the flight.
+        video: file for a video of the first flight (.mp4 or .gif).
+        slow: factor by which the video is slower than the flight, above 0.
     """
 
     logs: Logs
@@ -61,10 +63,10 @@ class View(Command):
     slow: float = 1.0
 
     def run(self) -> Viewed:
-        """Read the flights, look at them with the model, show them.
+        """Read the flights, compute predictions and residuals of the model, and show them.
 
         Raises:
-            CfbError: bad logs, a bad model, something missing that is needed, or a file that cannot be written.
+            CfbError: bad logs, an invalid model, a program that is not installed, or a file that cannot be written.
         """
         output = self._checked_output()
         if self._opens_recording:
@@ -75,7 +77,7 @@ class View(Command):
         from cfb_mjx.logs import read_log
         from cfb_mjx.runtime import Progress, configure_jax
 
-        logs = [read_log(path) for path in self.logs]  # before jax loads: a bad log is refused at once
+        logs = [read_log(path) for path in self.logs]  # before jax loads, so that a bad log is refused at once
         configure_jax(x64=True)
         from cfb_mjx.model import Quadrotor
         from cfb_mjx.parameters import load_model_file
@@ -108,10 +110,10 @@ class View(Command):
         return any(path.suffix == ".rrd" for path in self.logs)
 
     def _checked_output(self) -> Path | None:
-        """Which recording to write; None: none was asked for by name.
+        """Check the arguments; return the recording to write, or None if no name for it is known yet.
 
         Raises:
-            CfbError: nothing to show, impossible numbers, or outputs without a folder or of the wrong kind.
+            CfbError: no logs, a number outside its range, or an output in a missing folder or with the wrong ending.
         """
         if not self.logs:
             raise CfbError("view needs at least one log; see 'cfb view --help'.")

@@ -1,6 +1,6 @@
-"""Rollouts with a controller in the loop, on the true state and without noise: as fast as closed loops get.
+"""Fast rollouts with a controller in the loop, on the true state and without noise.
 
-Training and evaluation (`cfb_mjx.envs`, `cfb_mjx.train.flying`) add late estimates, noise and limits.
+Training and evaluation (`cfb_mjx.envs`, `cfb_mjx.train.flying`) add delayed estimates, noise and limits.
 """
 
 from __future__ import annotations
@@ -29,30 +29,32 @@ from cfb_mjx.model.vector import Vec
 from cfb_mjx.runtime import cores
 
 FEW = 8
-"""Up to so many drones are flown in one compiled function on a CPU, written-out products included: calling one for
-every layer and sum of every command takes longer than the numbers of so few. With more, a matrix library is faster."""
+"""Largest number of drones that are flown in one compiled function on a CPU, with matrix products written out as sums.
+For so few drones, calling a function for every layer and sum of every command takes longer than the arithmetic. With
+more drones a matrix library is faster."""
 AT_ONCE = 1024
-"""Drones whose numbers stay in the second cache of a CPU core, with room for what else is kept there."""
+"""Number of drones whose numbers fit in the second-level cache of a CPU core, with room for other data."""
 
 
 def at_once() -> int:
-    """More drones under one network than this are flown one such group after the other on a CPU.
+    """Largest number of drones under one network that a CPU flies at once; more are flown in groups one after another.
 
-    Where a device has several cores, XLA divides what a group computes between them: large groups well, small ones not.
+    If a device has several cores, XLA divides the computation of a group between them, which pays for large groups
+    only.
     """
     share = cores() // jax.local_device_count()
     return AT_ONCE if share < 2 else 4 * AT_ONCE * share
 
 
 class ClosedLoop(NamedTuple):
-    """What `rollout_closed_loop` returns."""
+    """Result of `rollout_closed_loop`."""
 
     state: State
-    """After every ``every``-th command, leading axis ``commands // every``."""
+    """State after every ``every``-th command, leading axis ``commands // every``."""
     command: Float[Array, "kept 4"]
-    """The command that led there."""
+    """The command before each kept state, motors M1..M4, 0 to 1."""
     memory: Any
-    """The controller's at the end: give it to the next rollout to go on."""
+    """Final memory of the controller; pass it to the next rollout to continue the flight."""
 
 
 def rollout_closed_loop(
@@ -67,23 +69,26 @@ def rollout_closed_loop(
 ) -> ClosedLoop:
     """Fly ``commands`` commands of a controller that sees the true state.
 
-    Use ``jax.vmap`` over model, state, target and memory. Many drones under one network are computed with the drones'
-    axis last throughout, however the call is batched, which on a CPU is faster than the same loop under ``vmap``.
-    Derivatives in all arrays, in both modes.
+    Use ``jax.vmap`` over model, state, target and memory. Many drones under one network are computed with the drones as
+    the last axis, however the call is batched; on a CPU this is faster than the same loop under ``vmap``. The result is
+    differentiable with respect to all arrays, in both modes.
 
     Args:
         model: the drone; its step must divide the controller's.
-        controller: a `NeuralController` without set-points, a `PidController`, a `MellingerController` or one of
-            your own.
+        controller: a `NeuralController` without set-points, a `PidController`, a `MellingerController` or a
+            controller of your own.
         state: initial state, without batch axes.
-        commands: how many; each is held for ``controller.control_dt_s``.
+        commands: number of commands; each is held for ``controller.control_dt_s``.
         target: position to hold, world, m.
-        memory: of the controller; by default it takes over a drone that has hovered in ``state`` for long.
+        memory: memory of the controller; by default that of a controller that has held ``state`` in hover for long.
         every: commands per kept state; must divide ``commands``.
 
+    Returns:
+        The kept states and commands, and the final memory.
+
     Raises:
-        CfbError: the control step is no multiple of the model's.
-        ValueError: ``every`` does not divide ``commands``, or the policy wants set-points.
+        CfbError: the control step is not a multiple of the model's.
+        ValueError: ``every`` does not divide ``commands``, or the policy needs set-points.
     """
     hold = model.steps_per_command(controller.control_dt_s)
     if commands < 1 or every < 1 or commands % every:
@@ -105,7 +110,7 @@ def rollout_closed_loop(
         size = examples(own, leaves)
         parts, own_parts = jax.tree.unflatten(structure, leaves), jax.tree.unflatten(structure, own)
         if size == 1:
-            # All drones there are share the model and the network.
+            # All drones share the model and the network.
             alone = jax.tree.map(lambda x, mine: x[0] if mine else x, parts[:2], own_parts[:2])
             parts, own_parts = (*alone, *parts[2:]), (*jax.tree.map(lambda _: False, own_parts[:2]), *own_parts[2:])
             leaves, own = jax.tree.leaves(parts), tuple(jax.tree.leaves(own_parts))
@@ -141,16 +146,16 @@ def rollout_closed_loop(
 
 
 class _Drones(NamedTuple):
-    """The axis of the drones: the last one of every array."""
+    """How the drones are batched: their axis is the last one of every array."""
 
     size: int | None
-    """None: there is one drone, and no axis."""
+    """Number of drones; None means one drone without the axis."""
     own_models: bool
-    """Whether the model has the axis too."""
+    """Whether the models have the axis too."""
     few: bool
-    """Whether the whole loop is to be one compiled function."""
+    """Whether the whole loop is one compiled function."""
     between: bool = False
-    """Whether all that happens between two evaluations of the network is to be one."""
+    """Whether everything between two evaluations of the network is one compiled function."""
 
     @property
     def many(self) -> bool:
@@ -158,14 +163,14 @@ class _Drones(NamedTuple):
         return self.size is not None and self.size > LANES
 
     def each(self, function: Callable, *arguments) -> Any:
-        """``function(model, ...)`` of one drone, for each; what comes after the model has the axis."""
+        """``function(model, ...)`` for each drone; all arguments after the model have the axis."""
         if self.size is None:
             return function(*arguments)
         axes = (-1 if self.own_models else None, *(-1 for _ in arguments[1:]))
         return jax.vmap(function, in_axes=axes, out_axes=-1, axis_size=self.size)(*arguments)
 
     def given(self, x: Array, own: bool) -> Array:
-        """Given the axis, if it does not have it."""
+        """Add the axis to an array that does not have it."""
         return x if own else jnp.broadcast_to(x[..., None], (*x.shape, self.size))
 
 
@@ -201,7 +206,7 @@ def _loop(drones: _Drones, parts: Sequence[Any], hold: int, commands: int, every
         return (drones.each(moved, prepared, at, command), memory, command), None
 
     def after(prepared, target, at, memory, command):
-        """What a network's ``command`` leads to: state, memory and the next observation."""
+        """Apply a network's ``command``: next state, memory and observation."""
         memory = remember(controller.layout, memory, drones.each(seen, prepared, at, target), command)
         at = drones.each(moved, prepared, at, command)
         return at, memory, observation(controller.layout, memory, drones.each(seen, prepared, at, target))
@@ -214,7 +219,7 @@ def _loop(drones: _Drones, parts: Sequence[Any], hold: int, commands: int, every
             )
     pack, unpack = _packing(jax.eval_shape(kept_of, at, command)) if drones.few else (lambda x: x, lambda x: x)
 
-    # What every turn moves on by one place, the memory, is then copied in every second only.
+    # The memory is shifted by one place in every iteration; with two iterations per turn it is copied half as often.
     turns = 2 if drones.many and every > 1 else 1
 
     def some(carry, _):
@@ -228,8 +233,10 @@ def _loop(drones: _Drones, parts: Sequence[Any], hold: int, commands: int, every
 
 
 def _by_kernel(drones, controller, after, kept_of, prepared, target, first, commands: int, every: int) -> ClosedLoop:
-    """The loop of a network with one kernel per command: one array of all that changes, one of what each drone has of
-    its own, one of what they share."""
+    """Fly a network's loop with one kernel per command.
+
+    All changing numbers are in one array, the numbers that differ between drones in a second, shared ones in a third.
+    """
     leaves, static = eqx.partition(prepared, eqx.is_array)
     shared, own = ((), (leaves, target)) if drones.own_models else (leaves, target)
     (pack, unpack), (pack_own, unpack_own) = _packing(first), _packing(own)
@@ -238,7 +245,7 @@ def _by_kernel(drones, controller, after, kept_of, prepared, target, first, comm
     def kernel(packed, command, own, *shared):
         leaves, target = unpack_own(own) if drones.own_models else (whole(*shared), unpack_own(own))
         changed = pack(after(eqx.combine(leaves, static), target, *unpack(packed)[:2], command))
-        # The last row is for `one_kernel`: whatever the function ignores, the kernel does not.
+        # The last row is for `one_kernel`: the kernel must use what the function ignores.
         return jnp.concatenate([changed, sum(x[:1] for x in (packed, command, own, *shared))])
 
     own, shared = pack_own(own), () if drones.own_models else (flat,)
@@ -259,8 +266,7 @@ def _by_kernel(drones, controller, after, kept_of, prepared, target, first, comm
 
 
 def _packing(example: Any) -> tuple[Callable, Callable]:
-    """What makes one array of a tree of arrays (..., drones), as `one_kernel` wants what a loop keeps, and what makes a
-    tree of one such, or of many."""
+    """Functions that pack a tree of arrays (..., drones) into one array, as `one_kernel` needs it, and unpack it."""
     leaves, structure = jax.tree.flatten(example)
     ends = np.cumsum([math.prod(x.shape[:-1]) for x in leaves])
 

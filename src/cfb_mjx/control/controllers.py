@@ -1,4 +1,4 @@
-"""What holds a target on late estimates relative to it: networks and the firmware's controllers alike."""
+"""Controllers that fly to a target, from delayed estimates relative to it: networks and those of the firmware."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cfb_mjx.model.state import State
 
 @runtime_checkable
 class Controller(Protocol):
-    """What holds the target: what it sees is relative to it. `NeuralController` is one."""
+    """A controller that flies to a target; it sees estimates relative to the target. `NeuralController` is one."""
 
     @property
     def control_dt_s(self) -> float:
@@ -27,52 +27,55 @@ class Controller(Protocol):
         ...
 
     def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
-        """Memory at take-over; ``command`` is what the rotors turn at."""
+        """Return the memory at take-over; ``command`` is the command at which the rotors turn."""
         ...
 
     def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
-        """New memory and command."""
+        """Return the new memory and the command of M1..M4, each in [0, 1]."""
         ...
 
 
 class PidController(eqx.Module):
-    """The firmware's PID, heading kept at zero."""
+    """The firmware's PID with the heading held at zero."""
 
     firmware: pid.FirmwarePid
     control_dt_s: float = eqx.field(static=True, default=pid.DT)
 
     def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
-        """Empty integrators."""
+        """Return a memory with empty integrators."""
         return pid.init(self.firmware, _measured(estimate))
 
     def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
-        """New memory and command."""
+        """Return the new memory and the command of M1..M4, each in [0, 1]."""
         return pid.step(self.firmware, memory, _measured(estimate), pid.Setpoint.hover(jnp.zeros(3)))
 
 
 class MellingerController(eqx.Module):
-    """The firmware's Mellinger controller, heading kept at zero."""
+    """The firmware's Mellinger controller with the heading held at zero."""
 
     firmware: mellinger.Mellinger
     control_dt_s: float = eqx.field(static=True, default=pid.DT)
 
     def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
-        """Empty integrators."""
+        """Return a memory with empty integrators."""
         return mellinger.init(_measured(estimate))
 
     def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
-        """New memory and command."""
+        """Return the new memory and the command of M1..M4, each in [0, 1]."""
         return mellinger.step(self.firmware, memory, _measured(estimate), jnp.zeros(3))
 
 
 def has_lumped_delay(controller: str | Path) -> bool:
-    """Whether a controller flies with the gyro as late as the pose (`cfb_mjx.envs.Task.lumped_delay`).
+    """Whether a controller expects the gyro with the delay of the pose (`cfb_mjx.envs.Task.lumped_delay`).
 
-    A policy does as it was trained, which for those that do not say is the paper's reading; the firmware's controllers
-    read the gyro on the drone.
+    For a policy this is how it was trained; policies that do not say follow the paper (True). The firmware's
+    controllers read the gyro on the drone (False).
+
+    Args:
+        controller: ``pid``, ``mellinger``, a shipped policy or a policy file.
 
     Raises:
-        CfbError: the file is no policy.
+        CfbError: the file is not a policy.
     """
     if controller in ("pid", "mellinger"):
         return False
@@ -80,7 +83,7 @@ def has_lumped_delay(controller: str | Path) -> bool:
 
 
 def is_flip_policy(controller: Controller) -> bool:
-    """Whether it flies set-points of speed and rate, which a manoeuvre gives it, and not to a target."""
+    """Whether a controller flies set-points of speed and rate, which a manoeuvre gives it, rather than to a target."""
     return bool(getattr(getattr(controller, "layout", None), "setpoint_scales", ()))
 
 
@@ -89,14 +92,14 @@ def _measured(estimate: Estimate) -> State:
 
 
 def find_controller(controller: str | Path, nominal: Quadrotor) -> Controller:
-    """The controller of a name (pid, mellinger, a shipped policy) or of a policy file.
+    """Return the controller of a name (pid, mellinger, a shipped policy) or of a policy file.
 
     Args:
         controller: name or file.
-        nominal: the drone that the PID's base thrust is set for.
+        nominal: drone for which the PID's base thrust is set.
 
     Raises:
-        CfbError: there is no such controller, or the file is no policy.
+        CfbError: there is no such controller, or the file is not a policy.
     """
     if controller == "pid":
         return PidController(pid.FirmwarePid.hovering(nominal.changed_parameters()))

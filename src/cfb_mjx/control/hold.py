@@ -1,4 +1,4 @@
-"""The PID as a holder of positions, for what flies a drone without asking how (`sysid.excitation`)."""
+"""Hold positions with the PID, for code that flies a drone with any controller (`sysid.excitation`)."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from cfb_mjx.model.state import State
 
 
 class PositionHold(eqx.Module):
-    """Start, resume and command a `FirmwarePid`."""
+    """Hold positions with a `FirmwarePid`."""
 
     pid: FirmwarePid
 
     def start(self, measurement: State) -> PidState:
-        """Memory at the first measurement."""
+        """Return the memory at the first measurement."""
         return init(self.pid, measurement)
 
     def resume(self, memory: PidState, measurement: State) -> PidState:
-        """Memory when taking over again."""
+        """Return the memory for taking over again."""
         return resume(self.pid, memory, measurement)
 
     def command(
         self, memory: PidState, measurement: State, position: Float[Array, "3"], yaw: Float[Array, ""] | float = 0.0
     ) -> tuple[PidState, Float[Array, "4"]]:
-        """New memory and command to hold ``position`` [m, world] and ``yaw`` [rad]; called every `pid.DT`."""
+        """New memory and command to hold ``position`` [m, world] and ``yaw`` [rad]; call it every `pid.DT` seconds."""
         return step(self.pid, memory, measurement, Setpoint.hover(position, yaw))

@@ -1,4 +1,4 @@
-"""Three parallel PID loops, as the Crazyflie firmware writes them (``pid.c``)."""
+"""Three parallel PID loops, as in the Crazyflie firmware (``pid.c``)."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from cfb_mjx.model.state import AnyArray
 
 
 class Gains(eqx.Module):
-    """Of three loops side by side."""
+    """Gains and limits of three parallel loops."""
 
     kp: tuple[float, float, float]
     ki: tuple[float, float, float]
     kd: tuple[float, float, float]
     integral_limit: tuple[float, float, float]
-    """Of the integral of the error, before ``ki``; error unit times s."""
+    """Limit of the integral of the error, before ``ki``; error unit times s."""
     output_limit: tuple[float, float, float]
 
 
 def gains(kp, ki=(0, 0, 0), kd=(0, 0, 0), integral_limit=(5000,) * 3, output_limit=(float("inf"),) * 3) -> Gains:
-    """`Gains` from numbers; the defaults are the firmware's."""
+    """Build `Gains` from numbers; the defaults are the firmware's."""
     return Gains(*map(_three, (kp, ki, kd, integral_limit, output_limit)))
 
 
@@ -31,7 +31,7 @@ def _three(numbers) -> tuple[float, float, float]:
 
 
 class Memory(eqx.Module):
-    """Integral of the error, and the measurement of the step before."""
+    """Integral of the error, and the measurement of the previous step."""
 
     integral: Float[Array, "3"]
     previous: Float[Array, "3"]
@@ -47,15 +47,18 @@ def update(
 ) -> tuple[Memory, Float[Array, "3"]]:
     """One step: proportional and integral of the error, derivative of the measurement.
 
-    The integral goes into the output of the same step. Nothing stops it while the output saturates, only its limit.
+    The integral enters the output of the same step. It is limited, but does not stop while the output saturates.
 
     Args:
-        gains: of the three loops.
-        memory: of the step before.
-        error: wanted minus measured.
-        measured: what the derivative is taken of.
-        dt: time since the step before, s.
-        wraps: which channels are angles in deg whose differences are taken the short way.
+        gains: gains of the three loops.
+        memory: memory of the previous step.
+        error: wanted minus measured value.
+        measured: measurement, of which the derivative is taken.
+        dt: time since the previous step, s.
+        wraps: which channels are angles in deg, with differences along the shorter arc.
+
+    Returns:
+        The new memory and the output.
     """
     kp, ki, kd, integral_limit, output_limit = (jnp.asarray(x, error.dtype) for x in vars(gains).values())
     error = jnp.where(wraps, _short_way(error), error)
@@ -67,5 +70,5 @@ def update(
 
 
 def _short_way(angle_deg):
-    # Equal angles modulo a turn; the derivative stays one.
+    # Equal to the angle modulo a full turn; the derivative is one.
     return angle_deg - 360.0 * jnp.round(angle_deg / 360.0)

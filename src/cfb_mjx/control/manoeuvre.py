@@ -1,7 +1,7 @@
 """Flips as one manoeuvre: climb towards a raised target, turn, and be caught at the start (paper section VI).
 
-The same target controller climbs and catches; between the two a flip policy holds rate and speed. The
-whole is a controller and flies wherever others do.
+The same target controller climbs and catches; in between a flip policy holds rate and speed. The whole manoeuvre is a
+controller and can be used like any other.
 """
 
 from __future__ import annotations
@@ -19,56 +19,56 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model.state import AnyArray
 
 CLIMB, TURN, CATCH = range(3)
-"""The phases, in order."""
+"""Phases of the manoeuvre, in order."""
 
 
 class Knobs(NamedTuple):
-    """What of a flip its user may set. A phase ends with its time, or earlier with the speed or angle of its own."""
+    """Adjustable parameters of a flip. A phase ends when its time is over, or earlier at a certain speed or angle."""
 
     climb_m: Float[Array, ""] | float
-    """How far above the start the target of the climb is: the farther, the harder the drone climbs."""
+    """Height of the climb's target above the start, m: the higher, the faster the drone climbs."""
     climb_s: Float[Array, ""] | float
-    """How long it climbs at most."""
+    """Longest duration of the climb, s."""
     turn_s: Float[Array, ""] | float
-    """How long it turns after that at most."""
+    """Longest duration of the turn, s."""
     speed_mps: Float[Array, ""] | float
-    """Along the body's z axis, asked of the flip policy."""
+    """Speed along the body's z axis that the flip policy is to fly, m/s."""
     rate_radps: Float[Array, ""] | float
-    """About the body's x axis, asked of the flip policy."""
+    """Rate about the body's x axis that the flip policy is to fly, rad/s."""
     climb_mps: Float[Array, ""] | float = math.inf
-    """The climb is over once the drone rises so fast."""
+    """Upward speed at which the climb ends, m/s."""
     turn_rad: Float[Array, ""] | float = math.inf
-    """The turn is over once the drone has turned so far."""
+    """Angle at which the turn ends, rad."""
 
 
 class ManoeuvreMemory(NamedTuple):
-    """What each phase's policy remembers, kept up to date in all of them, and how far the manoeuvre is."""
+    """Memories of the policies of all phases, all kept up to date, and the progress of the manoeuvre."""
 
     climb: Memory
     turn: Memory
     catch: Memory
     phase: Int[Array, ""]
-    """Of the last command."""
+    """Phase of the last command."""
     count: Int[Array, ""]  # pyright: ignore[reportIncompatibleMethodOverride]  # nobody counts in it
-    """Commands given in this phase."""
+    """Number of commands given in this phase."""
     roll: Float[Array, ""]
-    """Of the last estimate, rad."""
+    """Roll angle of the last estimate, rad."""
     turned: Float[Array, ""]
-    """Since the turn began, rad."""
+    """Angle turned since the turn began, rad."""
 
 
 class Manoeuvre(eqx.Module):
-    """A controller that flips and returns to where it began, which is the target.
+    """A controller that flips and returns to its start, which is the target.
 
     Attributes:
-        holder: flies to targets.
-        turner: a flip policy, with set-points of speed and rate.
-        knobs: when and what.
+        holder: policy that flies to targets.
+        turner: flip policy, with set-points of speed and rate.
+        knobs: parameters of the flip.
     """
 
     holder: NeuralController
     turner: NeuralController
-    # Arrays, so that one compiled program flies all knobs.
+    # Arrays, so that one compiled program serves all knobs.
     knobs: Knobs = eqx.field(converter=lambda knobs: Knobs(*map(jnp.asarray, knobs)))
 
     def __check_init__(self):
@@ -77,7 +77,7 @@ class Manoeuvre(eqx.Module):
         if self.holder.control_dt_s != self.turner.control_dt_s:
             raise CfbError(
                 f"The target policy commands every {self.holder.control_dt_s} s, the flip policy every "
-                f"{self.turner.control_dt_s} s; train one of them anew."
+                f"{self.turner.control_dt_s} s; train one of them again."
             )
 
     @property
@@ -86,14 +86,14 @@ class Manoeuvre(eqx.Module):
         return self.holder.control_dt_s
 
     def start(self, estimate: Estimate, command: Float[Array, "4"]) -> ManoeuvreMemory:
-        """Memory at take-over."""
+        """Return the memory at take-over."""
         climb, catch = (self.holder.start(seen, command) for seen in (self._raised(estimate), estimate))
         turn, roll = self.turner.start(estimate, command), roll_angle(estimate.quaternion)
         nothing = jnp.asarray(0)
         return ManoeuvreMemory(climb, turn, catch, nothing, nothing, roll, jnp.zeros_like(roll))
 
     def command(self, memory: ManoeuvreMemory, estimate: Estimate) -> tuple[ManoeuvreMemory, Float[Array, "4"]]:
-        """New memory and command."""
+        """Return the new memory and the command of M1..M4, each in [0, 1]."""
         phase, count, roll, turned = self._advance(memory, estimate)
         raised, held, turning = self._raised(estimate), self.holder.layout, self.turner.layout
         climbing, catching = observation(held, memory.climb, raised), observation(held, memory.catch, estimate)
@@ -102,17 +102,17 @@ class Manoeuvre(eqx.Module):
         spinning = self.turner.act(observation(turning, memory.turn, estimate, setpoint))
         u = jnp.where(phase == TURN, spinning, holding)
         caught = remember(held, memory.catch, estimate, u)
-        # An integral gathered while turning says nothing about what holding needs.
+        # An integral that grew during the turn says nothing about what holding needs.
         still = jnp.where(phase == CATCH, caught.integral, jnp.zeros_like(caught.integral))
         caught = eqx.tree_at(lambda m: m.integral, caught, still)
         climbed, spun = remember(held, memory.climb, raised, u), remember(turning, memory.turn, estimate, u)
         return ManoeuvreMemory(climbed, spun, caught, phase, count, roll, turned), u
 
     def _advance(self, memory: ManoeuvreMemory, estimate: Estimate):
-        """Phase of the command that is due, commands given in it so far, roll, and angle turned."""
+        """Phase of the next command, number of commands in it so far, roll angle, and angle turned."""
         roll, knobs = roll_angle(estimate.quaternion), self.knobs
         turned = jnp.where(memory.phase == TURN, memory.turned + nearest(roll - memory.roll), 0.0)
-        # A little more, so that a time that ends with a command's own is not missed by a rounding.
+        # The margin keeps rounding from missing a time that is a multiple of the control step.
         elapsed = memory.count * self.control_dt_s + 1e-6
         climbed = (elapsed >= knobs.climb_s) | (estimate.velocity[2] >= knobs.climb_mps)
         round_about = (elapsed >= knobs.turn_s) | (turned >= knobs.turn_rad)
@@ -131,11 +131,11 @@ def roll_angle(quaternion: Float[AnyArray, "*times 4"]) -> Float[Array, "*times"
 
 
 def nearest(angle: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """The same angle between -pi and pi."""
+    """Wrap an angle to the interval from -pi to pi, rad."""
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
 def unwrapped(angle: Float[Array, "*batch times"]) -> Float[Array, "*batch times"]:
-    """The angle without jumps of a whole turn, from its first value on, rad."""
+    """Remove jumps of full turns from a sequence of angles, starting at its first value, rad."""
     steps = nearest(jnp.diff(angle, axis=-1))
     return angle[..., :1] + jnp.concatenate([jnp.zeros_like(angle[..., :1]), jnp.cumsum(steps, axis=-1)], axis=-1)

@@ -1,4 +1,4 @@
-"""Flips as files: how often round, and the knobs that do it."""
+"""Files of flips: the number of rotations, and the knobs that produce it."""
 
 from __future__ import annotations
 
@@ -22,25 +22,29 @@ _NOT_NEGATIVE = ("climb_s", "turn_s")
 
 @dataclass(frozen=True)
 class ManoeuvreFile:
-    """What a manoeuvre YAML holds. A knob that is left out does nothing."""
+    """Contents of a manoeuvre YAML. Optional knobs that are missing have no effect."""
 
     rotations: int
     knobs: Knobs
     description: str = ""
     holder: str = "target"
-    """The target policy that climbs and catches, name or file: the one that the knobs were found with."""
+    """Name or file of the target policy that climbs and catches, with which the knobs were found."""
 
 
 def shipped_manoeuvres() -> list[str]:
-    """Names of the manoeuvres that come with the library."""
+    """Names of the manoeuvres shipped with the library."""
     return shipped_names(_FOLDER)
 
 
 def load_manoeuvre(name_or_path: str | Path, changes: tuple[str, ...] = ()) -> ManoeuvreFile:
-    """Read a shipped manoeuvre (``double-flip``) or a YAML file, with ``KNOB=VALUE`` changes.
+    """Read a shipped manoeuvre (``double-flip``) or a YAML file.
+
+    Args:
+        name_or_path: name or file.
+        changes: changes of knobs, each ``KNOB=VALUE``.
 
     Raises:
-        CfbError: no such file, an unknown or missing knob, or a value that makes no sense, named.
+        CfbError: there is no such file, a knob is unknown or missing, or a value is invalid; the message names it.
     """
     path, document = load_named(name_or_path, "manoeuvre", FORMAT, _FOLDER)
     refuse_unknown(document, {"format", "description", "rotations", "holder", "knobs"}, path, "")
@@ -71,12 +75,12 @@ def load_manoeuvre(name_or_path: str | Path, changes: tuple[str, ...] = ()) -> M
 
 
 def save_manoeuvre(manoeuvre: ManoeuvreFile, path: str | Path) -> None:
-    """Write atomically.
+    """Write a manoeuvre YAML, atomically.
 
     Raises:
         CfbError: the file cannot be written.
     """
-    # Four digits are less than a hair's breadth and a tenth of a millisecond.
+    # Four digits: a tenth of a millimetre, a tenth of a millisecond.
     knobs = {name: round(float(x), 4) for name, x in manoeuvre.knobs._asdict().items() if math.isfinite(x)}
     document: dict[str, Any] = {"format": FORMAT, "description": manoeuvre.description}
     document |= {"rotations": manoeuvre.rotations, "holder": manoeuvre.holder, "knobs": knobs}

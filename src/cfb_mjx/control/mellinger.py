@@ -1,13 +1,13 @@
 """The Crazyflie firmware's Mellinger controller: position and attitude in one loop at 500 Hz.
 
 Equations of Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors" (ICRA 2011), with the
-firmware's additions (integrals, a derivative of the rate error), gains and limits (bitcraze/crazyflie-firmware, August
-2026: ``controller_mellinger.c``, its defaults for this platform). As there, forces are multiplied by a fixed number of
-counts per newton, and moments are counts.
+additions of the firmware (integrals, a derivative of the rate error), its gains and its limits
+(bitcraze/crazyflie-firmware, August 2026: ``controller_mellinger.c``, the defaults for this platform). As in the
+firmware, forces are multiplied by a fixed number of counts per newton, and moments are counts.
 
-The counts per newton are the firmware's and do not fit this drone, for which it was never scaled (crazyflie-firmware
-issues 832 and 1625): where counts are commands, u = count / 65535, a drone of 44 g hovers 7 to 10 cm too high. A drone
-that is to hold its height needs `Mellinger.hovering`.
+The firmware's counts per newton were never scaled for this drone and do not fit it (crazyflie-firmware issues 832 and
+1625): if counts are commands, u = count / 65535, a drone of 44 g hovers 7 to 10 cm too high. Use `Mellinger.hovering`
+for a drone that is to hold its height.
 """
 
 from __future__ import annotations
@@ -31,61 +31,61 @@ class Mellinger(eqx.Module):
     """Gains and limits; forces in N, moments in counts."""
 
     mass: Float[Array, ""] | float = 0.0393
-    """Of the platform as configured in the firmware, kg."""
+    """Mass of the platform as configured in the firmware, kg."""
     mass_thrust: Float[Array, ""] | float = 132000.0
-    """Counts per newton."""
+    """Counts per newton of thrust."""
     kp: tuple[float, float, float] = (0.4, 0.4, 1.25)
-    """N/m."""
+    """Position gain, N/m."""
     kd: tuple[float, float, float] = (0.2, 0.2, 0.4)
-    """N s/m."""
+    """Velocity gain, N s/m."""
     ki: tuple[float, float, float] = (0.05, 0.05, 0.05)
-    """N/(m s)."""
+    """Gain of the integral of the position error, N/(m s)."""
     integral_limit: tuple[float, float, float] = (2.0, 2.0, 0.4)
-    """m s."""
+    """Limit of that integral, m s."""
     attitude: tuple[float, float, float] = (70000.0, 70000.0, 60000.0)
-    """k_R, counts."""
+    """Attitude gain k_R, counts."""
     rate: tuple[float, float, float] = (20000.0, 20000.0, 12000.0)
-    """k_omega, counts s/rad."""
+    """Rate gain k_omega, counts s/rad."""
     attitude_integral: tuple[float, float, float] = (0.0, 0.0, 500.0)
-    """k_i of the attitude error, counts/s."""
+    """Gain k_i of the integral of the attitude error, counts/s."""
     attitude_integral_limit: tuple[float, float, float] = (1.0, 1.0, 1500.0)
-    """s."""
+    """Limit of that integral, s."""
     rate_derivative: float = 200.0
-    """Of roll and pitch, counts s^2/rad."""
+    """Gain of the derivative of the rate error in roll and pitch, counts s^2/rad."""
     moment_limit: float = 32000.0
     idle: float = 7000.0
-    """No motor receives less, counts."""
+    """Lowest command of every motor, counts."""
 
     @classmethod
     def hovering(cls, parameters: Parameters) -> Mellinger:
-        """The firmware's gains with the mass and the counts per newton at which ``parameters`` hover."""
+        """Return the firmware's gains with the mass and the counts per newton at which ``parameters`` hover."""
         weight = parameters.mass * parameters.gravity
         return cls(mass=parameters.mass, mass_thrust=COUNTS * jnp.mean(hover_command(parameters)) / weight)
 
 
 class MellingerState(eqx.Module):
-    """What it remembers between steps."""
+    """Memory between steps."""
 
     position: Float[Array, "3"]
     """Integral of the position error, m s."""
     attitude: Float[Array, "3"]
     """Integral of the attitude error, s."""
     body_rate: Float[AnyArray, "3"]
-    """Of the step before, rad/s."""
+    """Body rate of the previous step, rad/s."""
 
 
 def init(measurement: State) -> MellingerState:
-    """Empty integrals after ``measurement``."""
+    """Return a memory with empty integrals, after ``measurement``."""
     zero = jnp.zeros(3)
     return MellingerState(zero, zero, jnp.asarray(measurement.body_rate, zero.dtype))
 
 
 def attitude_error(quaternion: Float[AnyArray, "4"], wanted: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """(R_des^T R - R^T R_des) as a vector, without the half of the article, as in the firmware.
+    """(R_des^T R - R^T R_des) as a vector, without the factor 1/2 of the article, as in the firmware.
 
     Args:
         quaternion: measured attitude, body to world.
-        wanted: R_des, its columns the wanted body axes in the world.
+        wanted: R_des; its columns are the wanted body axes in the world.
     """
     q = Vec.unstack(quaternion)
     axes = jnp.stack([rotated(q, Vec(*row)).stack() for row in jnp.eye(3)], axis=1)
@@ -108,11 +108,11 @@ def step(
     Args:
         controller: gains and limits.
         state: memory.
-        measurement: position, velocity, attitude and body rate, SI; rotor speeds are not read.
-        position: wanted, world, m.
-        yaw: wanted, rad.
-        velocity: wanted, world, m/s.
-        acceleration: wanted, world, m/s^2.
+        measurement: position, velocity, attitude and body rate, SI; rotor speeds are not used.
+        position: wanted position, world, m.
+        yaw: wanted yaw, rad.
+        velocity: wanted velocity, world, m/s.
+        acceleration: wanted acceleration, world, m/s^2.
 
     Returns:
         The new memory and the command (4,) in [0, 1] of M1..M4.
@@ -145,7 +145,7 @@ def step(
         + triple["attitude_integral"] * turned_integral
         + k.rate_derivative * slowing
     )
-    # Mixing takes pitch in the firmware's sign: nose up.
+    # The mixing expects pitch in the firmware's sign: nose up.
     moment = jnp.clip(moment, -k.moment_limit, k.moment_limit) * jnp.array([1.0, -1.0, 1.0])
     flying = thrust > 0
     zero = jnp.zeros(3, moment.dtype)

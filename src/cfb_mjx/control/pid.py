@@ -2,13 +2,14 @@
 
 Gains, limits, signs and mixing are those of the platform CF21BL (bitcraze/crazyflie-firmware, August 2026:
 ``platform_defaults_cf21bl.h``, ``position_controller_pid.c``, ``attitude_pid_controller.c``, ``pid.c``,
-``power_distribution_quadrotor.c``). As there, angles are degrees, pitch is nose up positive (the legacy sign: opposite
-to a rotation about +y), thrust counts go from 0 to 65535, and the derivative acts on the measurement, unfiltered.
+``power_distribution_quadrotor.c``). As in the firmware, angles are in degrees, pitch is positive with the nose up (the
+legacy sign, opposite to a rotation about +y), thrust counts range from 0 to 65535, and the derivative acts on the
+unfiltered measurement.
 
-Two things differ. The count of a motor is taken as its command, u = count / 65535: the firmware before its battery
-compensation, which otherwise treats it as a thrust. And the base thrust is by default the count that hovers
-(`FirmwarePid.hovering`): the firmware's own 30000 stands for a thrust, and without the compensation hovers only once
-the integrator has found the rest.
+Two things differ. First, the count of a motor is its command, u = count / 65535: the firmware before its battery
+compensation, which otherwise treats a count as a thrust. Second, `FirmwarePid.hovering` sets the base thrust to the
+count that hovers: the firmware's own 30000 stands for a thrust, and without the compensation the drone hovers only once
+the integrator has found the difference.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ from cfb_mjx.parameters import Parameters
 
 COUNTS = 65535.0
 DT = 0.002
-"""Time between two steps: the attitude and rate loops run at 500 Hz, s."""
+"""Time between two steps, s: the attitude and rate loops run at 500 Hz."""
 DIVIDER = 5
-"""The position and velocity loops run in every fifth step, at 100 Hz."""
+"""Steps per run of the position and velocity loops, which run at 100 Hz."""
 _OVERHEAD = 1.1
-"""Output limits of the position and velocity loops exceed the velocity and tilt limits by this factor."""
+"""Ratio of the output limits of the position and velocity loops to the velocity and tilt limits."""
 _LEGACY = (1.0, -1.0, 1.0)
-"""Roll, pitch, yaw to the firmware's signs, and back."""
+"""Signs between roll, pitch, yaw and the firmware's convention, in both directions."""
 _MIXING = ((-0.5, 0.5, 1.0), (-0.5, -0.5, -1.0), (0.5, -0.5, 1.0), (0.5, 0.5, -1.0))
-"""Roll, pitch, yaw counts of M1..M4."""
+"""Effect of roll, pitch and yaw counts on M1..M4."""
 
 
 class FirmwarePid(eqx.Module):
@@ -52,20 +53,20 @@ class FirmwarePid(eqx.Module):
     )
     tilt_limit_deg: float = 20.0
     thrust_base: Float[Array, ""] | float = 30000.0
-    """Counts of every motor at zero vertical velocity error."""
+    """Command of every motor at zero vertical velocity error, counts."""
     thrust_min: float = 20000.0
-    """Lowest collective of the velocity loop, counts."""
+    """Lowest collective thrust of the velocity loop, counts."""
     idle: float = 7000.0
-    """No motor receives less, counts."""
+    """Lowest command of every motor, counts."""
 
     @classmethod
     def hovering(cls, parameters: Parameters) -> FirmwarePid:
-        """The firmware's gains with the base thrust at which ``parameters`` hover."""
+        """Return the firmware's gains with the base thrust at which ``parameters`` hover."""
         return cls(thrust_base=COUNTS * jnp.mean(hover_command(parameters)))
 
 
 class PidState(eqx.Module):
-    """What the loops remember between steps."""
+    """Memory of the loops between steps."""
 
     tick: Int[Array, ""]
     position: Memory
@@ -73,20 +74,20 @@ class PidState(eqx.Module):
     attitude: Memory
     rate: Memory
     attitude_wanted_deg: Float[Array, "2"]
-    """Roll and pitch (firmware's signs) from the last run of the velocity loop."""
+    """Roll and pitch (firmware's signs) from the last run of the velocity loop, deg."""
     thrust: Float[Array, ""]
-    """Collective from the last run of the velocity loop, counts."""
+    """Collective thrust from the last run of the velocity loop, counts."""
 
 
 class Setpoint(eqx.Module):
-    """What to do: hold a position, or an attitude with a given collective. Build it with `hover` or `tilted`."""
+    """Set-point: a position to hold, or an attitude with a given collective. Build it with `hover` or `tilted`."""
 
     position: Float[Array, "3"]
     yaw: Float[Array, ""]
     roll_pitch: Float[Array, "2"]
     thrust: Float[Array, ""]
     hold_position: Float[Array, ""]
-    """1: position and yaw count; 0: roll, pitch, yaw and thrust do."""
+    """1: hold position and yaw; 0: hold roll, pitch, yaw and thrust."""
 
     @classmethod
     def hover(cls, position: Float[Array, "3"], yaw: Float[Array, ""] | float = 0.0) -> Setpoint:
@@ -102,7 +103,7 @@ class Setpoint(eqx.Module):
 
 
 def init(controller: FirmwarePid, measurement: State) -> PidState:
-    """State with empty integrators that has seen ``measurement`` before."""
+    """Return a memory with empty integrators, after ``measurement``."""
     position, velocity, angles_deg, rates_deg = _signals(measurement)
     zero = jnp.zeros(3)
     return PidState(
@@ -117,7 +118,7 @@ def init(controller: FirmwarePid, measurement: State) -> PidState:
 
 
 def resume(controller: FirmwarePid, state: PidState, measurement: State) -> PidState:
-    """Take over from something else: integrators as they were, derivatives without a kick, every loop due."""
+    """Memory for taking over from another controller: integrators kept, no derivative kick, all loops due."""
     fresh = init(controller, measurement)
     return eqx.tree_at(
         lambda s: [getattr(s, loop).integral for loop in ("position", "velocity", "attitude", "rate")],
@@ -134,9 +135,9 @@ def step(
     Args:
         controller: gains and limits.
         state: memory.
-        measurement: position, velocity and attitude as the estimator gives them, body rate of the gyro, SI; rotor
-            speeds are not read.
-        setpoint: what to do.
+        measurement: position, velocity and attitude from the estimator, body rate from the gyro, SI; rotor speeds are
+            not used.
+        setpoint: what to hold.
 
     Returns:
         The new memory and the command (4,) in [0, 1] of M1..M4.
@@ -152,7 +153,7 @@ def step(
     )
     velocity_memory, output = update(controller.velocity, state.velocity, wanted_velocity - velocity, velocity, slow)
     limit = controller.tilt_limit_deg
-    # Forward is nose down, left is left side down: both negative in the firmware's signs.
+    # Forward is nose down and left is left side down, both negative in the firmware's signs.
     roll_pitch_deg = jnp.clip(-output[np.array([1, 0])], -limit, limit)
     thrust = jnp.clip(1000.0 * output[2] + controller.thrust_base, controller.thrust_min, COUNTS)
     position_memory, velocity_memory, roll_pitch_deg, thrust = jax.tree.map(
@@ -178,12 +179,12 @@ def step(
 
 
 def mix(thrust: Float[Array, ""], torque: Float[Array, "3"], idle: Float[Array, ""] | float = 0.0) -> Float[Array, "4"]:
-    """Legacy mixing of collective and roll, pitch, yaw (counts) to commands in [0, 1].
+    """Mix collective thrust and roll, pitch, yaw torques (counts) to commands in [0, 1] ("legacy" mixing).
 
-    Positive counts ask for roll about +x, nose up (legacy), yaw about +z. Where a motor would exceed full power all are
-    lowered alike, as in the firmware: attitude before height.
+    Positive counts ask for roll about +x, nose up (legacy sign), and yaw about +z. If a motor would exceed full power,
+    all are lowered by the same amount, as in the firmware: attitude has priority over height.
     """
-    # The firmware turns the yaw output's sign before mixing.
+    # The firmware inverts the sign of the yaw output before mixing.
     counts = thrust + np.array(_MIXING) @ (torque * np.array([1.0, 1.0, -1.0]))
     counts = counts - jnp.maximum(jnp.max(counts) - COUNTS, 0.0)
     return jnp.clip(counts, idle, COUNTS) / COUNTS
@@ -192,7 +193,7 @@ def mix(thrust: Float[Array, ""], torque: Float[Array, "3"], idle: Float[Array, 
 def _signals(measurement: State):
     """Position and velocity along the heading (m, m/s); roll, pitch, yaw (deg) and rates (deg/s) in legacy signs."""
     w, x, y, z = measurement.quaternion
-    # Just inside the range: at the pole the derivative of arcsin is infinite.
+    # Clipped just inside the range, because the derivative of arcsin is infinite at the poles.
     sine = jnp.clip(2 * (w * y - z * x), -1 + 1e-9, 1 - 1e-9)
     yaw = jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     angles = jnp.stack([jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), jnp.arcsin(sine), yaw])

@@ -1,4 +1,4 @@
-"""Trained policies as files: weights and the whole observation contract in one small ``.npz``."""
+"""Files of trained policies: weights and the complete observation contract in one small ``.npz``."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ FORMAT = "cfb_mjx policy 1"
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """A controller and where it comes from.
+    """A trained policy with its origin.
 
-    ``training`` holds the configuration, the model YAML it was trained on, seed and versions; no dates or times, so
-    that the same training on the same machine gives the same file.
+    ``training`` holds the configuration, the model YAML of the training, seed and versions. It holds no dates or times,
+    so that the same training on the same machine gives the same file.
     """
 
     controller: NeuralController
@@ -36,25 +36,25 @@ class PolicyFile:
 
     @property
     def lumped_delay(self) -> bool:
-        """Whether it was trained with the gyro as late as the pose: `cfb_mjx.envs.Task.lumped_delay`."""
+        """Whether the policy was trained with a gyro as late as the pose: `cfb_mjx.envs.Task.lumped_delay`."""
         return bool(self.training.get("config", {}).get("lumped_delay", True))
 
     @property
     def weights_sha256(self) -> str:
-        """Of weights and biases, first layer first, as little-endian float32."""
+        """SHA-256 of weights and biases, first layer first, as little-endian float32."""
         network = self.controller.network
         layers = zip(network.weights, network.biases, strict=True)
         return sha256(b"".join(np.asarray(x, "<f4").tobytes() for layer in layers for x in layer)).hexdigest()
 
 
 def shipped_policies() -> dict[str, Path]:
-    """Names and files of the policies that come with the library."""
+    """Names and files of the policies shipped with the library."""
     folder = Path(__file__).resolve().parents[1] / "policies"
     return {path.parent.name: path for path in sorted(folder.glob("*/policy.npz"))}
 
 
 def save_policy(policy: PolicyFile, path: str | Path) -> None:
-    """Write atomically.
+    """Write a policy file, atomically.
 
     Raises:
         CfbError: the file cannot be written.
@@ -84,7 +84,7 @@ def load_policy(path: str | Path) -> PolicyFile:
         path: file, or the name of a shipped policy.
 
     Raises:
-        CfbError: no such file, or not a policy, or a damaged one.
+        CfbError: there is no such file, or it is not a policy, or damaged.
     """
     path = shipped_policies().get(str(path), path)
     read_bytes(path, 1)
@@ -92,7 +92,7 @@ def load_policy(path: str | Path) -> PolicyFile:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             about = json.loads(archive["about"].tobytes())
             if about["format"] != FORMAT:
-                raise CfbError(f"{path}: is a policy of another format ({about['format']!r}, not {FORMAT!r}).")
+                raise CfbError(f"{path}: the policy has another format ({about['format']!r}, not {FORMAT!r}).")
             shown, activation = about["observation"], about["activation"]
             settings = dict(with_former(shown, "position_scale_m", BEFORE_BENDS))
             settings["setpoint_scales"] = tuple(shown.get("setpoint_scales", ()))
@@ -100,7 +100,9 @@ def load_policy(path: str | Path) -> PolicyFile:
             weights = tuple(archive[f"weight_{i}"] for i in range(about["layers"]))
             biases = tuple(archive[f"bias_{i}"] for i in range(about["layers"]))
     except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
-        raise CfbError(f"{path}: is no policy of cfb_mjx, or a damaged one; give a policy.npz of cfb train.") from None
+        raise CfbError(
+            f"{path}: is not a policy of cfb_mjx, or is damaged; give a policy.npz written by cfb train."
+        ) from None
     sizes = [layout.size, *(len(b) for b in biases)]
     fits = [w.shape for w in weights] == list(pairwise(sizes)) and sizes[-1] == 4
     if not fits or activation not in ACTIVATIONS or not all(np.all(np.isfinite(x)) for x in (*weights, *biases)):

@@ -1,11 +1,12 @@
-"""What advances many examples of a system through many steps: drones, for the rest of the library.
+"""Advance many examples of a system (drones, in this library) through many steps, on CPU and GPU.
 
-A system is two functions on pytrees, `lanes.System`: what every step needs of the constants, and a step. The engine
-knows no physics. Imports point one way, from what a program contains to where it runs:
+A system is a pair of functions on pytrees, `lanes.System`: one prepares what every step needs of the constants, the
+other is a step. The engine contains no physics. The modules import each other in one direction, from the contents of a
+program to the device it runs on:
 
-- `scalars`: a traced function carried out one number at a time, and whether one consists of numbers alone;
-- `cpu_kernel`: a computation that XLA's CPU compiler makes one function of; `groups`: a batch in such groups;
-- `lanes`: what many steps mean, forward, and their derivatives; `primitive`: these as operations of jax;
-- `batching`: a function of many examples made into one that jax can transform;
-- `gpu`, `gpu_kernel`: the same in one kernel on a GPU, and the choice of it.
+- `scalars`: evaluates a traced function one number at a time, and checks whether it consists of numbers alone;
+- `cpu_kernel`: lets XLA's CPU compiler make one function of a computation; `groups`: runs a batch in such groups;
+- `lanes`: defines many steps and their derivatives in both modes; `primitive`: makes primitives of JAX of these;
+- `batching`: makes a function of many examples a function of one that JAX can transform;
+- `gpu`, `gpu_kernel`: a whole rollout in one GPU kernel, and the choice between the kernel and the plain program.
 """

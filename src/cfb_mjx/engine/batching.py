@@ -1,4 +1,4 @@
-"""Functions of many examples at once, made into functions of one that JAX can transform."""
+"""Turn functions of many examples into functions of one example that JAX can transform."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from jax.custom_derivatives import SymbolicZero
 
 
 def one_of_many(together: Callable) -> Callable:
-    """The function of one example whose ``vmap``, however nested, is ``together``.
+    """Return the function of one example whose ``vmap``, also nested, is ``together``.
 
     Args:
-        together: called as ``together(own, *leaves)``, where ``own`` says which of the leaves have a leading axis of
-            examples (at least one has; the others are the same for all), returns a list of arrays with that axis.
+        together: called as ``together(own, *leaves)``. ``own`` marks the leaves that have a leading axis of examples
+            (at least one has; the others are the same for all examples). Returns a list of arrays with that axis.
 
     Returns:
-        Function of leaves without that axis that returns a list of arrays without it.
+        A function of leaves without that axis; it returns a list of arrays without it.
     """
 
     @custom_vmap
@@ -42,7 +42,7 @@ def _over(together: Callable, own: tuple[bool, ...]) -> Callable:
 
     @many.def_vmap
     def more(size, outer, *leaves):
-        """Two axes of examples become one."""
+        """Merge two axes of examples into one."""
         inner = examples(own, [x[0] if o else x for x, o in zip(leaves, outer, strict=True)])
 
         def merged(x, o, mine):
@@ -60,20 +60,20 @@ def _over(together: Callable, own: tuple[bool, ...]) -> Callable:
 
 
 def examples(own: tuple[bool, ...], leaves) -> int:
-    """How many there are."""
+    """Number of examples: the length of the leading axis of the leaves that are ``own``."""
     return next(x.shape[0] for x, mine in zip(leaves, own, strict=True) if mine)
 
 
 def axes(own: tuple[bool, ...]) -> tuple[int | None, ...]:
-    """``in_axes`` of a `jax.vmap` over them."""
+    """``in_axes`` for a `jax.vmap` over the leaves that are ``own``."""
     return tuple(0 if mine else None for mine in own)
 
 
 def differentiated_as(function: Callable, plain: Callable) -> Callable:
-    """``function`` with the derivatives of ``plain``, of every order and in both modes."""
+    """``function`` with the derivatives of ``plain``, of all orders and in both modes."""
     outer = jax.custom_jvp(function)
 
-    # What does not move stays out of the tangents: else every gradient would cost as much as that by all leaves.
+    # Constant arguments stay out of the tangents: otherwise every gradient would cost as much as one by all leaves.
     @functools.partial(outer.defjvp, symbolic_zeros=True)
     def rule(leaves, tangents):
         moving = [i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)]

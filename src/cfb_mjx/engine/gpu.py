@@ -1,8 +1,8 @@
-"""Which way a rollout is computed: by the plain program, or on a GPU by one kernel (`cfb_mjx.engine.gpu_kernel`).
+"""Choose how a rollout is computed: by the plain program, or by one GPU kernel (`cfb_mjx.engine.gpu_kernel`).
 
-The choice is made while tracing. On a CPU nothing is ever changed: the plain program is traced as if this module did
-not exist. On a GPU the kernel is taken for what it can do: float32, operations it knows, more than a few steps, one
-device. Derivatives, of every order and in both modes, are those of the plain program.
+The choice is made at trace time. On a CPU the plain program is traced unchanged. On a GPU the kernel is used if it
+supports the program: float32, known operations, more than a few steps, one device. Derivatives of all orders and in
+both modes are those of the plain program.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from cfb_mjx.engine.batching import axes, differentiated_as, examples, one_of_ma
 from cfb_mjx.engine.lanes import System
 
 FEWEST_STEPS = 4
-"""Shorter rollouts stay plain, so that XLA can merge them with what surrounds them (a policy, say)."""
+"""Rollouts with fewer steps stay plain, so that XLA can fuse them with the surrounding computation (e.g. a policy)."""
 MOST_NUMBERS = 2**30
-"""In one array: beyond it Triton's addresses need 64 bits, and what is held for all drones gets too large anyway."""
+"""Largest number of elements in one array: beyond it Triton's addresses need 64 bits, and the arrays get too large."""
 OLDEST_GPU = 8.0
-"""Compute capability that XLA compiles Triton for: Ampere."""
+"""Lowest compute capability for which XLA compiles Triton: Ampere."""
 
 Way = Literal["plain", "kernel", "interpret"]
 _forced: contextvars.ContextVar[tuple[Way, gpu_kernel.Tuning] | None] = contextvars.ContextVar("way", default=None)
@@ -37,10 +37,10 @@ _forced: contextvars.ContextVar[tuple[Way, gpu_kernel.Tuning] | None] = contextv
 
 @contextlib.contextmanager
 def using(way: Way, tuning: gpu_kernel.Tuning | None = None) -> Iterator[None]:
-    """Rollouts traced within go this way. Functions compiled before keep the way they were traced.
+    """Force the way in which rollouts traced in this block are computed; compiled functions keep theirs.
 
-    ``"kernel"`` still computes the plain way where the program turns out to run on something else than CUDA;
-    ``"interpret"`` carries the kernel out in plain JAX, for tests.
+    ``"kernel"`` falls back to the plain program if the compiled program runs on something other than CUDA;
+    ``"interpret"`` evaluates the kernel in plain JAX, for tests.
     """
     token = _forced.set((way, tuning or gpu_kernel.Tuning()))
     try:
@@ -60,17 +60,18 @@ def fly(
     hold: int,
     every: int | None = None,
 ) -> Any:
-    """``plain(prepared, state, rows)``, computed the way that suits the device.
+    """``plain(prepared, state, rows)``, computed in the way that suits the device.
 
     Args:
-        system: whose step ``plain`` takes.
-        plain: returns the numbers of the state after each ``every`` rows (leading axis), or at the end if that is None.
-        begin: returns the numbers at the beginning, from the same arguments.
-        prepared: what steps need of the system's constants, for one lane, as are the others.
-        state: at the beginning.
-        rows: (n, inputs).
-        hold: steps for which each row is held.
-        every: rows per state, or None.
+        system: the system whose steps ``plain`` takes.
+        plain: returns the numbers of the state after each ``every`` rows (leading axis), or only at the end if
+            ``every`` is None.
+        begin: returns the numbers of the initial state, from the same arguments.
+        prepared: prepared constants of the system; for one lane, like state and rows.
+        state: initial state.
+        rows: inputs, (n, inputs).
+        hold: number of steps for which each row is held.
+        every: rows per returned state, or None.
     """
     way, tuning = _forced.get() or (("kernel" if _suits_kernel() else "plain"), gpu_kernel.Tuning())
     if way == "plain" or rows.shape[0] * hold < FEWEST_STEPS:
@@ -95,7 +96,7 @@ def fly(
             leaves[:count],
             own[:count],
             jax.tree.leaves(start),
-            # Neighbouring threads fly neighbouring drones, whose commands must be neighbours in memory.
+            # Neighbouring threads fly neighbouring drones, so their commands must be neighbours in memory.
             jnp.moveaxis(leaves[-1], 0, 2) if own[-1] else leaves[-1],
             hold=hold,
             every=every or rows.shape[0],
@@ -111,7 +112,7 @@ def fly(
             return plainly_together(own, *leaves)
         if way == "interpret":
             return by_kernel(own, *leaves)
-        # Where the program will run is known for certain when it is compiled: GPU machines have CPUs too.
+        # The device is known for certain only when the program is compiled: GPU machines also have CPUs.
         ways = {"cuda": by_kernel, "default": plainly_together}
         return jax.lax.platform_dependent(*leaves, **{key: functools.partial(f, own) for key, f in ways.items()})
 
@@ -120,12 +121,12 @@ def fly(
 
 
 def kernel_is_chosen() -> bool:
-    """Whether rollouts the kernel can do are given to it here."""
+    """Whether rollouts that the kernel supports are computed by it on this machine."""
     return _suits_kernel() and kernel_works()
 
 
 def _step(system: System, prepared: Any, components: Any, inputs: int) -> scalars.Program | None:
-    """A step as a program of numbers, or None if it is none: MJX, say, or an effect that remembers arrays."""
+    """A step as a program of numbers, or None if it is none, e.g. with MJX or an effect with arrays in its memory."""
     if any(x.shape for x in jax.tree.leaves(components)):
         return None
     leaves, structure = jax.tree.flatten((prepared, components, jax.ShapeDtypeStruct((inputs,), jnp.float32)))
@@ -144,7 +145,7 @@ def _suits_kernel() -> bool:
     try:
         from jax.experimental.pallas.triton import CompilerParams  # noqa: F401
 
-        # "gfx..." on AMD's, for which nothing here was tried.
+        # "gfx..." on AMD GPUs, on which nothing here has been tested.
         return float(jax.devices()[0].compute_capability) >= OLDEST_GPU
     except (ImportError, AttributeError, ValueError):
         return False
@@ -152,7 +153,7 @@ def _suits_kernel() -> bool:
 
 @functools.cache
 def kernel_works() -> bool:
-    """Whether the kernel compiles on this device and flies as the plain program does; tried once per process."""
+    """Whether the kernel compiles on this device and agrees with the plain program; tested once per process."""
     return _tried("kernel")
 
 
@@ -163,7 +164,7 @@ def _swing(damping: Array, state: tuple[Array, Array], row: Array, plain: bool) 
 
 
 _PENDULUM = System(lambda damping: damping, _swing)
-"""What the kernel is tried with."""
+"""System with which the kernel is tested."""
 
 
 def _tried(way: Way, compiler_options: dict | None = None) -> bool:
@@ -182,13 +183,13 @@ def _tried(way: Way, compiler_options: dict | None = None) -> bool:
         return [np.asarray(x) for x in final]
 
     try:
-        # The caller may be in the middle of a trace, which another thread knows nothing of.
+        # The caller may be in the middle of a trace, which does not affect another thread.
         with ThreadPoolExecutor(1) as thread:
             pairs = thread.submit(lambda: list(zip(*map(swung, (way, "plain")), strict=True))).result()
         if all(np.allclose(a, b, rtol=1e-4, atol=1e-4) for a, b in pairs):
             return True
-        problem = "it computes something else"
+        problem = "its results differ from the plain program's"
     except Exception as error:
         problem = f"{type(error).__name__}: {error}".splitlines()[0]
-    warnings.warn(f"The GPU kernel for rollouts does not work here ({problem}); they run without it.", stacklevel=2)
+    warnings.warn(f"The GPU kernel for rollouts does not work here ({problem}); rollouts run without it.", stacklevel=2)
     return False

@@ -1,7 +1,7 @@
-"""One GPU kernel for a whole rollout: the state of a drone stays in registers from the first time step to the last.
+"""One GPU kernel for a whole rollout: the state of a drone stays in registers from the first step to the last.
 
-XLA turns a loop over time into kernels that are launched anew in every step, and the state travels through memory
-between them. Here one program of Pallas, in Triton's language, flies a block of drones from start to end.
+XLA turns a loop over time into kernels that are launched in every step, with the state in memory between them. Here a
+single Pallas program for Triton flies a block of drones from start to end.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from cfb_mjx.engine.scalars import Program, shaped
 
 @dataclass(frozen=True)
 class Tuning:
-    """How drones are dealt out to the GPU.
+    """How drones are distributed on the GPU.
 
-    One drone per thread: two would share nothing but need twice the registers, and a step needs about half of those a
-    thread can have. Four warps, because a multiprocessor has four schedulers: a smaller block would leave some
-    idle as long as there are fewer blocks than multiprocessors, and a larger one would leave multiprocessors idle.
+    One drone per thread: two would share nothing and need twice the registers, and a step needs about half of the
+    registers of a thread. Four warps, because a multiprocessor has four schedulers: smaller blocks would leave some of
+    them idle if there are fewer blocks than multiprocessors, and larger blocks would leave multiprocessors idle.
     """
 
     block: int = 128
-    """Drones flown by one program; a power of two, as Triton wants it."""
+    """Drones per program; a power of two, as Triton requires."""
     warps: int = 4
-    """Groups of 32 threads that share them."""
+    """Warps (32 threads each) per program."""
 
 
 def fly(
@@ -47,18 +47,18 @@ def fly(
     tuning: Tuning,
     interpret: bool = False,
 ) -> Float[Array, "kept numbers drones"]:
-    """Every drone's state after each ``every`` commands, all held for ``hold`` steps.
+    """Every drone's state after each ``every`` commands, each held for ``hold`` steps.
 
     Args:
-        step: from the constants, the numbers of the state and a row of inputs to the new numbers of the state.
+        step: step from the constants, the numbers of the state and a row of inputs to the new numbers of the state.
         constants: (...) for all drones or (drones, ...), float32.
-        own: which of the constants are each drone's own.
-        start: the numbers of the state.
-        commands: for all drones, or each drone's own.
+        own: which constants differ between drones.
+        start: numbers of the initial state.
+        commands: commands for all drones, or one sequence per drone.
         hold: steps per command.
-        every: commands per state returned; divides their number.
-        tuning: how drones are dealt out.
-        interpret: carry the kernel out in plain JAX, on any device (for tests).
+        every: commands per returned state; must divide the number of commands.
+        tuning: distribution of the drones.
+        interpret: evaluate the kernel in plain JAX, on any device (for tests).
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton as language
@@ -66,7 +66,7 @@ def fly(
     drones, rows, block, inputs = start[0].shape[0], commands.shape[0], tuning.block, commands.shape[1]
     used = [i for i, matters in enumerate(step.used[: len(constants)]) if matters]
     private, common = [i for i in used if own[i]], [i for i in used if not own[i]]
-    # Tables of numbers, one line for each, as flat arrays; those without lines are no operands.
+    # Tables of numbers as flat arrays, one line per number; empty tables are no operands.
     tables = {
         "start": start,
         "commands": [commands],
@@ -78,7 +78,7 @@ def fly(
     def kernel(*refs):
         refs, out = dict(zip(tables, refs[:-1], strict=True)), refs[-1]
         first = pl.program_id(0) * block
-        # The last block may reach beyond the last drone: there it computes with ones and stores nothing.
+        # The last block may extend beyond the last drone: there it computes with ones and stores nothing.
         there = first + jnp.arange(block, dtype=jnp.int32) < drones
 
         def each(line):
@@ -88,7 +88,7 @@ def fly(
             return language.load(refs[name].at[each(line)], mask=there, other=1.0)
 
         def taken(which, lines, number):
-            """Arrays of numbers, whose lines follow each other."""
+            """Arrays of numbers whose lines are consecutive."""
             for i in which:
                 shape = constants[i].shape[1:] if own[i] else constants[i].shape
                 yield i, shaped(shape, (number(next(lines)) for _ in range(math.prod(shape))))
@@ -120,7 +120,7 @@ def fly(
         kernel,
         out_shape=jax.ShapeDtypeStruct((rows // every * len(start) * drones,), jnp.float32),
         grid=(pl.cdiv(drones, block),),
-        # Nothing to overlap: within the loop only commands are loaded.
+        # Nothing to overlap: the loop loads only commands.
         compiler_params=language.CompilerParams(num_warps=tuning.warps, num_stages=1),
         interpret=interpret,
         name="rollout",
@@ -129,7 +129,7 @@ def fly(
 
 
 def _repeat(count: int, function: Callable, state: tuple) -> tuple:
-    # 32 bits also where JAX is set to 64.
+    # 32-bit counters even if JAX uses 64 bits.
     if count == 1:
         return function(np.int32(0), state)
     return jax.lax.fori_loop(np.int32(0), np.int32(count), function, state)

@@ -1,7 +1,7 @@
-"""What many steps of many examples of a system mean, forward, and their derivatives pushed along and pulled back.
+"""Many steps of many examples of a system: forward, with tangents pushed forward, and with cotangents pulled back.
 
-An example of a system, a drone say, is called a lane, and so is its place along the last axis of every array.
-`cfb_mjx.engine.primitive` makes operations of jax of the three functions here.
+An example of a system, e.g. a drone, is called a lane, and so is its index along the last axis of every array.
+`cfb_mjx.engine.primitive` makes primitives of JAX of the three functions here.
 """
 
 from __future__ import annotations
@@ -21,42 +21,43 @@ from cfb_mjx.optional import not_none
 
 
 class System(NamedTuple):
-    """What the engine advances. Compiled programs are kept by the two functions, so they are those of a module."""
+    """A system for the engine. Compiled programs are cached by the two functions, so use functions of a module."""
 
     prepare: Callable[[Any], Any]
-    """From the constants, a pytree, what every step needs of them."""
+    """Function of the constants (a pytree) that returns what every step needs of them."""
     step: Callable[[Any, Any, Array, bool], Any]
-    """From what is prepared, the state (a pytree of numbers), a row of inputs, and whether there is no derivative of
-    the step to be had (so that it may keep XLA from computing parts twice), the next state."""
+    """Function of the prepared constants, the state (a pytree of numbers), a row of inputs and a flag; returns the next
+    state. The flag says that no derivative of the step is taken, so that the step may keep XLA from computing parts
+    twice."""
 
 
 class Flight(NamedTuple):
-    """What is static in a flight: everything but its arrays (state, rows of inputs, the system's constants)."""
+    """The static part of a flight: everything except its arrays (state, rows of inputs, constants of the system)."""
 
     system: System
     structure: Any
-    """Of (state, rows, constants)."""
+    """Structure of (state, rows, constants)."""
     static: tuple
-    """Leaves that are no arrays; None in the place of arrays."""
+    """Leaves that are not arrays; None in the place of arrays."""
     state: int
-    """How many of the arrays are the state's, the first ones; the rows come next."""
+    """Number of arrays of the state, which come first; the rows follow."""
     hold: int
-    """Steps for which a row of commands is held."""
+    """Number of steps for which a row is held."""
     every: int
-    """Rows from one state that is kept to the next."""
+    """Number of rows per kept state."""
 
     @property
     def arrays(self) -> int:
-        """How many arrays there are."""
+        """Total number of arrays."""
         return self.static.count(None)
 
 
 class _Lanes:
-    """The lanes of one flight and what they are flown with; their axis is the last one of whatever has it.
+    """The lanes of one flight and its inputs and constants; the lane is the last axis of every array that has it.
 
-    The state is one array per number: put together as one, XLA would copy it in every step. What steps need of the
-    constants (`System.prepare`) is computed once, number by number (`cfb_mjx.engine.scalars`): so a number has the axis
-    only where it depends on something that has it, and derivatives by numbers stay among numbers.
+    The state is one array per number, because XLA would copy a packed array in every step. What steps need of the
+    constants (`System.prepare`) is computed once, number by number (`cfb_mjx.engine.scalars`). A number therefore has
+    the axis only if it depends on something that has it, and derivatives with respect to numbers remain numbers.
     """
 
     def __init__(self, flight: Flight, batched: Sequence[bool], lanes: int, arrays: Sequence[Array]):
@@ -76,7 +77,7 @@ class _Lanes:
             return [jnp.asarray(x, dtype) for x in leaves]
 
         examples = [jax.ShapeDtypeStruct(x.shape, dtype) for x in self.model]
-        # Systems consist of numbers (`scalars.consists_of`), so there is a program.
+        # Systems consist of numbers (`scalars.consists_of`), so the program exists.
         self.prepare = not_none(scalars.trace(prepared, *examples, elementwise=HELD))
         (self.structure,) = structure
         self.prepared = self.prepared_from(self.model)
@@ -89,36 +90,36 @@ class _Lanes:
         return jax.tree.unflatten(self.flight.structure, leaves)
 
     def prepared_from(self, model: Sequence[np.ndarray]) -> list[Array]:
-        """What steps need, from the model's numbers."""
+        """Prepared constants, from the numbers of the model."""
         return [_put_together(x, self.state[0].dtype) for x in self.prepare(*model)]
 
     def step(self, numbers: list[Array], row: Array, prepared: list[Array], plain: bool) -> list[Array]:
-        """One step of one lane; ``plain``: no derivative of it is taken."""
+        """One step of one lane; ``plain`` says that no derivative of it is taken."""
         state = self._whole(numbers, [None] * len(self.model))[0]
         return jax.tree.leaves(self.flight.system.step(jax.tree.unflatten(self.structure, prepared), state, row, plain))
 
     def used(self) -> list[bool]:
-        """Which of what is prepared a step depends on."""
+        """Which of the prepared constants a step depends on."""
         numbers, row, prepared = self.first()
         return scalars.used(lambda prepared: self.step(numbers, row, prepared, False), prepared)
 
     def first(self) -> tuple[list[Array], Array, list[Array]]:
-        """Numbers, row and what is prepared of one drone at its first step."""
+        """Numbers of the state, row and prepared constants of the first drone at its first step."""
         row = self.rows[0, 0] if self.row_axis is None else self.rows[0, 0, :, 0]
         prepared = [x if a is None else x[..., 0] for x, a in zip(self.prepared, self.prepared_axes, strict=True)]
         return [x[0] for x in self.state], row, prepared
 
     def each(self, function: Callable, state: list[Array], row: Array, *own: list[Array]) -> Any:
-        """``function(numbers, row, prepared, *own)`` of every drone; its own arrays have the axis."""
+        """``function(numbers, row, prepared, *own)`` for every drone; the arrays in ``own`` have the axis."""
         axes = (-1, self.row_axis, self.prepared_axes, *(-1 for _ in own))
         return jax.vmap(function, axes, -1, axis_size=self.lanes)(state, row, self.prepared, *own)
 
     def along(self, advanced: Callable, kept: Callable = lambda state: None) -> tuple[Any, Any]:
-        """From the first state through all steps.
+        """Scan from the first state through all steps.
 
         Args:
-            advanced: of a state and a row of commands, returns the next state and what to keep of the step.
-            kept: what to keep of a state that is kept.
+            advanced: function of a state and a row; returns the next state and what to keep of the step.
+            kept: function of a kept state; returns what to keep of it.
 
         Returns:
             What is kept of states, (kept, ...), and of steps, (kept, every, hold, ...).
@@ -134,12 +135,12 @@ class _Lanes:
         return jax.lax.scan(some, self.state, self.rows)[1]
 
     def forward(self, state: list[Array], row: Array) -> list[Array]:
-        """All drones after a step."""
+        """States of all drones after a step."""
         return self.each(partial(self.step, plain=True), state, row)
 
 
 def _put_together(numbers: np.ndarray, dtype) -> Array:
-    """One array of numbers; with the axis of the drones, if one of them has it."""
+    """Stack numbers in one array, with the axis of the drones if one of them has it."""
     if not numbers.shape:
         return jnp.asarray(numbers.item(), dtype)
     block = np.broadcast_shapes(*map(np.shape, numbers.flat))
@@ -148,19 +149,19 @@ def _put_together(numbers: np.ndarray, dtype) -> Array:
 
 
 def _entries(packed: Array, axis: int = 0) -> list[Array]:
-    # split, not indexing: its transpose is one concatenation, and not a sum of arrays that are mostly zero.
+    # split, not indexing: its transpose is one concatenation, not a sum of arrays that are mostly zero.
     return [jnp.squeeze(x, axis) for x in jax.lax.split(packed, (1,) * packed.shape[axis], axis)]
 
 
 PACKING = {True: (jnp.stack, _entries), False: (list, lambda numbers, axis=0: numbers)}
-"""What makes one array of arrays and takes it apart again, and what leaves them as they are."""
+"""Functions that stack arrays in one and take it apart again (True), or leave them unchanged (False)."""
 
 
 def flown(flight, batched, moving, lanes, packed, *arrays):
-    """The states that are kept: their numbers, (kept, lanes) each.
+    """The kept states: one array (kept, lanes) per number.
 
-    Where ``packed``, here and below, what a loop keeps is one array, which `one_kernel` writes in place, and the result
-    is (kept, numbers, lanes); elsewhere XLA leaves out what nobody needs.
+    If ``packed``, here and below, a loop stores what it keeps in one array, which `one_kernel` writes in place, and the
+    result is (kept, numbers, lanes). Otherwise XLA leaves out what is not needed.
     """
     drones = _Lanes(flight, batched, lanes, arrays)
     kept = drones.along(lambda state, row: (drones.forward(state, row), None), PACKING[packed][0])[0]
@@ -168,7 +169,7 @@ def flown(flight, batched, moving, lanes, packed, *arrays):
 
 
 def pushed(flight, batched, moving, lanes, packed, *operands):
-    """Tangents of the kept states; operands are the flight's arrays and the tangents of those that are ``moving``."""
+    """Tangents of the kept states; operands are the flight's arrays and the tangents of the ``moving`` ones."""
     arrays, own = list(operands[: flight.arrays]), list(batched[: flight.arrays])
     moved = [_each(arrays[i], own[i], lanes) for i in moving]
     for i in moving:
@@ -184,9 +185,9 @@ def pushed(flight, batched, moving, lanes, packed, *operands):
 
 
 def pulled(flight, batched, moving, lanes, packed, *operands):
-    """Cotangents, drone by drone, of the ``moving`` arrays; operands are the arrays and the kept states' cotangents.
+    """Cotangents of the ``moving`` arrays, per drone; operands are the arrays and the cotangents of the kept states.
 
-    The states of all steps are kept, the rest of a step is computed again: to store that costs more.
+    The states of all steps are stored; the rest of a step is computed again, because storing it costs more.
     """
     drones, count = _Lanes(flight, batched, lanes, operands[: flight.arrays]), flight.state
     dtype = drones.state[0].dtype
@@ -196,7 +197,7 @@ def pulled(flight, batched, moving, lanes, packed, *operands):
     which = _both(scalars.changed_by(drones.prepare, moved), drones.used())
 
     def before(numbers, row, prepared, cotangents):
-        """Cotangents before a step, of one drone."""
+        """Cotangents before a step of one drone, from those after it."""
 
         def after(numbers, row, some):
             return drones.step(numbers, row, _replaced(prepared, which, some), plain=False)
@@ -207,7 +208,7 @@ def pulled(flight, batched, moving, lanes, packed, *operands):
         of_numbers, of_some = jax.vjp(lambda numbers, some: after(numbers, row, some), numbers, some)[1](cotangents)
         return of_numbers, jnp.zeros(0, row.dtype), of_some
 
-    # Positions, for instance, are needed only by what depends on them.
+    # For example, positions are needed only if something depends on them.
     numbers, row, prepared = drones.first()
     cotangents = [jnp.zeros_like(x) for x in numbers]
     used = scalars.used(lambda numbers: before(numbers, row, prepared, cotangents), numbers)
@@ -217,7 +218,7 @@ def pulled(flight, batched, moving, lanes, packed, *operands):
     nowhere = [jnp.zeros(lanes, dtype)] * count
 
     def of_model(of_some):
-        """Cotangents of the model's own numbers from those of what is prepared."""
+        """Cotangents of the model's numbers from those of the prepared constants."""
         return jax.vmap(of_one_model, (-1, axes), -1, axis_size=lanes)(of_some, model)
 
     def of_one_model(of_some, model):
@@ -229,8 +230,8 @@ def pulled(flight, batched, moving, lanes, packed, *operands):
 
         return jax.vjp(some_from, [model[i] for i in moved])[1](of_some)[0]
 
-    # Sums over steps are what takes longest, to read and to write: where the model's numbers are far fewer than what is
-    # prepared from them, each step's cotangents become theirs first.
+    # Reading and writing the sums over steps takes most of the time. If the model has far fewer numbers than the
+    # prepared constants, the cotangents of each step are converted to the model's numbers first.
     early = 2 * sum(len(model[i]) for i in moved) < len(which)
 
     def over_row(carry, states_and_row):

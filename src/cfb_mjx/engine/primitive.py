@@ -1,11 +1,11 @@
-"""Many steps of many drones, and their derivatives, as operations that see the whole batch.
+"""Many steps of many drones, and their derivatives, as primitives that see the whole batch.
 
-Written drone by drone under ``vmap``, a step is thirty small kernels over all drones, and its derivative two hundred;
-between them every number goes through memory. On CPU the drones are flown a few at a time through all steps instead,
-each group in one compiled function (`cfb_mjx.engine.groups`) whose numbers stay in the nearest cache, and so are their
-derivatives. To form groups an operation has to know its batch, which code under ``vmap`` does not: hence primitives of
-jax. There are three: the flight, its push of tangents forward, and its pull of cotangents back. All mean what the same
-steps under ``vmap``, ``jvp`` and ``vjp`` mean, which is also how they are computed elsewhere.
+Under ``vmap``, a step becomes thirty small kernels over all drones, and its derivative two hundred, and every number
+passes through memory between them. On CPU the drones are therefore flown a few at a time through all steps, each group
+in one compiled function (`cfb_mjx.engine.groups`) whose numbers stay in the nearest cache; the same holds for the
+derivatives. To form groups an operation must know its batch, which code under ``vmap`` does not: hence primitives of
+JAX. There are three: the flight, the push of its tangents forward, and the pull of its cotangents back. They are
+defined by the same steps under ``vmap``, ``jvp`` and ``vjp``, which is also how they are computed on other devices.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ def fly(system: System, constants: Any, state: Any, rows: Array, hold: int, ever
     """Advance ``state`` by all ``rows`` of inputs, each held for ``hold`` steps.
 
     Args:
-        system: what is advanced; its steps consist of numbers (`cfb_mjx.engine.scalars.consists_of`).
-        constants: of the system, a pytree without batch axes.
-        state: where it starts, a pytree of scalars.
-        rows: (n, inputs).
+        system: the system; its steps must consist of numbers (`cfb_mjx.engine.scalars.consists_of`).
+        constants: constants of the system, a pytree without batch axes.
+        state: initial state, a pytree of scalars.
+        rows: inputs, (n, inputs).
         hold: steps per row.
-        every: rows per state that is returned; must divide n.
+        every: rows per returned state; must divide n.
 
     Returns:
-        The states after every ``every`` rows, (n // every,); without it, the last one.
+        The states after every ``every`` rows, (n // every,); without ``every``, the last state.
     """
     leaves, structure = jax.tree.flatten((state, rows, constants))
     dynamic = [isinstance(x, jax.Array | np.ndarray | np.generic) for x in leaves]
@@ -52,11 +52,11 @@ def fly(system: System, constants: Any, state: Any, rows: Array, hold: int, ever
 
 
 OPERATIONS = {"fly": flown, "fly_push": pushed, "fly_pull": pulled}
-"""What each primitive means."""
+"""Definition of each primitive."""
 
 
 def _evaluated(what, *operands, flight, drones, batched, moving, in_groups):
-    """One of the three above for the whole batch."""
+    """Evaluate one of the three functions above for the whole batch."""
     if drones is None:
         operands, batched = [x[..., None] for x in operands], (True,) * len(operands)
     size = drones or 1
@@ -65,7 +65,7 @@ def _evaluated(what, *operands, flight, drones, batched, moving, in_groups):
         lanes = next(x.shape[-1] for x, b in zip(operands, batched, strict=True) if b)
         return what(flight, batched, moving, lanes, in_groups, *operands)
 
-    # Of more drones than a group, states on the way take longer to move than to compute.
+    # With more drones than a group, storing intermediate states takes longer than computing them.
     in_groups = in_groups and (size <= LANES or operands[flight.state].shape[0] == flight.every)
     found = grouped(some, operands, batched, size) if in_groups else some(*operands)
     if in_groups and what is not pulled:
@@ -103,7 +103,7 @@ def _primitive(name: str) -> Primitive:
 
 
 def meaning(name: str, operands: Sequence[jax.ShapeDtypeStruct], static: dict[str, Any]):
-    """The plain steps that an operation of this name stands for, traced; for those who count what programs do."""
+    """Trace the plain steps that define the primitive of this name, for tools that count operations."""
     return jax.make_jaxpr(partial(_evaluated, OPERATIONS[name], in_groups=False, **static))(*operands)
 
 
@@ -119,11 +119,11 @@ def _batch(primitive, operands, axes, *, flight, drones, batched, moving):
 
 
 def _join(x: Array, axis: int | None, batched: bool, size: int, drones: int | None) -> Array:
-    """The new batch axis and the earlier one, where there is one, as a single last axis."""
+    """Merge the new batch axis and the earlier one, if any, into a single last axis."""
     if axis is None and not batched:
         return x
     if drones is None:
-        # Without an earlier batch axis only a new one is left.
+        # Without an earlier batch axis there is only the new one.
         return jnp.moveaxis(x, not_none(axis), -1)
     x = x[None] if axis is None else jnp.moveaxis(x, axis, 0)
     x = x if batched else x[..., None]
@@ -132,7 +132,7 @@ def _join(x: Array, axis: int | None, batched: bool, size: int, drones: int | No
 
 
 def _differentiate(plain, primals, tangents, **static):
-    """Of the push and the pull: second derivatives, by the plain steps."""
+    """Derivatives of push and pull, i.e. second derivatives, by the plain steps."""
     moving = [i for i, t in enumerate(tangents) if type(t) is not ad.Zero]
 
     def function(*moved):
@@ -181,10 +181,10 @@ def _pull(cotangents, *operands, flight, drones, batched, moving):
 
 
 def _totals(parts: list[Array]) -> list[Array]:
-    """The sum over the last axis of each."""
+    """Sum of each array over its last axis."""
     if not parts:
         return []
-    # One sum of many rows, since XLA compiles and calls every sum on its own.
+    # One sum over all rows, because XLA compiles and calls every sum separately.
     total = jnp.sum(jnp.concatenate([x.reshape(-1, x.shape[-1]) for x in parts]), axis=-1)
     ends = np.cumsum([x[..., 0].size for x in parts])
     return [y.reshape(x.shape[:-1]) for y, x in zip(jnp.split(total, ends[:-1]), parts, strict=True)]

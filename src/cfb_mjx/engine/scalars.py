@@ -1,9 +1,9 @@
-"""A function of small arrays, computed one number at a time.
+"""Evaluate a function of small arrays one number at a time.
 
-Registers of a GPU hold numbers, and a kernel language such as Triton's knows no arrays of three. JAX's trace of a
-function of small arrays is therefore carried out again here with every array taken apart: what only moves numbers about
-(slices, stacks, reshapes) happens in Python, what computes is done number by number. A number may itself stand for a
-block of drones. So the code that flies one drone in plain JAX serves inside a kernel too, without a second version.
+GPU registers hold numbers, and a kernel language such as Triton's has no arrays of three. This module therefore
+evaluates JAX's trace of a function again with every array taken apart. Operations that only move numbers (slices,
+stacks, reshapes) happen in Python; computations are done number by number. A number may itself be a block of drones. So
+the code that flies one drone in plain JAX also serves inside a kernel, without a second version.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _ELEMENTWISE = """
     max min mul ne neg not or pow rsqrt select_n sign sin sqrt square sub tan tanh
 """
 ELEMENTWISE = frozenset(_ELEMENTWISE.split())
-"""Operations known to exist in Triton's language as well as in JAX's; all have one result."""
+"""Operations that exist in Triton's language as well as in JAX's; all have one result."""
 CALLS = frozenset(("jit", "pjit", "closed_call", "custom_jvp_call"))
 
 
@@ -42,7 +42,7 @@ def _slice(array: np.ndarray, start_indices, limit_indices, strides) -> np.ndarr
 def _sum(array: np.ndarray, axes, **_) -> np.ndarray:
     first = np.moveaxis(array, axes, range(len(axes)))
     kept = first.shape[len(axes) :]
-    # One row stays a row: NumPy would take the sum of all numbers out of its array.
+    # The extra axis keeps every row an array: NumPy would return a sum of all numbers as a scalar.
     rows = first.reshape(-1, 1, *kept)
     total = rows[0]
     for row in rows[1:]:
@@ -52,7 +52,7 @@ def _sum(array: np.ndarray, axes, **_) -> np.ndarray:
 
 def _unstack(array: np.ndarray, axis: int) -> tuple[np.ndarray, ...]:
     rows = np.moveaxis(array, axis, 0)
-    # A slice stays an array where a row of one number would not.
+    # A slice remains an array; indexing a row of one number would not.
     return tuple(rows[i : i + 1].reshape(rows.shape[1:]) for i in range(len(rows)))
 
 
@@ -60,7 +60,7 @@ MOVES: dict[str, Callable[..., np.ndarray | tuple[np.ndarray, ...]]] = {
     "broadcast_in_dim": _broadcast,
     "concatenate": lambda *arrays, dimension: np.concatenate(arrays, axis=dimension),
     "copy": lambda array: array,
-    # Barriers keep XLA from computing things twice; a kernel's compiler finds common parts by itself.
+    # Barriers keep XLA from computing things twice; the compiler of a kernel finds common subexpressions by itself.
     "optimization_barrier": lambda *arrays: arrays,
     "reduce_sum": _sum,
     "reshape": lambda array, new_sizes, **_: array.reshape(new_sizes),
@@ -70,29 +70,29 @@ MOVES: dict[str, Callable[..., np.ndarray | tuple[np.ndarray, ...]]] = {
     "transpose": lambda array, permutation: array.transpose(permutation),
     "unstack": _unstack,
 }
-"""Operations that move numbers about, or add them up, on arrays of objects."""
+"""Operations that move numbers, or add them up, on arrays of objects."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """A traced function of arrays whose parts are all known here."""
+    """A traced function of arrays that consists of known operations."""
 
     traced: ClosedJaxpr
     used: tuple[bool, ...]
-    """Which arguments the results depend on."""
+    """Whether the results depend on each argument."""
 
     def __call__(self, *arguments: np.ndarray | None) -> list[np.ndarray]:
-        """Results as arrays of numbers, from arguments likewise; those not used may be None."""
+        """Evaluate with arrays of numbers; arguments that are not used may be None."""
         return _run(self.traced.jaxpr, self.traced.consts, arguments)
 
 
 def trace(function: Callable, *examples: Any, elementwise: frozenset[str] = ELEMENTWISE) -> Program | None:
-    """The program of ``function``, which takes arrays and returns a sequence of them; None if parts are unknown here.
+    """Return the program of ``function``, or None if it contains unknown operations.
 
     Args:
-        function: works on arrays alone, closed over nothing that is traced.
-        examples: arrays or `jax.ShapeDtypeStruct`, as many as there are arguments.
-        elementwise: operations known beside `MOVES`.
+        function: function of arrays that returns a sequence of arrays and closes over no traced values.
+        examples: arrays or `jax.ShapeDtypeStruct`, one per argument.
+        elementwise: known operations besides `MOVES`.
     """
     traced = jax.make_jaxpr(function)(*examples)
     if not consists_of(traced.jaxpr, elementwise):
@@ -102,7 +102,7 @@ def trace(function: Callable, *examples: Any, elementwise: frozenset[str] = ELEM
 
 
 def shaped(shape: tuple[int, ...], numbers: Iterable) -> np.ndarray:
-    """An array of these numbers, as they are: NumPy's own constructors would look into them."""
+    """An array of objects that holds ``numbers`` unchanged: NumPy's constructors would convert them."""
     array = np.empty(shape, object)
     for index, number in zip(np.ndindex(shape), numbers, strict=True):
         array[index] = number
@@ -110,12 +110,12 @@ def shaped(shape: tuple[int, ...], numbers: Iterable) -> np.ndarray:
 
 
 def apart(array, shape: tuple[int, ...]) -> np.ndarray:
-    """``array`` taken apart along its first axes, which have this ``shape``: an array of its entries."""
+    """Split ``array`` along its first axes, of this ``shape``, into an array of its entries."""
     return shaped(shape, (array[index] for index in np.ndindex(shape)))
 
 
 def changed_by(program: Program, moved: Sequence[int]) -> list[bool]:
-    """Which results may change with these arguments."""
+    """Which results may change if the arguments with indices ``moved`` change."""
     jaxpr = program.traced.jaxpr
     touched = {jaxpr.invars[i] for i in moved}
     for equation in jaxpr.eqns:
@@ -125,7 +125,7 @@ def changed_by(program: Program, moved: Sequence[int]) -> list[bool]:
 
 
 def used(function: Callable, arguments: Sequence) -> list[bool]:
-    """Which of a list of arrays a function of that list depends on."""
+    """Which of ``arguments`` the result of ``function(arguments)`` depends on."""
     jaxpr = jax.make_jaxpr(lambda *arguments: function(list(arguments)))(*arguments).jaxpr
     needed = _needed(jaxpr)[1]
     return [v in needed for v in jaxpr.invars]
@@ -136,7 +136,7 @@ def _inner(equation) -> ClosedJaxpr:
 
 
 def consists_of(jaxpr, elementwise: frozenset[str]) -> bool:
-    """Whether what the results depend on is calls, `MOVES` and these operations alone."""
+    """Whether everything the results depend on is a call, one of `MOVES`, or one of these operations."""
     for equation in _needed(jaxpr)[0]:
         name = equation.primitive.name
         if name in CALLS:
@@ -148,7 +148,7 @@ def consists_of(jaxpr, elementwise: frozenset[str]) -> bool:
 
 
 def _needed(jaxpr) -> tuple[list, set]:
-    """The equations the results depend on, in order, and every variable these read."""
+    """The equations on which the results depend, in order, and all variables they read."""
     needed, kept = {v for v in jaxpr.outvars if not isinstance(v, Literal)}, []
     for equation in reversed(jaxpr.eqns):
         if needed.intersection(equation.outvars):
@@ -181,7 +181,7 @@ def _run(jaxpr, constants, arguments) -> list[np.ndarray]:
 
 
 def _numbers(array) -> np.ndarray:
-    """An array of NumPy numbers: such a number is written into a kernel, where an array could not be."""
+    """Convert an array to NumPy scalars, which can be written into a kernel where arrays cannot."""
     array = np.asarray(array)
     return apart(array, array.shape)
 

@@ -1,4 +1,4 @@
-"""Tasks to train on: what the controller sees, what it is rewarded for, how episodes begin and end."""
+"""Tasks for training: observations, rewards, and how episodes begin and end."""
 
 from cfb_mjx.envs.episode import Episode, Noise, Task, observe, privileged, reset, step, with_room
 from cfb_mjx.envs.flip import FlipReward, FlipStarts, FlipTask, Setpoints

@@ -1,8 +1,8 @@
-"""Episodes of any task: on drones drawn anew, seen through late, offset and noisy estimates.
+"""Episodes of any task: on randomly drawn drones, seen through delayed, offset and noisy estimates.
 
-`reset` begins an episode, `observe` gives what the controller sees, `step` flies one command. All are pure functions
-of one drone: ``vmap`` them over many. Each episode carries its own drone, so randomisation needs nothing else. What is
-wanted of the drone is said by a `Task`: `cfb_mjx.envs.target` and `cfb_mjx.envs.flip`.
+`reset` begins an episode, `observe` returns what the controller sees, `step` flies one command. All are pure functions
+of one drone; use ``vmap`` for many. Each episode carries its own drone, so randomisation needs nothing else. A `Task`
+defines what the drone should do: `cfb_mjx.envs.target` and `cfb_mjx.envs.flip`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cfb_mjx.parameters import Parameters, Randomisation
 
 @dataclass(frozen=True)
 class Noise:
-    """Standard deviations. Of the state: added in every simulation step (paper). Of the estimate: in every reading."""
+    """Standard deviations of noise: on the state in every simulation step (paper), on the estimate in every reading."""
 
     state_velocity_mps: float = 0.001
     state_rate_radps: float = 0.001
@@ -40,8 +40,8 @@ class Noise:
     attitude_rad: float = 0.001
     rate_radps: float = 0.01
     pose_jitter_s: float = 0.0
-    """By up to so much every reading is later than the model's ``pose_delay``, drawn anew and uniformly: what a radio
-    or a motion capture's network adds."""
+    """Largest additional delay of a reading, s, on top of the model's ``pose_delay``. Each reading draws it uniformly:
+    jitter of a radio or of the network of a motion-capture system."""
 
 
 QUIET = Noise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -50,49 +50,49 @@ QUIET = Noise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Task:
-    """Everything about a task but the drone. Hashable, so it can be closed over under ``jit``.
+    """Everything about a task except the drone. Hashable, so that functions may close over it under ``jit``.
 
-    A task of one's own says what its flights ask for, how they begin, what a state is worth and when it is lost.
+    A subclass defines the set-points, how episodes begin, the reward of a state, and which states end an episode.
     """
 
     layout: Layout = field(default_factory=Layout)
     noise: Noise = field(default_factory=Noise)
     randomisation: Randomisation | None = None
-    """What varies from episode to episode; None: nothing does."""
+    """Ranges that vary from episode to episode; None: nothing varies."""
     magnitude: float = 1.0
     """Factor on all ranges of ``randomisation``."""
     graded: float = 0.0
     """Share of the episodes that draw their own factor between 0 and ``magnitude``."""
     episode_s: float = 6.0
     lumped_delay: bool = True
-    """The paper's reading: one delay, the model's ``pose_delay``, for pose, velocity and gyro alike. Else the gyro is
-    on the drone, as real ones are, and only ``gyro_delay`` late."""
+    """Whether pose, velocity and gyro have one common delay, the model's ``pose_delay``, as in the paper. Otherwise the
+    gyro is on the drone, as a real one, and has only the delay ``gyro_delay``."""
     longest_delay_s: float | None = None
-    """The longest delay that any drone of the task has, for which estimates are kept; None: what the model and the
-    randomisation say. To be given (`with_room`) where the model is traced."""
+    """Longest delay of any drone of the task, s, for which estimates are stored. None: computed from the model and the
+    randomisation. Set it (`with_room`) if the model is traced."""
 
     @property
     def episode_steps(self) -> int:
-        """Commands in a full episode."""
+        """Number of commands in a full episode."""
         return round(self.episode_s / self.layout.control_dt_s)
 
     def hold(self, model: Quadrotor) -> int:
-        """Simulation steps per command; raises as `Quadrotor.steps_per_command`."""
+        """Number of simulation steps per command; raises as `Quadrotor.steps_per_command`."""
         return model.steps_per_command(self.layout.control_dt_s)
 
     @property
     def largest_reward(self) -> float:
-        """What the best step is worth."""
+        """Reward of the best possible step."""
         raise NotImplementedError
 
     def draw_setpoint(self, key: PRNGKeyArray) -> Float[Array, " setpoints"]:
-        """What an episode asks for beside its target; ``layout.setpoint_scales`` has one scale for each number."""
+        """Draw the set-point of an episode; ``layout.setpoint_scales`` has one scale per number."""
         return jnp.zeros(0)
 
     def draw_start(
         self, model: Quadrotor, target: Float[Array, "3"], setpoint: Float[Array, " setpoints"], key: PRNGKeyArray
     ) -> State:
-        """A random initial state."""
+        """Draw an initial state."""
         raise NotImplementedError
 
     def judge(
@@ -103,38 +103,38 @@ class Task:
         command: Float[Array, "4"],
         parameters: Parameters,
     ) -> Float[Array, ""]:
-        """Reward of ``state`` after ``command`` [0 to 1]; what is judged is the true state, not its estimate."""
+        """Reward of the true ``state`` (not its estimate) after ``command`` [0 to 1]."""
         raise NotImplementedError
 
     def failed(self, state: State) -> Bool[Array, ""]:
-        """Whether ``state`` ends the episode; one that is not finite does, whatever is said here."""
+        """Whether ``state`` ends the episode as a failure; a state that is not finite always does."""
         raise NotImplementedError
 
     @property
     def diverged_reward(self) -> float:
-        """Reward of the step after which the state is not finite any more."""
+        """Reward of a step after which the state is not finite."""
         return -300.0
 
     def errors(
         self, state: State, target: Float[Array, "3"], setpoint: Float[Array, " setpoints"]
     ) -> Float[Array, "errors"]:
-        """The distances that the reward falls with, each scaled to about one: what a value network is told."""
+        """Errors that the reward decreases with, each scaled to about one, for the value network."""
         raise NotImplementedError
 
 
 def longest_delay_s(task: Task, nominal: Quadrotor, magnitude: Float[Array, ""] | float | None = None) -> float | None:
-    """The longest delay of what a controller sees, s, of any drone that the task draws about ``nominal``.
+    """Longest delay, s, of the estimates of any drone that the task draws about ``nominal``.
 
     Args:
         task: the task.
-        nominal: the drone about which others are drawn; may carry batch axes.
-        magnitude: of the randomisation, in place of the task's.
+        nominal: centre of the ranges; may carry batch axes.
+        magnitude: magnitude of the randomisation; default: the task's.
 
     Returns:
-        None where it cannot be known, as the model or the magnitude is traced.
+        The delay, or None if the model or the magnitude is traced.
 
     Raises:
-        CfbError: a delay of zero has a relative range, which is none.
+        CfbError: a delay of zero has a relative range.
     """
     ranges = {} if task.randomisation is None else dict(task.randomisation.ranges)
     magnitude = task.magnitude if magnitude is None else magnitude
@@ -147,8 +147,8 @@ def longest_delay_s(task: Task, nominal: Quadrotor, magnitude: Float[Array, ""] 
         if spread is not None:
             if spread.relative and value == 0:
                 raise CfbError(
-                    f"ranges.{name} is relative, and {name} is 0: nothing would vary; give the model one (--set {name}="
-                    "0.002), or leave the range out."
+                    f"ranges.{name} is relative, and {name} is 0, so nothing would vary; give the model one (--set "
+                    f"{name}=0.002), or leave the range out."
                 )
             width = float(magnitude) * max(spread.half_width)
             value = value * (1 + width) if spread.relative else value + width
@@ -163,34 +163,41 @@ _AnyTask = TypeVar("_AnyTask", bound=Task)
 
 
 def with_room(task: _AnyTask, nominal: Quadrotor) -> _AnyTask:
-    """The task with room for late estimates of every drone it draws about ``nominal``, which may then be traced."""
+    """Return the task with room for the delayed estimates of all drones that it draws about ``nominal``.
+
+    Afterwards ``nominal`` may be traced.
+
+    Args:
+        task: the task.
+        nominal: centre of the ranges; may carry batch axes.
+    """
     longest = longest_delay_s(task, nominal)
     return task if longest is None else replace(task, longest_delay_s=longest)
 
 
 def _room_s(task: Task, nominal: Quadrotor, magnitude) -> float:
-    """For how long estimates are kept."""
+    """How long estimates are stored, s."""
     longest, room = longest_delay_s(task, nominal, magnitude), task.longest_delay_s
     if room is None:
         if longest is None:
             raise CfbError(
-                "reset: the delay of a traced model is not known while compiling; give the task its longest_delay_s, "
-                "for instance by with_room(task, model) outside of jit and vmap."
+                "reset: the delay of a traced model is not known at compile time; give the task its longest_delay_s, "
+                "for example by with_room(task, model) outside of jit and vmap."
             )
         return longest
     if longest is not None and longest > room * (1 + 1e-6):
         names = " or ".join(_DELAYS[: 1 if task.lumped_delay else 2])
         raise CfbError(
-            f"The task keeps estimates for longest_delay_s = {room:g} s, but {names} can be {longest:g} s; raise it or "
-            "leave it out."
+            f"The task stores estimates for longest_delay_s = {room:g} s, but {names} can be {longest:g} s; increase "
+            "it or leave it out."
         )
     return room
 
 
 class Streams(NamedTuple):
-    """One key for each thing that an episode draws: nothing else may be drawn from it, or derived from it.
+    """One key for each random part of an episode; nothing else may be drawn or derived from it.
 
-    A key is told by its place, so a new stream goes last and leaves the draws of the others alone.
+    The position of a key determines its value, so add new keys at the end to keep the draws of the others.
     """
 
     drone: PRNGKeyArray
@@ -198,17 +205,17 @@ class Streams(NamedTuple):
     noise: PRNGKeyArray
     first_estimate: PRNGKeyArray
     mildness: PRNGKeyArray
-    """Of the factor on the ranges of randomisation."""
+    """Key of the factor on the ranges of randomisation."""
     setpoint: PRNGKeyArray
 
     @classmethod
     def of(cls, key: PRNGKeyArray) -> Streams:
-        """Of the episode that ``key`` decides."""
+        """Return the keys of the episode that ``key`` determines."""
         return cls(*(jax.random.fold_in(key, place) for place in range(len(cls._fields))))
 
 
 class Pose(eqx.Module):
-    """What of the state an estimator could know."""
+    """The part of the state that an estimator can know."""
 
     position: AnyArray
     velocity: AnyArray
@@ -224,26 +231,26 @@ class Episode(eqx.Module):
     state: State
     target: Float[Array, "3"]
     setpoint: Float[Array, " setpoints"]
-    """What is asked for beside the target; empty for tasks that ask for nothing else."""
+    """Set-point beside the target; empty for tasks without one."""
     past: DelayLine
-    """Of `Pose`: estimates arrive late."""
+    """Past values of `Pose`, because estimates are delayed."""
     memory: Memory
     estimate: Estimate
-    """What the controller sees now."""
+    """Estimate that the controller sees now."""
     count: Int[Array, ""]
     key: PRNGKeyArray
 
 
 class Outcome(NamedTuple):
-    """What a step led to."""
+    """Result of a step."""
 
     reward: Float[Array, ""]
     failed: Bool[Array, ""]
-    """The episode is over: too fast, or not finite."""
+    """The episode is over because a limit was passed or the state is not finite."""
     timed_out: Bool[Array, ""]
-    """The episode is over: its time is up."""
+    """The episode is over because its time is up."""
     diverged: Bool[Array, ""]
-    """It failed because its state is not finite any more."""
+    """It failed because its state is not finite."""
 
 
 def reset(
@@ -259,23 +266,26 @@ def reset(
 
     Args:
         task: the task.
-        nominal: the drone about which this episode's is drawn.
-        key: decides the drone, the start and all noise.
-        state: where it begins; drawn by default.
-        target: position that estimates are relative to, world, m.
-        magnitude: of the randomisation, in place of the task's; may be traced.
-        setpoint: what is asked for beside the target; drawn by default.
+        nominal: drone about which the drone of this episode is drawn.
+        key: determines the drone, the start and all noise.
+        state: initial state; drawn by default.
+        target: position to which estimates are relative, world, m.
+        magnitude: magnitude of the randomisation; default: the task's. May be traced.
+        setpoint: set-point beside the target; drawn by default.
+
+    Returns:
+        The episode at its start.
 
     Raises:
-        CfbError: ranges that allow impossible drones (`cfb_mjx.model.require_possible`); or the task has no room
-            for the delays that can be drawn, or they are not known as the model is traced.
+        CfbError: the ranges allow impossible drones (`cfb_mjx.model.require_possible`), the task has no room for the
+            delays that can be drawn, or these are unknown because the model is traced.
     """
     room = _room_s(task, nominal, magnitude)
     streams = Streams.of(key)
     model = nominal
     if task.randomisation is not None:
         factor = task.magnitude if magnitude is None else magnitude
-        # Asked of the whole magnitude: whether a drone can be must not depend on the grade that this key draws.
+        # Checked for the whole magnitude: the result must not depend on the grade that this key draws.
         require_possible(nominal, task.randomisation, factor)
         factor = factor * mildness(task, streams.mildness)
         model = sample_drone(streams.drone, nominal, task.randomisation, factor)
@@ -291,7 +301,7 @@ def reset(
 
 
 def mildness(task: Task, key: PRNGKeyArray) -> Float[Array, ""] | float:
-    """Factor in [0, 1] on an episode's randomisation: of a share ``task.graded`` of the episodes uniform, else 1."""
+    """Factor in [0, 1] on an episode's randomisation: uniform for a share ``task.graded`` of the episodes, else 1."""
     if not task.graded:
         return 1.0
     which, grade = jax.random.uniform(key, (2,))
@@ -299,26 +309,26 @@ def mildness(task: Task, key: PRNGKeyArray) -> Float[Array, ""] | float:
 
 
 def settled_command(model: Quadrotor, state: State) -> Float[Array, "4"]:
-    """The command [0 to 1] that keeps the rotors as they turn: what a controller that takes over finds."""
+    """Command [0 to 1] that keeps the rotors at their present speeds, as a controller finds it at take-over."""
     return jnp.clip(steady_command(model.parameters, state.rotor_speed), 0.0, 1.0)
 
 
 def choose(condition: Array, yes: Any, no: Any) -> Any:
-    """``jnp.where`` on every array of two like pytrees; the condition's axes come first."""
+    """``jnp.where`` on every array of two pytrees of the same structure; the condition's axes come first."""
     return jax.tree.map(
         lambda a, b: jnp.where(condition.reshape(condition.shape + (1,) * (a.ndim - condition.ndim)), a, b), yes, no
     )
 
 
 def observe(task: Task, episode: Episode) -> Float[Array, " size"]:
-    """What the controller's network is given now."""
+    """Observation of the controller's network."""
     return seen.observation(task.layout, episode.memory, episode.estimate, episode.setpoint)
 
 
 def privileged(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array, " n"]:
-    """What a value network may know: true frame, errors, rotor speeds, integral, set-points, how the drone differs.
+    """Input of a value network: true frame, errors, rotor speeds, integral, set-points, differences of the drone.
 
-    The reward falls with lengths of errors, whose tips at zero a small network is slow to form by itself.
+    The reward decreases with norms of errors, whose kinks at zero a small network learns only slowly by itself.
     """
     state, parameters = episode.state, episode.model.parameters
     position = state.position - episode.target
@@ -338,13 +348,16 @@ def step(
 ) -> tuple[Episode, Outcome]:
     """Fly ``command`` [0 to 1] for one control step.
 
+    If the state becomes non-finite the episode has failed; it then keeps the last finite state and its estimates.
+
     Args:
         task: the task.
-        episode: the flight so far.
-        command: of M1..M4; clipped to [0, 1].
-        prepared: `prepare(episode.model)`, where the caller has it already.
+        episode: the episode so far.
+        command: commands of M1..M4; clipped to [0, 1].
+        prepared: `prepare(episode.model)`, if it has been computed already.
 
-    A state that is not finite any more has failed; the episode keeps the last one that was, and what was seen of it.
+    Returns:
+        The episode after the step, and the outcome.
     """
     model = episode.model
     prepared = prepare(model) if prepared is None else prepared
@@ -361,8 +374,8 @@ def step(
         at = Components(at.position, velocity, at.quaternion, body_rate, at.rotor_speed, at.memory)
         return at, at
 
-    # A loop, however short, and arrays put together only after it: else XLA fuses the dynamics into every such array
-    # and, on CPU without its multi-output fusion, computes them once for each number in it, twenty times slower.
+    # A loop, even of one step, and arrays stacked only after it: otherwise XLA fuses the dynamics into every such array
+    # and, on CPU without multi-output fusion, computes them once per number, twenty times slower.
     moved, passed = jax.lax.scan(fly, unstack(episode.state, center), Vec.unstack(kicks))
     state, poses = stack(moved, center), _pose(stack(passed, center))
     finite = _finite(state)
@@ -392,14 +405,14 @@ def _estimate(task: Task, model: Quadrotor, past: DelayLine, target: Array, key:
     parameters, noise = model.parameters, task.noise
     delay = parameters.pose_delay
     if noise.pose_jitter_s:
-        # Of a key of its own: the noise stays what it is without jitter.
+        # A separate key, so that the other noise is the same with and without jitter.
         delay = delay + noise.pose_jitter_s * jax.random.uniform(jax.random.fold_in(key, 1), (), delay.dtype)
     late = past.read(delay)
     if not task.lumped_delay:
         gyro = DelayLine(past.samples.body_rate, past.dt).read(parameters.gyro_delay)
         late = Pose(late.position, late.velocity, late.quaternion, gyro)
     draws = jax.random.normal(key, (12,), late.position.dtype)
-    # Between two samples the blend of unit quaternions is a little short.
+    # Interpolation between two unit quaternions is slightly shorter than one.
     q = late.quaternion / jnp.sqrt(jnp.sum(late.quaternion**2))
     turned = Vec.unstack(parameters.attitude_offset + noise.attitude_rad * draws[6:9])
     return Estimate(

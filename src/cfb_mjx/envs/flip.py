@@ -1,7 +1,7 @@
-"""The task of turning about the body's x axis at a rate that is asked for (paper section V, its flips).
+"""The task of rotating about the body's x axis at a given rate (paper section V, its flips).
 
-Set-points are [v_target, rate_target]: speed along the body's z axis, m/s, and rate about its x axis, rad/s. Position
-is neither rewarded nor shown.
+Set-points are [v_target, rate_target]: speed along the body's z axis, m/s, and rate about its x axis, rad/s. The
+position is neither rewarded nor observed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.parameters import Parameters
 
 SETPOINTS = ("speed_mps", "rate_radps")
-"""What they are, in order."""
+"""Names of the set-points, in order."""
 FLIP_LAYOUT = Layout(
     position=False,
     position_scale_m=1.0,
@@ -32,7 +32,7 @@ FLIP_LAYOUT = Layout(
     velocity_bend_mps=0.0,
     setpoint_scales=(3.0, 10.0),
 )
-"""What a flip policy sees."""
+"""Observation of a flip policy."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class FlipReward:
         0.6 Lambda(|R^T v - [0, 0, v_target]|, 20 m/s) + 0.15 Lambda(|R e_x - axis|, 3)
         + Lambda(|omega - [rate_target, 0, 0]|, e_omega) - 300 fail
 
-    Two values cannot be as printed (docs/deviations.md): e_omega is given in N m, and an axis [0, 1, 0] would turn the
-    drone out of the plane of the paper's figures.
+    Two values differ from the printed ones, which cannot be right (docs/deviations.md): the paper gives e_omega in N m,
+    and its axis [0, 1, 0] would turn the drone out of the plane of the paper's figures.
     """
 
     velocity: float = 0.6
@@ -51,7 +51,7 @@ class FlipReward:
     axis: float = 0.15
     axis_width: float = 3.0
     axis_direction: tuple[float, ...] = (1.0, 0.0, 0.0)
-    """Of the body's x axis, in the world."""
+    """Wanted direction of the body's x axis, world."""
     body_rate: float = 1.0
     body_rate_width_radps: float = 20.0
     failure: float = 300.0
@@ -61,11 +61,11 @@ class FlipReward:
 
     @property
     def largest(self) -> float:
-        """What a step at the set-points is worth."""
+        """Reward of a step at the set-points."""
         return self.velocity + self.axis + self.body_rate
 
     def failed(self, state: State) -> Bool[Array, ""]:
-        """Whether speed or body rate have passed their limits."""
+        """Whether speed or body rate exceed their limits."""
         return too_fast(state, self.speed_limit_mps, self.rate_limit_radps)
 
     def __call__(self, state: State, setpoint: Float[Array, "2"]) -> Float[Array, ""]:
@@ -82,7 +82,7 @@ class FlipReward:
 def deviations(
     state: State, setpoint: Float[Array, "2"], axis_direction: tuple[float, ...] = (1.0, 0.0, 0.0)
 ) -> tuple[Float[AnyArray, "3"], Float[AnyArray, "3"], Float[AnyArray, "3"]]:
-    """Of velocity (body axes, m/s), of the body's x axis (world), and of the body rate (rad/s)."""
+    """Deviations of velocity (body axes, m/s), of the body's x axis (world), and of the body rate (rad/s)."""
     turn = rotation_matrix(state.quaternion)
     speed, rate = setpoint
     nothing = jnp.zeros_like(speed)
@@ -93,7 +93,7 @@ def deviations(
 
 @dataclass(frozen=True)
 class Setpoints:
-    """What users will ask for; each episode draws its own, uniformly between the two numbers."""
+    """Ranges of the set-points; each episode draws its own uniformly between the two numbers."""
 
     speed_mps: tuple[float, ...] = (-3.0, 5.0)
     rate_radps: tuple[float, ...] = (8.0, 22.0)
@@ -101,30 +101,30 @@ class Setpoints:
 
 @dataclass(frozen=True)
 class FlipStarts:
-    """How flips begin: a share ``entering`` as a climb leaves the drone, the rest in the middle of a turn.
+    """How flips begin: a share ``entering`` in the state after a climb, the rest in the middle of a turn.
 
-    Largest values; all draws are uniform.
+    The fields are largest values; all draws are uniform.
     """
 
     entering: float = 0.5
     climb_mps: float = 6.0
-    """Upward speed, from zero on when entering."""
+    """Upward speed; when entering from zero upwards."""
     fall_mps: float = 2.0
-    """Downward speed in a turn. What falls faster reaches the limit of speed before the episode is over."""
+    """Downward speed in a turn. A drone that falls faster reaches the speed limit before the episode is over."""
     level_mps: float = 1.0
-    """Horizontal speed, per axis, in a turn twice that across the axis."""
+    """Horizontal speed per axis; in a turn twice that across the axis."""
     tilt_rad: float = 0.3
-    """About each axis when entering; in a turn any roll, and this about the other two."""
+    """Angle about each axis when entering; in a turn any roll angle, and this about the other two axes."""
     rate_radps: float = 1.5
-    """About each axis; in a turn beside the rate that is asked for."""
+    """Rate about each axis; in a turn in addition to the set-point."""
     rotor_speed: tuple[float, ...] = (0.2, 1.7)
-    """Least and largest, relative to hover."""
+    """Smallest and largest rotor speed, relative to hover."""
 
 
 def draw_flip(
     starts: FlipStarts, model: Quadrotor, target: Float[Array, "3"], rate: Float[Array, ""], key: PRNGKeyArray
 ) -> State:
-    """A random initial state of ``model`` about to turn, or turning, at ``rate`` [rad/s]."""
+    """Draw an initial state of ``model`` that is about to turn, or turning, at ``rate`` [rad/s]."""
     unit = jax.random.uniform(key, (17,), jnp.result_type(float))
     entering = unit[0] < starts.entering
     both = 2 * unit - 1
@@ -137,7 +137,7 @@ def draw_flip(
     turning = jnp.where(entering, 0.0, 1.2 * unit[7] * rate)
     body_rate = starts.rate_radps * both[8:11] + jnp.stack([turning, jnp.zeros_like(rate), jnp.zeros_like(rate)])
     low, high = starts.rotor_speed
-    # Rotors of one drone run at much the same speed, whatever that is.
+    # The rotors of one drone turn at similar speeds.
     spread = low + (high - low) * (0.7 * unit[11] + 0.3 * unit[12:16])
     rotor_speed = hover_rotor_speed(model.changed_parameters()) * spread
     return State(target, velocity, attitude, body_rate, rotor_speed)
@@ -158,7 +158,7 @@ def _from_roll_pitch_yaw(roll: Array, pitch: Array, yaw: Array) -> Float[Array, 
 
 @dataclass(frozen=True)
 class FlipTask(Task):
-    """The paper's second task."""
+    """The paper's second task: rotate about x at the set-points."""
 
     layout: Layout = FLIP_LAYOUT
     reward: FlipReward = field(default_factory=FlipReward)
@@ -168,18 +168,18 @@ class FlipTask(Task):
 
     @property
     def largest_reward(self) -> float:
-        """What a step at the set-points is worth."""
+        """Reward of a step at the set-points."""
         return self.reward.largest
 
     def draw_setpoint(self, key: PRNGKeyArray) -> Float[Array, "2"]:
-        """Speed and rate, uniformly within their ranges."""
+        """Draw speed and rate, uniformly within their ranges."""
         low, high = jnp.array([self.setpoints.speed_mps, self.setpoints.rate_radps]).T
         return jax.random.uniform(key, (2,), low.dtype, low, high)
 
     def draw_start(
         self, model: Quadrotor, target: Float[Array, "3"], setpoint: Float[Array, "2"], key: PRNGKeyArray
     ) -> State:
-        """As ``starts`` says."""
+        """Draw an initial state from ``starts``."""
         return draw_flip(self.starts, model, target, setpoint[1], key)
 
     def judge(
@@ -190,19 +190,19 @@ class FlipTask(Task):
         command: Array,
         parameters: Parameters,
     ) -> Float[Array, ""]:
-        """The paper's reward."""
+        """Reward of the paper."""
         return self.reward(state, setpoint)
 
     def failed(self, state: State) -> Bool[Array, ""]:
-        """Too fast."""
+        """Whether speed or body rate exceed their limits."""
         return self.reward.failed(state)
 
     @property
     def diverged_reward(self) -> float:
-        """The failure of the paper."""
+        """Reward of the paper for a failure."""
         return -self.reward.failure
 
     def errors(self, state: State, target: Float[Array, "3"], setpoint: Float[Array, "2"]) -> Float[Array, "3"]:
-        """Of velocity, axis and body rate."""
+        """Errors of velocity, axis and body rate."""
         velocity, axis, body_rate = deviations(state, setpoint, self.reward.axis_direction)
         return jnp.stack([length(velocity) / 3, length(axis), length(body_rate) / 10])

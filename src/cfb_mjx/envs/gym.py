@@ -1,4 +1,4 @@
-"""Tasks for other libraries of reinforcement learning: Gymnasium environments, one drone or many.
+"""Gymnasium environments of the tasks, for other libraries of reinforcement learning; one drone or many.
 
     import cfb_mjx.envs.gym  # registers them
 
@@ -7,8 +7,8 @@
 
 Needs the extra ``gymnasium``. Actions are 2 u - 1 in [-1, 1]; observations are those of `Layout`. The info of a reset
 or step holds what the controller does not see: the true ``position`` (relative to the target), ``velocity``,
-``quaternion``, ``body_rate`` and ``rotor_speed`` of the drone, SI, and its ``parameters``, a dictionary of arrays. Of
-the step in which an episode fails it also says why (``failure``).
+``quaternion``, ``body_rate`` and ``rotor_speed`` of the drone, SI, and its ``parameters``, a dictionary of arrays. If
+an episode fails in a step, the info also contains the reason (``failure``).
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ except ImportError:
 
 
 class NotReset(CfbError, ResetNeeded):
-    """A step where only a reset makes sense."""
+    """A step at a time when only a reset is possible."""
 
 
 FAST, DIVERGED = "a limit of speed or body rate is passed", "the state is not finite any more"
-"""What ``failure`` says."""
+"""Values of ``failure``."""
 
 _cut_off = False
-"""Whether this process was forked from one that had started JAX, whose threads a fork does not take along."""
+"""Whether this process was forked from one that had started JAX, whose threads a fork does not copy."""
 
 
 def _after_fork() -> None:
@@ -63,8 +63,8 @@ if hasattr(os, "register_at_fork"):
 def _require_jax() -> None:
     if _cut_off:
         raise CfbError(
-            "This process was forked from one that uses JAX already, in which JAX would wait for ever; start it anew, "
-            'AsyncVectorEnv with context="spawn", or fly many drones in one process: TargetVectorEnv.'
+            "This process was forked from a process that already uses JAX; in it JAX would wait forever. Start it anew "
+            '(AsyncVectorEnv with context="spawn"), or fly many drones in one process (TargetVectorEnv).'
         )
 
 
@@ -74,7 +74,7 @@ def _spaces(task: Task) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
 
 
 def _truth(episode: Episode) -> dict[str, Any]:
-    """What the controller does not see, of one episode or of many."""
+    """Values that the controller does not see, for one episode or many."""
     state, names = episode.state, SPECIFICATIONS
     return {
         "position": state.position - episode.target,
@@ -86,10 +86,10 @@ def _truth(episode: Episode) -> dict[str, Any]:
     }
 
 
-# Compiled once for all environments of a task, however many a process has.
+# Compiled once for all environments of a task in a process.
 @partial(jax.jit, static_argnums=0)
 def _draw(task: Task, nominal: Quadrotor, keys: Array) -> tuple[Array, Episode]:
-    """Keys of what comes after, and the next episode of every drone."""
+    """New keys, and the next episode of every drone."""
     keys, own = jax.vmap(jax.random.split, out_axes=1)(keys)
     return keys, jax.vmap(partial(reset, task, nominal))(own)
 
@@ -102,13 +102,13 @@ def _fly(task: Task, episodes: Episode, actions: Array) -> tuple[Episode, Outcom
 
 @partial(jax.jit, static_argnums=0)
 def _begin(task: Task, which: Array, waiting: Episode, episodes: Episode) -> tuple[Episode, tuple[Array, dict]]:
-    """Begin the episodes that wait."""
+    """Begin the waiting episodes of ``which``."""
     begun = choose(which, waiting, episodes)
     return begun, _show(task, begun)
 
 
 def _show(task: Task, episodes: Episode) -> tuple[Array, dict[str, Any]]:
-    """What the controllers see, and what they do not."""
+    """Observations of the controllers, and the values that they do not see."""
     return jax.vmap(partial(observe, task))(episodes), jax.vmap(_truth)(episodes)
 
 
@@ -116,21 +116,22 @@ _choose = jax.jit(choose)
 
 
 class TargetVectorEnv(VectorEnv):
-    """Many drones at once, one compiled step for all; every episode is on another drone.
+    """Many drones at once with one compiled step for all; every episode has its own drone.
 
-    Info has an array with one row for each drone under each name. Where episodes begin anew in the step in which they
-    end, ``final_obs`` and ``final_info`` hold what the ended ones came to (masks ``_final_obs``, ``_final_info``).
+    Under each name the info has an array with one row per drone. If episodes begin again in the step in which they
+    end, ``final_obs`` and ``final_info`` hold the last observation and info of the ended ones (masks ``_final_obs``,
+    ``_final_info``).
 
     Args:
         num_envs: number of drones.
-        task: what to fly, a `FlipTask` too; by default to the target, on the nominal drone.
+        task: task to fly, also a `FlipTask`; default: fly to the target on the nominal drone.
         model: preset or model YAML, or the drone itself.
-        autoreset_mode: when ended episodes begin anew. Some of Gymnasium's wrappers, `NormalizeObservation` for
-            one, need ``NEXT_STEP``. With ``DISABLED``, ``reset(options={"reset_mask": ended})`` begins them.
+        autoreset_mode: when ended episodes begin again. Some of Gymnasium's wrappers, e.g. `NormalizeObservation`,
+            need ``NEXT_STEP``. With ``DISABLED``, ``reset(options={"reset_mask": ended})`` begins them.
 
     Raises:
-        CfbError: no such model or mode, a control step that is no multiple of the drone's, or ranges that allow drones
-            that cannot be.
+        CfbError: there is no such model or mode, the control step is not a multiple of the drone's, or the ranges allow
+            impossible drones.
     """
 
     def __init__(
@@ -154,7 +155,7 @@ class TargetVectorEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._keys = self._episodes = None
         self._over = np.zeros(num_envs, bool)
-        # Gymnasium tells the parent of what a reset raises, not of what this does.
+        # In a forked process raise in reset: Gymnasium reports errors of a reset to the parent, not errors of this.
         if _cut_off:
             return
         self.nominal = model if isinstance(model, Quadrotor) else Quadrotor.from_file(model)
@@ -167,13 +168,16 @@ class TargetVectorEnv(VectorEnv):
         """Begin all episodes, or those of a mask.
 
         Args:
-            seed: one for all drones (others share nothing with it), or a list with one for each, as `TargetEnv` takes
-                it. It decides all episodes of a drone from then on. Without one (None) drones go on; the first time
-                they get one of their own.
-            options: ``reset_mask`` says which to begin, (num_envs,) booleans.
+            seed: one seed for all drones (the drones of different seeds share nothing), or a list with one per drone,
+                as `TargetEnv` takes it. It determines all later episodes of a drone. With None, drones continue their
+                sequence; at the first reset they get random seeds.
+            options: ``reset_mask`` selects the episodes to begin, (num_envs,) booleans.
+
+        Returns:
+            Observations and info.
 
         Raises:
-            CfbError: seeds or a mask that are something else, or nothing has begun yet and not all are to.
+            CfbError: invalid seeds or mask, or a first reset that does not begin all episodes.
         """
         _require_jax()
         who = type(self).__name__
@@ -191,7 +195,7 @@ class TargetVectorEnv(VectorEnv):
         super().reset(seed=next((int(s) for s in seeds if s is not None), None))
         if self._keys is None:
             if not which.all():
-                raise NotReset(f"{who}: the first reset has to begin all episodes.")
+                raise NotReset(f"{who}: the first reset must begin all episodes.")
             seeds = [int(self.np_random.integers(2**32)) if s is None else s for s in seeds]
         given = np.array([s is not None for s in seeds])
         if given.any():
@@ -208,12 +212,14 @@ class TargetVectorEnv(VectorEnv):
 
     @property
     def waits(self) -> bool:
-        """Whether nothing has begun, or an episode has ended that only `reset` begins anew."""
+        """Whether nothing has begun, or an episode has ended that only `reset` can begin again."""
         return self._episodes is None or (self.autoreset_mode == AutoresetMode.DISABLED and bool(self._over.any()))
 
     def _begin(self, which: np.ndarray) -> tuple[Array, dict[str, Any]]:
-        """Begin the episodes that wait; what is seen of all. Drawing costs as much as flying: all that are taken are
-        drawn anew at once, when one of them is needed again. Which episodes a drone flies, its own key alone decides.
+        """Begin the waiting episodes of ``which`` and return what is seen of all drones.
+
+        Drawing costs as much as flying: all waiting episodes that were used are drawn again together, when one of them
+        is needed. A drone's own key alone determines the sequence of its episodes.
         """
         if (which & self._taken).any():
             drawn = _draw(self.task, self.nominal, self._keys)
@@ -224,10 +230,13 @@ class TargetVectorEnv(VectorEnv):
         return shown
 
     def step(self, actions: Any):
-        """Observations, rewards, whether failed, whether timed out, and the info.
+        """Fly one action per drone.
+
+        Returns:
+            Observations, rewards, whether failed, whether timed out, and the info.
 
         Raises:
-            CfbError: no reset came before, or is due; actions of another shape or that are not finite.
+            CfbError: there was no reset, or one is due; actions have a wrong shape or are not finite.
         """
         _require_jax()
         who, anew = type(self).__name__, self._over
@@ -236,7 +245,7 @@ class TargetVectorEnv(VectorEnv):
             raise NotReset(f"{who}: call reset before step{over}.")
         actions = _checked(actions, (self.num_envs, 4), who)
         self._episodes, outcome, shown = _fly(self.task, self._episodes, actions)
-        # Where the last step ended an episode, this one begins the next: the action there counts for nothing.
+        # If the last step ended an episode, this one begins the next, and its action is ignored.
         failed = np.asarray(outcome.failed) & ~anew
         timed_out = np.asarray(outcome.timed_out) & ~anew & ~failed
         reward = np.where(anew, 0.0, np.asarray(outcome.reward, np.float64))
@@ -261,7 +270,7 @@ def _whole(number: Any) -> bool:
 
 
 def _shown(truth: dict[str, Any], which: np.ndarray) -> dict[str, Any]:
-    """As Gymnasium's vector environments do: beside each name a mask of the environments that have it."""
+    """Add a mask to each name, as Gymnasium's vector environments do: which environments have it."""
     shown = {name: _shown(x, which) if isinstance(x, dict) else np.asarray(x) for name, x in truth.items()}
     return shown | {f"_{name}": which for name in truth}
 
@@ -274,15 +283,15 @@ def _checked(actions: Any, shape: tuple[int, ...], who: str) -> np.ndarray:
     if numbers is None or numbers.shape != shape:
         found = "something else" if numbers is None else f"the shape {numbers.shape}"
         wanted = " x ".join(map(str, shape))
-        raise CfbError(f"{who}: an action must be {wanted} numbers, 2 u - 1 of each motor, found {found}.")
+        raise CfbError(f"{who}: an action must be {wanted} numbers, 2 u - 1 for each motor, found {found}.")
     if not np.isfinite(numbers).all():
         bad = numbers if numbers.ndim == 1 else numbers[~np.isfinite(numbers).all(axis=1)][0]
-        raise CfbError(f"{who}: an action must be finite, found {bad.tolist()}; what computed it has diverged.")
+        raise CfbError(f"{who}: an action must be finite, found {bad.tolist()}; the policy has diverged.")
     return numbers
 
 
 class TargetEnv(gymnasium.Env):
-    """One drone; arguments as `TargetVectorEnv`. Episodes that end wait for ``reset``."""
+    """One drone; arguments as for `TargetVectorEnv`. After an episode has ended, call ``reset``."""
 
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's interface)
 
@@ -292,16 +301,19 @@ class TargetEnv(gymnasium.Env):
         self.render_mode = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode; the same seed gives the same ones from then on."""
+        """Begin an episode; the same seed gives the same episodes from then on."""
         super().reset(seed=seed)
         seen, info = self.many.reset(seed=[seed])
         return seen[0], _of_one(info)
 
     def step(self, action: Any):
-        """Observation, reward, whether failed, whether timed out, info.
+        """Fly one action.
+
+        Returns:
+            Observation, reward, whether failed, whether timed out, and the info.
 
         Raises:
-            CfbError: no reset came before or the episode is over, or an action of another shape or not finite.
+            CfbError: there was no reset, the episode is over, or the action has a wrong shape or is not finite.
         """
         if self.many.waits:
             raise NotReset("TargetEnv: the episode is over, or none has begun; call reset before step.")

@@ -1,12 +1,12 @@
-"""What a neural controller sees: the newest estimate, some past ones, its own past commands, and what it is asked for.
+"""Observation of a neural controller: newest estimate, past estimates, past commands, and set-points.
 
-One contract for training, simulation and the exported C: `Layout` says what goes in, in which order and scale.
-Order: newest frame, past frames (newest first), past commands (newest first), integral, set-points. A frame is the
-position relative to the target, velocity (world or body axes), the nine entries of the rotation matrix body to world by
-rows (the same for q and -q), and the body rate.
+The same contract holds for training, simulation and the exported C: `Layout` defines the contents, their order and
+scale. Order: newest frame, past frames (newest first), past commands (newest first), integral, set-points. A frame is
+the position relative to the target, velocity (world or body axes), the nine entries of the rotation matrix body to
+world by rows (the same for q and -q), and the body rate.
 
-All of it works on one drone, and on many whose axis is the last one of every array: then their numbers are put together
-row by row, where ``vmap`` would put them together drone by drone, which on a CPU takes longer than flying.
+All functions accept one drone, or many along the last axis of every array. The numbers are then concatenated row by
+row; ``vmap`` would concatenate them drone by drone, which on a CPU takes longer than flying.
 """
 
 from __future__ import annotations
@@ -23,45 +23,45 @@ from cfb_mjx.optional import not_none
 
 @dataclass(frozen=True)
 class Layout:
-    """Size, order and scale of an observation. Hashable: it is fixed for the life of a policy."""
+    """Size, order and scale of an observation. Hashable; fixed for the lifetime of a policy."""
 
     control_dt_s: float = 0.008
     """Time between two commands, s."""
     past_estimates: int = 1
     estimate_stride: int = 1
-    """Control steps between one shown estimate and the next older one."""
+    """Control steps between one observed estimate and the next older one."""
     past_commands: int = 6
     integral: bool = False
-    """Also show the integral of the relative position: with it constant errors of thrust and attitude can be held."""
+    """Whether to observe the integral of the relative position, which allows constant errors to be held."""
     position_limit_m: float = 8.0
-    """Farther targets look as if they were this far away, in their direction."""
+    """Largest observed distance, m: farther targets appear at this distance in the same direction."""
     position_scale_m: float = 0.1
     position_bend_m: float = 0.1
-    """Distances much longer than this are shown on a logarithmic scale, as b asinh(d / b); 0: all as they are.
+    """Distances much longer than this appear on a logarithmic scale, b asinh(d / b), in m; 0: linear scale.
 
-    A network is nearly linear at first. Of distances shown as they are it makes one gain for all, no larger than a
-    target 6 m away allows.
+    A network is nearly linear at the beginning of a training. With a linear scale it uses one gain for all distances,
+    no larger than the gain that a target 6 m away allows.
     """
     velocity_scale_mps: float = 2.0
     velocity_bend_mps: float = 0.5
-    """The same for speeds: what brakes half a metre per second in time turns the drone over at six."""
+    """The same for speeds, m/s: the braking that is right at 0.5 m/s turns the drone over at 6 m/s."""
     rate_scale_radps: float = 10.0
     integral_input_limit_m: float = 0.3
-    """The integral of each axis grows no faster than if the drone were this far away."""
+    """Largest position error per axis that enters the integral, m."""
     integral_limit_ms: float = 0.6
-    """Largest integral of each axis, m s."""
+    """Largest integral per axis, m s."""
     position: bool = True
-    """Show the position at all."""
+    """Whether to observe the position."""
     body_position: bool = True
-    """Position in body axes, not the world's: what to do then does not depend on the heading."""
+    """Whether the position is in body axes, not the world's; the right command then does not depend on the heading."""
     body_velocity: bool = True
-    """The same for the velocity."""
+    """Whether the velocity is in body axes, not the world's."""
     setpoint_scales: tuple[float, ...] = ()
-    """One per set-point, which is divided by it."""
+    """Divisor of each set-point."""
 
     @property
     def frame(self) -> int:
-        """Numbers in a frame."""
+        """Number of values in a frame."""
         return 15 + 3 * self.position
 
     @property
@@ -72,12 +72,12 @@ class Layout:
 
 
 BEFORE_BENDS = {"position_bend_m": 0.0, "velocity_bend_mps": 0.0, "body_position": False, "body_velocity": False}
-"""What a layout was before it could be otherwise: straight, and in the world's axes. One that was written out then
-gives ``position_scale_m`` and none of these."""
+"""Settings of layouts written before these fields existed: linear scales and world axes. Such a layout gives
+``position_scale_m`` and none of these fields."""
 
 
 class Estimate(eqx.Module):
-    """What the state estimator reports."""
+    """Output of the state estimator."""
 
     position: Float[AnyArray, " 3 *drones"]
     """Position minus target, world, m."""
@@ -90,14 +90,14 @@ class Estimate(eqx.Module):
 
 
 class Memory(eqx.Module):
-    """What the controller keeps between two steps."""
+    """Memory of a controller between two steps."""
 
     frames: Float[Array, "estimates frame *drones"]
-    """Of every control step, shown or not, newest first."""
+    """Frames of every control step, observed or not, newest first."""
     commands: Float[Array, "commands 4 *drones"]
-    """As the observation shows them: 2 u - 1."""
+    """Past commands as observed: 2 u - 1."""
     integral: Float[Array, " 3 *drones"]
-    """Of the relative position, m s."""
+    """Integral of the relative position, m s."""
 
 
 def rotation_matrix(q: Float[AnyArray, " 4 *drones"]) -> Float[Array, "3 3 *drones"]:
@@ -113,7 +113,7 @@ def rotation_matrix(q: Float[AnyArray, " 4 *drones"]) -> Float[Array, "3 3 *dron
 
 
 def frame(layout: Layout, estimate: Estimate) -> Float[Array, " frame *drones"]:
-    """The numbers of one estimate, scaled."""
+    """Scaled numbers of one estimate."""
     turn = rotation_matrix(estimate.quaternion)
 
     def in_axes(vector, body):
@@ -135,12 +135,12 @@ def frame(layout: Layout, estimate: Estimate) -> Float[Array, " frame *drones"]:
 
 
 def _length(vector: Float[AnyArray, " 3 *drones"]) -> Float[Array, " *drones"]:
-    # The square root has no slope at zero; the small number keeps the gradient finite there.
+    # The square root has no derivative at zero; the small number keeps the gradient finite there.
     return jnp.sqrt(jnp.sum(vector * vector, axis=0) + 1e-12)
 
 
 def _bent(length: Float[Array, " *drones"], bend: float) -> Float[Array, " *drones"]:
-    """By what a vector of this length is multiplied to be bend asinh(length / bend) long."""
+    """Factor that changes the length of a vector to bend asinh(length / bend)."""
     return bend * jnp.arcsinh(length / bend) / length
 
 
@@ -156,13 +156,13 @@ def start(layout: Layout, estimate: Estimate, command: Float[Array, " 4 *drones"
 def observation(
     layout: Layout, memory: Memory, estimate: Estimate, setpoint: Float[Array, " setpoints *drones"] | None = None
 ) -> Float[Array, " size *drones"]:
-    """What the network is given, (``layout.size``,).
+    """Input of the network, (``layout.size``,).
 
     Args:
-        layout: what goes in.
-        memory: of the controller.
-        estimate: the newest.
-        setpoint: what is asked for, one number for each of ``layout.setpoint_scales``.
+        layout: layout of the observation.
+        memory: memory of the controller.
+        estimate: newest estimate.
+        setpoint: one number for each of ``layout.setpoint_scales``.
     """
     shown = memory.frames[layout.estimate_stride - 1 :: layout.estimate_stride]
     drones = estimate.position.shape[1:]
@@ -176,7 +176,7 @@ def observation(
 
 
 def remember(layout: Layout, memory: Memory, estimate: Estimate, command: Float[Array, " 4 *drones"]) -> Memory:
-    """Memory after ``command`` [0 to 1] was given on ``estimate``; called once every ``layout.control_dt_s``."""
+    """Memory after ``command`` [0 to 1] on ``estimate``; call it once every ``layout.control_dt_s``."""
     frames, commands = memory.frames, memory.commands
     if layout.past_estimates:
         frames = jnp.concatenate([frame(layout, estimate)[None], frames[:-1]])

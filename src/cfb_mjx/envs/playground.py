@@ -1,13 +1,13 @@
-"""Tasks as environments of MuJoCo Playground, for its trainers and those written for them.
+"""Tasks as environments of MuJoCo Playground, for its trainers and trainers written for them.
 
     import cfb_mjx.envs.playground  # registers them
     from mujoco_playground import registry
 
     env = registry.load("CfbTarget", config_overrides={"model": "cfb", "magnitude": 1.0})
 
-`BraxEnv` with Playground's interface: what flies lies in ``state.data``, sizes are shapes, a configuration says which
-drone. `cfb_mjx.envs.brax_env.wrap` begins every episode on a drone of its own; Playground's wrapper goes back to the
-first one.
+These are `BraxEnv` with Playground's interface: the simulation's state is in ``state.data``, sizes are shapes, and a
+configuration selects the drone. `cfb_mjx.envs.brax_env.wrap` begins every episode on its own drone; Playground's own
+wrapper always returns to the first one.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ except ImportError as error:
 
 
 CAMERA = "track"
-"""Of `CfbEnv.render`, unless another is asked for: it stays beside the drone."""
+"""Default camera of `CfbEnv.render`: it stays beside the drone."""
 PLACE, AXES = (0.0, -0.35, 0.15), (1.0, 0.0, 0.0, 0.0, 0.4, 0.92)
 
 
 class Data(eqx.Module):
-    """What flies, and what drawing needs of MuJoCo's data."""
+    """State of the simulation, and what rendering needs of MuJoCo's data."""
 
     episode: Episode
 
@@ -66,22 +66,25 @@ class Data(eqx.Module):
 
     @property
     def mocap_pos(self) -> Float[Array, "*batch 0 3"]:
-        """Of no body."""
+        """Empty: there are no mocap bodies."""
         return jnp.zeros((*self.qpos.shape[:-1], 0, 3))
 
     @property
     def mocap_quat(self) -> Float[Array, "*batch 0 4"]:
-        """Of no body."""
+        """Empty: there are no mocap bodies."""
         return jnp.zeros((*self.qpos.shape[:-1], 0, 4))
 
     @property
     def xfrc_applied(self) -> Float[Array, "*batch 2 6"]:
-        """Nothing: the rotors' forces are not MuJoCo's."""
+        """Zero: the rotors' forces are not MuJoCo's."""
         return jnp.zeros((*self.qpos.shape[:-1], 2, 6))
 
 
 def default_config() -> config_dict.ConfigDict:
-    """The nominal drone with guards; ``randomisation`` names ranges, drawn ``magnitude`` of them, "" none."""
+    """Default configuration: the nominal drone with guards, randomised by ``magnitude`` times ``randomisation``.
+
+    ``randomisation`` names ranges; an empty string means no randomisation.
+    """
     task = TargetTask()
     return config_dict.create(
         ctrl_dt=task.layout.control_dt_s,
@@ -96,15 +99,15 @@ def default_config() -> config_dict.ConfigDict:
 
 
 class CfbEnv(MjxEnv):
-    """One drone on a task.
+    """One drone on a task, for MuJoCo Playground.
 
     Args:
-        config: as `default_config`.
-        config_overrides: of some of its numbers.
-        task: in place of the paper's first one as the configuration has it.
+        config: configuration; default: `default_config`.
+        config_overrides: changes of single entries.
+        task: task to fly, in place of the paper's first task with the configuration's randomisation.
 
     Raises:
-        CfbError: as `BraxEnv`, or a control step that is not the task's.
+        CfbError: as for `BraxEnv`, or the configuration's control step is not the task's.
     """
 
     task_type: type[Task] = TargetTask
@@ -125,52 +128,52 @@ class CfbEnv(MjxEnv):
         if (own.ctrl_dt, own.sim_dt) != real:
             raise CfbError(
                 f"ctrl_dt = {own.ctrl_dt:g}, sim_dt = {own.sim_dt:g} in the configuration, but the task's commands are "
-                f"{real[0]:g} s apart and the model's steps {real[1]:g} s: say these, or give a task of your own."
+                f"{real[0]:g} s apart and the model's steps {real[1]:g} s; set these values, or give your own task."
             )
         seen = mujoco.MjSpec.from_file(self.xml_path)
-        # Tasks fly about the origin, below it too.
+        # Tasks fly about the origin, also below it.
         for floor in [geom for geom in seen.geoms if geom.type == mujoco.mjtGeom.mjGEOM_PLANE]:
             seen.delete(floor)
         seen.body(BODY_NAME).add_camera(name=CAMERA, mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACK, pos=PLACE, xyaxes=AXES)
-        seen.stat.extent = 2.0  # the nearest that is drawn is a share of it
+        seen.stat.extent = 2.0  # the near clipping plane is a share of it
         self._mj_model = seen.compile()
 
     @property
     def task(self) -> Task:
-        """What is flown."""
+        """The task that is flown."""
         return self._env.task
 
     def reset(self, rng: jax.Array) -> State:
-        """As `BraxEnv.reset`."""
+        """Begin an episode, as `BraxEnv.reset`."""
         return _shown(self._env.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """As `BraxEnv.step`."""
+        """Fly one command, as `BraxEnv.step`."""
         flying = brax.State(state.data.episode, state.obs, state.reward, state.done, state.metrics, state.info)
         return _shown(self._env.step(flying, action))
 
     @property
     def action_size(self) -> int:
-        """One number for each motor."""
+        """Number of actions, one per motor."""
         return self._env.action_size
 
     @property
     def xml_path(self) -> str:
-        """Of the drone as it is drawn."""
+        """Path of the MJCF that is rendered."""
         return str(shipped("assets", "cfb.xml"))
 
     @property
     def mj_model(self) -> mujoco.MjModel:
-        """The drone as it is drawn; how it flies its own model says."""
+        """MuJoCo model for rendering; the flight follows the drone's own model."""
         return self._mj_model
 
     @property
     def mjx_model(self) -> mjx.Model:
-        """The same for MJX."""
+        """The rendering model for MJX."""
         return mjx.put_model(self._mj_model)
 
     def render(self, trajectory: Any, height: int = 240, width: int = 320, camera: str | None = CAMERA, **options: Any):
-        """As Playground's: pictures of states; by default from beside the drone."""
+        """Render states, as Playground does; by default with a camera beside the drone."""
         return super().render(trajectory, height, width, camera, **options)
 
     @property
@@ -179,9 +182,9 @@ class CfbEnv(MjxEnv):
 
     @_mjx_model.setter
     def _mjx_model(self, _: mjx.Model) -> None:
-        # What Playground's wrapper for randomisation sets; no drone would fly otherwise for it.
+        # Playground's wrapper for randomisation sets this, but no drone would fly differently for it.
         raise CfbError(
-            "randomization_fn: drones are randomised by `randomisation` and `magnitude` of the configuration."
+            "randomization_fn is not supported: set `randomisation` and `magnitude` in the configuration instead."
         )
 
 

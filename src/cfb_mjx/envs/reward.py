@@ -1,4 +1,4 @@
-"""The reward for flying to a target, when an episode fails, and what rewards are made of."""
+"""Reward of flying to a target, limits that end an episode, and the functions that rewards are made of."""
 
 from __future__ import annotations
 
@@ -19,23 +19,22 @@ def triangle(error: Float[Array, ""], largest: float) -> Float[Array, ""]:
 
 @dataclass(frozen=True)
 class TargetReward:
-    """The paper's lengths (section V) with other weights, and ``near``, which is not the paper's: `PAPER_REWARD` is as
-    printed. The sum is per control step.
+    """Reward per control step with the paper's widths (section V), other weights, and an additional term ``near``.
 
-    "L u" is read as the roll and pitch torque that the command asks for once the rotors have followed it, L f(K u):
-    its width is given in N m, and u itself has no unit.
+    `PAPER_REWARD` is the reward as printed. "L u" of the paper is read as the roll and pitch torque of the command once
+    the rotors have followed it, L f(K u), because its width is given in N m and u itself has no unit.
     """
 
     position: float = 10.0
     position_width_m: float = 10.0
     near: float = 3.0
-    """Of a bell about rest at the target:
+    """Weight of a bell-shaped term, largest at rest at the target:
 
         1 / (1 + |p / near_width|^2 + |v / near_speed|^2 + |(q - 1) / near_attitude|^2)
 
-    The paper's falls by 0.1 per metre: a decimetre is worth less than a learner's own noise. This one falls by up to
-    2.6 x near per metre, has no cusp that would ask for the largest gain, and tells who swings from who is at rest: at
-    half of ``near_speed`` a fifth of it is gone.
+    The paper's position term falls by 0.1 per metre, so a decimetre is worth less than a learner's noise. This term
+    falls by up to 2.6 x near per metre and has no kink that would reward the largest gain. It also distinguishes a
+    swinging drone from one at rest: at half of ``near_speed`` a fifth of it is lost.
     """
     near_width_m: float = 0.25
     near_speed_mps: float = 0.4
@@ -44,29 +43,29 @@ class TargetReward:
     velocity_width_mps: float = 10.0
     attitude: float = 0.15
     attitude_width: float = 2.0
-    """Of |q - [1, 0, 0, 0]|, taken with the sign of q that is nearer."""
+    """Width of |q - [1, 0, 0, 0]|, taken with the sign of q that is nearer."""
     body_rate: float = 2.0
     body_rate_width_radps: float = 30.0
     torque: float = 0.1
     torque_width_nm: float = 0.01
     failure: float = 300.0
-    """Subtracted in the step that ends an episode."""
+    """Penalty in the step in which an episode fails."""
     speed_limit_mps: float = 10.0
     rate_limit_radps: float = 30.0
 
     @property
     def largest(self) -> float:
-        """What a step at rest on the target is worth."""
+        """Reward of a step at rest at the target."""
         return self.position + self.near + self.velocity + self.attitude + self.body_rate + self.torque
 
     def failed(self, state: State) -> Bool[Array, ""]:
-        """Whether speed or body rate have passed their limits."""
+        """Whether speed or body rate exceed their limits."""
         return too_fast(state, self.speed_limit_mps, self.rate_limit_radps)
 
     def __call__(
         self, state: State, target: Float[Array, "3"], command: Float[Array, "4"], parameters: Parameters
     ) -> Float[Array, ""]:
-        """Reward of ``state`` after ``command`` [0 to 1]; what is judged is the true state, not its estimate."""
+        """Reward of the true ``state`` (not its estimate) after ``command`` [0 to 1]."""
         offset = state.position - target
         turned = 2.0 * jnp.maximum(0.0, 1.0 - jnp.abs(state.quaternion[0]))
         apart = jnp.sum((offset / self.near_width_m) ** 2) + jnp.sum((state.velocity / self.near_speed_mps) ** 2)
@@ -86,7 +85,7 @@ PAPER_REWARD = TargetReward(position=1.0, near=0.0, body_rate=0.15, body_rate_wi
 
 
 def too_fast(state: State, speed_limit_mps: float, rate_limit_radps: float) -> Bool[Array, ""]:
-    """Whether speed or body rate have passed their limits."""
+    """Whether speed or body rate exceed their limits."""
     fast = jnp.sum(state.velocity**2) > speed_limit_mps**2
     return fast | (jnp.sum(state.body_rate**2) > rate_limit_radps**2)
 
@@ -98,5 +97,5 @@ def commanded_torque(parameters: Parameters, command: Float[Array, "4"]) -> Floa
 
 
 def length(vector: Float[AnyArray, " n"]) -> Float[Array, ""]:
-    """Euclidean norm with a finite slope at zero."""
+    """Euclidean norm with a finite derivative at zero."""
     return jnp.sqrt(jnp.sum(vector * vector) + 1e-12)

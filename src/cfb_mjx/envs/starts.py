@@ -1,4 +1,4 @@
-"""How episodes begin: from hovering beside the target to being thrown upside down six metres away."""
+"""Initial states of episodes: from hover beside the target to a throw upside down six metres away."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from cfb_mjx.model.vector import Vec, multiply
 
 @dataclass(frozen=True)
 class Starts:
-    """The hardest start of each kind. Every episode draws one difficulty d in [0, 1] that scales all of them.
+    """Largest values of the initial state. Every episode draws one difficulty d in [0, 1] that scales all of them.
 
-    A share ``near`` of the episodes begins with d below 0.1. The rest is uniform.
+    In a share ``near`` of the episodes d is below 0.1; in the rest it is uniform.
     """
 
     near: float = 0.2
@@ -30,11 +30,11 @@ class Starts:
     yaw_deg: float = 60.0
     rate_radps: float = 6.0
     rotor_speed: float = 0.4
-    """Relative to hover."""
+    """Largest relative deviation from hover speed."""
 
 
 def draw(starts: Starts, model: Quadrotor, target: Float[Array, "3"], key: PRNGKeyArray) -> State:
-    """A random initial state of ``model``; a pure function of ``key``."""
+    """Draw an initial state of ``model``; a pure function of ``key``."""
     parts = jax.random.uniform(key, (18,), jnp.result_type(float))
     near = parts[0] < starts.near
     difficulty = jnp.where(near, 0.1 * parts[1], parts[1])
@@ -50,7 +50,7 @@ def draw(starts: Starts, model: Quadrotor, target: Float[Array, "3"], key: PRNGK
     body_rate = difficulty * starts.rate_radps * (2 * parts[11:14] - 1)
     spread = 1 + difficulty * starts.rotor_speed * (2 * parts[14:18] - 1)
     rotor_speed = hover_rotor_speed(model.changed_parameters()) * spread
-    # The tilted drone is turned about the world's vertical.
+    # Rotate the tilted drone about the world's vertical.
     turn = Vec(jnp.cos(yaw / 2), 0.0, 0.0, jnp.sin(yaw / 2))
     return State(position, velocity, multiply(turn, Vec.unstack(tilted)).stack(), body_rate, rotor_speed)
 

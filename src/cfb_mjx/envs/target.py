@@ -17,36 +17,36 @@ from cfb_mjx.parameters import Parameters
 
 @dataclass(frozen=True)
 class TargetTask(Task):
-    """The paper's first task. It asks for nothing beside the target."""
+    """The paper's first task: fly to the target. It has no set-points."""
 
     reward: TargetReward = field(default_factory=TargetReward)
     starts: Starts = field(default_factory=Starts)
 
     @property
     def largest_reward(self) -> float:
-        """What a step at rest on the target is worth."""
+        """Reward of a step at rest at the target."""
         return self.reward.largest
 
     def draw_start(self, model: Quadrotor, target: Float[Array, "3"], setpoint: Array, key: PRNGKeyArray) -> State:
-        """As ``starts`` says."""
+        """Draw an initial state from ``starts``."""
         return draw(self.starts, model, target, key)
 
     def judge(
         self, state: State, target: Float[Array, "3"], setpoint: Array, command: Array, parameters: Parameters
     ) -> Float[Array, ""]:
-        """As ``reward`` says."""
+        """Reward of the state from ``reward``."""
         return self.reward(state, target, command, parameters)
 
     def failed(self, state: State) -> Bool[Array, ""]:
-        """Too fast."""
+        """Whether speed or body rate exceed their limits."""
         return self.reward.failed(state)
 
     @property
     def diverged_reward(self) -> float:
-        """The failure of the paper."""
+        """Reward of the paper for a failure."""
         return -self.reward.failure
 
     def errors(self, state: State, target: Float[Array, "3"], setpoint: Array) -> Float[Array, "3"]:
-        """Of position, velocity and body rate."""
+        """Errors of position, velocity and body rate."""
         rate = length(state.body_rate) / 10
         return jnp.stack([length(state.position - target), length(state.velocity), rate])

@@ -1,8 +1,8 @@
-"""Are the motor columns in step with the gyro? Finding and removing a constant shift between them.
+"""Estimate and remove a constant time shift between the motor columns and the gyro.
 
-The angular acceleration that the rotor speeds must cause is compared with the derivative of the gyro in a band above
-the bandwidth of the flight controller. Below it a closed loop lets the motors answer the motion as much as cause it,
-which moves the lag and can flip the sign of the correlation; above it the motors are mostly cause.
+The angular acceleration caused by the rotor speeds is compared with the derivative of the gyro, in a band above the
+bandwidth of the flight controller. Below that bandwidth, feedback makes the motors react to the motion as well as cause
+it, which biases the lag and can flip the sign of the correlation. Above it, the motors are mostly the cause.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from cfb_mjx.logs.gaps import stretches
 from cfb_mjx.optional import not_none
 
 BAND_HZ = (5.0, 17.0)
-MAX_SHIFT = 0.06  # s: under one period of the band's centre, so that the neighbouring correlation peak stays outside
+MAX_SHIFT = 0.06  # s; below one period of the band's centre, to exclude the neighbouring correlation peak
 _BLOCK = 2.0  # s
 _RESAMPLES = 200
-# Nominal rotor model of the Crazyflie 2.1 Brushless; only its phase in the band matters. A motor time constant wrong by
-# 10 ms moves the lag by 1 ms.
+# Nominal rotor model of the Crazyflie 2.1 Brushless; only its phase in the band matters. An error of 10 ms in the motor
+# time constant shifts the lag by 1 ms.
 _TIME_CONSTANT, GAIN = 0.050, 2900.0
 _THRUST = (-0.23, 0.562, -0.043, 0.0)
 ROLL_PITCH = np.array([[-1.0, -1.0, 1.0, 1.0], [-1.0, 1.0, 1.0, -1.0]])
@@ -34,10 +34,10 @@ class AlignmentEstimate:
     """Lag of the measured motion behind the motor columns.
 
     Attributes:
-        shift_s: s by which the motor columns (command and rotor speed) must be *delayed*; negative: advanced.
+        shift_s: delay, s, that the motor columns (command and rotor speed) need; negative: they must be advanced.
         std_s: standard deviation of ``shift_s`` from a bootstrap over blocks of the flight, s; infinite without data.
-        correlation: of predicted and measured angular acceleration in the band at that shift, 0 to 1.
-        gain: measured over predicted angular acceleration in the band (1 for the nominal inertia and thrust).
+        correlation: correlation of predicted and measured angular acceleration in the band at that shift, 0 to 1.
+        gain: ratio of measured to predicted angular acceleration in the band (1 for nominal inertia and thrust).
         method: which column predicted the torque, ``rotor_speed`` or ``command``.
         band_hz: the band used, Hz.
         blocks: number of half-overlapping blocks used.
@@ -53,11 +53,11 @@ class AlignmentEstimate:
 
     @property
     def reliable(self) -> bool:
-        """Whether the flight excites the band enough to act on the estimate."""
+        """Whether the flight excites the band enough for the estimate to be used."""
         return self.correlation > 0.4 and self.std_s < 0.004
 
     def report(self) -> dict:
-        """The estimate in JSON terms, milliseconds."""
+        """The estimate as JSON-compatible values, in milliseconds."""
         return {
             "shift_ms": self.shift_s * 1e3,
             "shift_std_ms": self.std_s * 1e3 if np.isfinite(self.std_s) else None,  # JSON has no infinity
@@ -72,16 +72,20 @@ class AlignmentEstimate:
 def estimate_command_shift(
     log: FlightLog, method: str | None = None, band_hz: tuple[float, float] = BAND_HZ, seed: int = 0
 ) -> AlignmentEstimate:
-    """Estimate by how much the motor columns must be delayed to be in step with the gyro.
+    """Estimate the delay that aligns the motor columns with the gyro.
 
     Args:
-        log: the flight; irregular sampling is fine, nothing is computed across gaps.
-        method: ``rotor_speed`` or ``command`` (through a first-order motor of 50 ms); None takes the best available.
-        band_hz: band of the comparison, Hz. Its lower edge should lie above the bandwidth of the flight controller.
-        seed: of the bootstrap.
+        log: the flight. Sampling may be irregular; nothing is computed across gaps.
+        method: ``rotor_speed``, or ``command`` (through a first-order motor of 50 ms). None uses rotor speeds if most
+            of them were measured, else commands.
+        band_hz: band of the comparison, Hz. Its lower edge should be above the bandwidth of the flight controller.
+        seed: seed of the bootstrap.
 
     Returns:
-        The estimate; with too little data, shift 0 with infinite standard deviation.
+        The estimate. With too little data its shift is 0 and its standard deviation infinite.
+
+    Raises:
+        ValueError: ``method`` is neither of the two.
     """
     if method is None:
         measured = log.rotor_speed is not None and np.isfinite(log.rotor_speed).all(axis=1).mean() > 0.5
@@ -105,7 +109,7 @@ def estimate_command_shift(
     steer = np.exp(2j * np.pi * np.outer(frequency, lags))
     total = cross.sum(axis=0)
     shift, peak = _peak(lags, np.real(total @ steer)[None])
-    # Neighbouring blocks overlap by half: drawing them in pairs keeps the standard deviation honest.
+    # Neighbouring blocks overlap by half. Drawing them in pairs avoids an underestimated standard deviation.
     pairs = np.add.reduceat(cross, np.arange(0, len(cross), 2))
     draws = np.random.default_rng(seed).multinomial(len(pairs), np.full(len(pairs), 1 / len(pairs)), size=_RESAMPLES)
     resampled, _ = _peak(lags, np.real((draws @ pairs) @ steer))
@@ -116,15 +120,15 @@ def estimate_command_shift(
 
 
 def apply_shift(log: FlightLog, shift: float) -> FlightLog:
-    """Delay the motor columns (command and rotor speed) by ``shift`` s; rows whose motor data are unknown are dropped.
+    """Delay the motor columns (command and rotor speed) by ``shift`` s.
 
-    Commands are held (the row gets the command in force ``shift`` earlier), rotor speeds are interpolated linearly.
-    A row whose source falls into a gap or outside the log is dropped, so gaps grow rather than fill with guesses.
+    Commands are held: a row gets the command that was active ``shift`` earlier. Rotor speeds are interpolated linearly.
+    A row whose motor data would come from a gap or from outside the log is dropped.
     """
     if shift == 0.0:
         return log
     t, source = log.time, log.time - shift
-    slack = 0.01 * log.nominal_interval  # a whole number of samples must not fall to the sample before by rounding
+    slack = 0.01 * log.nominal_interval  # keeps rounding from moving a shift of whole samples to the sample before
     before = np.searchsorted(t, source + slack, side="right") - 1
     inside = (before >= 0) & (source <= t[-1] + slack)
     before = np.clip(before, 0, len(t) - 1)
@@ -146,7 +150,7 @@ def delay_by_samples(log: FlightLog, samples: int) -> FlightLog:
 
 
 def nominal_speeds(log: FlightLog) -> np.ndarray:
-    """Rotor speeds (n, 4) that the commands, held between rows, give through the first-order motor."""
+    """Rotor speeds (n, 4), rad/s, of the nominal first-order motor driven by the commands (held between rows)."""
     decay = np.exp(-np.diff(log.time) / _TIME_CONSTANT)
     target = GAIN * log.command
     speed = target.copy()
@@ -156,23 +160,25 @@ def nominal_speeds(log: FlightLog) -> np.ndarray:
 
 
 def nominal_command(time: np.ndarray, rotor_speed: np.ndarray) -> np.ndarray:
-    """Commands (n, 4) with which a first-order motor of 50 ms turns the rotors (rad/s) as they turned.
+    """Commands (n, 4) for which the nominal first-order motor (50 ms) gives these rotor speeds (n, 4), rad/s.
 
-    Noise of the readings may carry them beyond [0, 1], in which every command lies.
+    Because of noise in the speeds, they may lie outside [0, 1].
     """
     slope = np.gradient(rotor_speed, time, axis=0) if len(time) > 1 else np.zeros_like(rotor_speed)
     return (rotor_speed + _TIME_CONSTANT * slope) / GAIN
 
 
 def nominal_thrust(rotor_speed: np.ndarray) -> np.ndarray:
-    """Thrust, N, of each rotor at a speed, rad/s, of the nominal drone."""
+    """Thrust, N, of each rotor at a speed, rad/s, by the nominal thrust curve."""
     return np.polyval(_THRUST, rotor_speed / GAIN)
 
 
 def _spectra(t, predicted, gyro, log, band_hz):
-    """Per-block cross spectra of predicted and measured angular acceleration, summed over roll and pitch.
+    """Cross spectra of predicted and measured angular acceleration per block, summed over roll and pitch.
 
-    Returns (frequency (f,) Hz, cross (blocks, f), and the total power of both in the band), or None without data.
+    Returns:
+        Frequency (f,) Hz, cross spectra (blocks, f), and the total power of both signals in the band. None without
+        data.
     """
     interval = log.nominal_interval
     if interval <= 0.0 or 0.4 / interval < band_hz[1]:
@@ -201,7 +207,7 @@ def _spectra(t, predicted, gyro, log, band_hz):
 
 
 def _peak(lags: np.ndarray, correlation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lag and height of the maximum of each row, refined by a parabola through three points."""
+    """Lag and value of the maximum of each row, refined by a parabola through three points."""
     k = np.clip(np.argmax(correlation, axis=1), 1, len(lags) - 2)
     rows = np.arange(len(k))
     left, middle, right = (correlation[rows, k + i] for i in (-1, 0, 1))
@@ -215,15 +221,16 @@ _LAGS = np.arange(-0.03, 0.0601, 0.002)
 
 
 def motor_spectra(log: FlightLog, source: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Each motor's thrust beside how the drone turns, in a band of 2 to 17 Hz.
+    """Correlations of each motor's thrust with roll and pitch acceleration, in a band of 2 to 17 Hz.
 
     Args:
         log: the flight.
         source: ``rotor_speed``, or ``command`` through a first-order motor of 50 ms.
 
     Returns:
-        Products of each motor's nominal thrust with the roll and pitch acceleration for lags of -30 to 60 ms, (lags, 4,
-        2); of the motors with each other, (4, 4); of the two accelerations with themselves, (2,). None without data.
+        Cross-correlation of each motor's nominal thrust with the roll and pitch acceleration for lags of -30 to 60 ms,
+        (lags, 4, 2); correlation of the motors with each other, (4, 4); power of the two accelerations, (2,). None
+        without data.
     """
     step = log.nominal_interval
     low, high = WIDE_BAND_HZ[0], min(WIDE_BAND_HZ[1], 0.4 / step) if step > 0 else 0.0
@@ -261,7 +268,7 @@ def motor_spectra(log: FlightLog, source: str) -> tuple[np.ndarray, np.ndarray, 
 
 
 def describe_alignment(alignment: dict | None) -> str:
-    """One line about the shift between motor columns and gyro."""
+    """One line about the shift between motor columns and gyro, from the log's ``alignment`` metadata."""
     if not alignment:
         return "motor columns against gyro: not estimated"
     if "shift_ms" not in alignment:

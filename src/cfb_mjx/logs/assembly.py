@@ -1,4 +1,4 @@
-"""From streams of logged variables to a `FlightLog`: choosing variables, converting units, merging onto one clock."""
+"""Build a `FlightLog` from streams of logged variables: choose variables, convert units, merge onto one clock."""
 
 from __future__ import annotations
 
@@ -19,31 +19,32 @@ from cfb_mjx.logs.variables import Choice, VariableMap
 _DERIVED = {
     "velocity": "velocity: not logged; central differences of the positions, which look one sample ahead and carry "
     "their noise. Log stateEstimate.vx vy vz.",
-    "body_rate": "body rate: not logged; central differences of the attitude, as late and as smooth as that is. Log "
+    "body_rate": "body rate: not logged; central differences of the attitude, with its delay and smoothing. Log "
     "gyro.x y z.",
-    "specific_force": "specific force: not logged; central differences of the velocity plus gravity, in body axes, as "
-    "late and as smooth as that is. Log acc.x y z.",
-    "command": "command: not logged; what a nominal motor of the Crazyflie would have needed for these rotor "
-    "speeds. Log the duty.",
+    "specific_force": "specific force: not logged; central differences of the velocity plus gravity, in body axes, "
+    "with the velocity's delay and smoothing. Log acc.x y z.",
+    "command": "command: not logged; computed as the command that a nominal motor of the Crazyflie needs for these "
+    "rotor speeds. Log the duty.",
 }
 _GRAVITY = np.array([0.0, 0.0, 9.81])
-_LATE = 0.002  # s of average age of a held pose worth a note: a quarter of the observation delay assumed otherwise
+_LATE = 0.002  # s; a held pose older than this on average gets a note (a quarter of the default observation delay)
 COMMAND_NOTE = (
-    "motor.m1..m4 is what the ESC is told: the command after battery compensation and thrust limit, where the firmware "
-    "has them."
+    "motor.m1..m4 is the command sent to the ESC: after battery compensation and thrust limit, where the firmware has "
+    "them."
 )
 
 
 @dataclasses.dataclass
 class Import:
-    """What an importer has read: streams, and what it has to say about them.
+    """Streams read by an importer, with its notes and warnings.
 
     Attributes:
         format: name of the format.
-        streams: with time in s on one clock; their origin is ``origin``.
-        preferred: name of the stream whose rows the log should have, if it holds the gyro.
-        notes: facts about the data. ``warnings``: reasons to doubt them.
-        metadata: more entries for the log's metadata.
+        streams: streams with time in s on one clock.
+        preferred: name of the stream whose rows become the rows of the log, if it holds the gyro.
+        notes: facts about the data.
+        warnings: reasons to doubt the data.
+        metadata: further entries for the log's metadata.
     """
 
     format: str
@@ -55,11 +56,16 @@ class Import:
 
 
 def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
-    """Merge the streams onto the rows of the one that holds the gyro; the rest is held from its last sample.
+    """Merge the streams onto the rows of the one that holds the gyro. Samples of other streams are held.
 
-    Rows before the first sample of a required variable, and rows whose required sample is older than three intervals of
-    its stream + 0.5 ms, are dropped (so a pause becomes a gap). A rotor speed that old becomes NaN; a battery voltage
-    is held however old it is, and rows before its first sample get that first sample.
+    Rows before the first sample of a required variable are dropped, and so are rows whose required sample is older than
+    three intervals of its stream + 0.5 ms (a pause becomes a gap). A rotor speed of that age becomes NaN. A battery
+    voltage is held at any age; rows before its first sample get the first sample.
+
+    Args:
+        read: the streams.
+        mapping: assigns variables to columns.
+        path: the file, for messages and metadata.
 
     Raises:
         CfbError: required variables are missing (all are listed), or fewer than two rows remain.
@@ -67,7 +73,7 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
     streams = [s for s in read.streams if len(s.time)]
     home = _homes(streams)
     spoiled = _spoiled_quaternions(streams, mapping, home)
-    read.notes.extend(f"{v} travelled as float32, which cannot hold its 32 bits; it was not used." for v in spoiled)
+    read.notes.extend(f"{v} was sent as float32, which cannot hold its 32 bits; it was not used." for v in spoiled)
     chosen = mapping.choose(set(home) - set(spoiled), path)
     reference = _reference(streams, home, chosen, read.preferred)
     for name in reference.values:
@@ -79,8 +85,10 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
         if choice.derived:
             fields[field] = merger.derived(field, fields)
             parts = mapping.logged_parts(field, home)
-            beside = f" ({', '.join(parts)} alone does not tell it.)" if parts else ""
-            held = f" {merger.beyond:.1%} of them lay beyond 0 to 1 and were held there." if merger.beyond else ""
+            beside = f" ({', '.join(parts)} alone is not sufficient.)" if parts else ""
+            held = (
+                f" {merger.beyond:.1%} of the commands were outside [0, 1] and were clipped." if merger.beyond else ""
+            )
             read.warnings.append(_DERIVED[field] + beside + (held if field == "command" else ""))
     battery = _backfilled(fields["battery_voltage"][:, 0]) if "battery_voltage" in fields else None
     keep = np.all([merger.usable[f] for f in chosen if f in REQUIRED], axis=0)
@@ -97,7 +105,8 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
     held = merger.report()
     if (late := max((held[s.name]["mean_age_ms"] for s in merger.poses(chosen)), default=0.0)) > _LATE * 1e3:
         read.notes.append(
-            f"pose or velocity are held from samples {late:.1f} ms old on average; this adds to the observation delay."
+            f"pose or velocity are held; the samples are {late:.1f} ms old on average, which adds to the observation "
+            "delay."
         )
     names = ("position", "velocity", "quaternion", "body_rate", "specific_force", "command")
     log = FlightLog(
@@ -128,7 +137,7 @@ def assemble(read: Import, mapping: VariableMap, path: Path) -> FlightLog:
 def _with_capture(
     log: FlightLog, home: dict[str, Stream], chosen: dict[str, Choice], mapping: VariableMap, path: Path
 ) -> FlightLog:
-    """The log with pose and velocity by motion capture if that was asked for, or a note where it would differ."""
+    """The log with pose and velocity by motion capture if requested; else with a note if motion capture differs."""
     for choices in mapping.motion_capture:
         names = [name for choice in choices for name in choice.variables]
         if not all(name in home for name in names) or len({home[name].name for name in names}) > 1:
@@ -142,7 +151,7 @@ def _with_capture(
             return with_pose_of(log, capture)
         try:
             said = compared(log, with_pose_of(log, capture))
-        except CfbError:  # Nobody asked for it: a capture of positions alone, say.
+        except CfbError:  # Motion capture was not requested, and is not usable (positions without attitude, say).
             return log
         return log.replace(metadata={"notes": [*log.metadata["notes"], said]}) if said else log
     if mapping.by_motion_capture:
@@ -155,7 +164,7 @@ def _with_capture(
 
 
 def _homes(streams: Sequence[Stream]) -> dict[str, Stream]:
-    """For each variable the stream with the most samples of it."""
+    """Variable to the stream with the most samples of it."""
     home: dict[str, Stream] = {}
     for stream in streams:
         for name in stream.values:
@@ -170,7 +179,7 @@ def _spoiled_quaternions(streams, mapping: VariableMap, home: dict[str, Stream])
 
 
 def _reference(streams, home, chosen: dict[str, Choice], preferred: str | None) -> Stream:
-    # Where no gyro was logged, what its rates are derived from.
+    # Without a gyro, the rates are derived from the quaternion.
     gyro = chosen["body_rate"].variables or chosen["quaternion"].variables
     for stream in streams:
         if stream.name == preferred and all(v in stream.values for v in gyro):
@@ -179,12 +188,12 @@ def _reference(streams, home, chosen: dict[str, Choice], preferred: str | None) 
 
 
 class _Merger:
-    """Brings variables onto the rows of the reference stream, field by field, and keeps account of it."""
+    """Brings variables onto the rows of the reference stream, field by field, and records which rows are usable."""
 
     def __init__(self, reference: Stream, home: dict[str, Stream], chosen: dict[str, Choice]):
         self.reference, self.home, self.chosen = reference, home, chosen
         self.usable: dict[str, np.ndarray] = {}
-        self.beyond = 0.0  # share of derived commands that no motor is given, brought to 0 or 1
+        self.beyond = 0.0  # share of derived commands outside [0, 1], which were clipped
         self._held: dict[str, tuple[Stream, np.ndarray, np.ndarray]] = {}
 
     def field(self, field: str, choice: Choice) -> np.ndarray:
@@ -193,7 +202,7 @@ class _Merger:
         self.usable[field] = np.all(usable, axis=0)
         raw = np.stack(columns, axis=1)
         if field != "rotor_speed":
-            # A cell without a value, as where a script wrote "nan" in place of a number: not known in that row.
+            # A cell without a value, for example "nan" written by a script, is unknown in that row.
             self.usable[field] &= ~np.isnan(raw).any(axis=1)
         if field == "rotor_speed":
             raw = np.where(self.usable[field][:, None] & ~np.isin(raw, choice.invalid), raw, np.nan)
@@ -203,14 +212,14 @@ class _Merger:
         return _in_si(raw, choice)
 
     def derived(self, field: str, fields: dict[str, np.ndarray]) -> np.ndarray:
-        """(rows, 3) of a field that was not logged, from the samples of the one it is the derivative of."""
+        """(rows, columns) of a field that was not logged, computed from the samples of another field."""
         if field == "body_rate":
             source, unit = self._samples("quaternion", fields)
             rate = _turning_rate(source, rotation.tidy(unit))
             rate, self.usable[field] = self._place_all(source, rate)
             return rate
         if field == "command":
-            # Readings are of one time, whatever field asks for them.
+            # All four rotor speeds of a row were read at the same time.
             speed = fields["rotor_speed"]
             known = np.all(np.isfinite(speed), axis=1)
             self.usable[field] = known
@@ -228,9 +237,9 @@ class _Merger:
         return rotation.to_body(rotation.tidy(_held_where(fields["quaternion"], ok)), acceleration + _GRAVITY)
 
     def _samples(self, field: str, fields: dict[str, np.ndarray]) -> tuple[Stream, np.ndarray]:
-        """A vector where it was sampled: its stream without repeated samples, and the values there in SI units.
+        """A vector at its own samples: its stream without repeated samples, and the values there in SI units.
 
-        Rows of the log stand for a vector whose columns came in several streams, or in body axes.
+        For a vector whose columns come from several streams, or are in body axes, the rows of the log are used instead.
         """
         choice = self.chosen[field]
         if choice.derived:
@@ -241,7 +250,7 @@ class _Merger:
             stream = self.home[choice.variables[0]]
             values = _in_si(np.stack([stream.values[v] for v in choice.variables], axis=1), choice)
             keep = fresh(values) & np.isfinite(values).all(axis=1)
-            # Under another name: what is held of it has its own ages.
+            # The name differs from the stream's, because its held samples have ages of their own.
             return dataclasses.replace(stream, name=f"{stream.name}: {field}", time=stream.time[keep]), values[keep]
         keep = self.usable[field]
         return Stream(f"rows: {field}", self.reference.time[keep], {}), fields[field][keep]
@@ -269,7 +278,7 @@ class _Merger:
         return [s for s, *_ in self._held.values() if names & set(s.values)]
 
     def report(self) -> dict:
-        """Per held stream its interval and the age of the samples used, ms."""
+        """For each held stream, its interval and the ages of the samples used, ms."""
         out = {}
         for name, (stream, _, age) in self._held.items():
             fresh = age[np.isfinite(age)]
@@ -284,7 +293,7 @@ class _Merger:
 
 
 def _in_si(raw: np.ndarray, choice: Choice) -> np.ndarray:
-    """Logged numbers (n, columns) in SI units, quaternions as such whatever their form; not yet rotated."""
+    """Logged numbers (n, columns) in SI units, every form of attitude as a quaternion. Not yet rotated."""
     if choice.form == "compressed":
         return decompress_quaternion(raw[:, 0])
     values = raw * choice.factors
@@ -292,21 +301,21 @@ def _in_si(raw: np.ndarray, choice: Choice) -> np.ndarray:
 
 
 def _turning_rate(source: Stream, quaternion: np.ndarray) -> np.ndarray:
-    """Body rate, rad/s, (n, 3): between the samples before and after each, which takes it to its own time."""
+    """Body rate, rad/s, (n, 3): rotation between the samples before and after each one, over the time between them."""
     before, after, span = neighbours(source)
     turned = rotation.multiply(rotation.conjugate(quaternion[before]), quaternion[after])
-    # Half of the turn is behind the sample, half ahead: seen from its own axes to second order.
+    # The sample is in the middle of this rotation, so its vector is right in the sample's axes to second order.
     return rotation.rotation_vector(turned) / np.where(span > 0, span, np.nan)[:, None]
 
 
 def _held_where(quaternion: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """The quaternions, with one that turns nothing where they are not known."""
+    """The quaternions, with the identity where they are not known."""
     fine = known & (np.linalg.norm(quaternion, axis=1) > 0)
     return np.where(fine[:, None], quaternion, [1.0, 0.0, 0.0, 0.0])
 
 
 def _into_frames(fields: dict[str, np.ndarray], chosen: dict[str, Choice]) -> None:
-    """Rotate a velocity logged in body axes to world, and a specific force logged in world axes to body."""
+    """Rotate a velocity logged in body axes to the world, and a specific force logged in world axes to the body."""
     if chosen["velocity"].frame != "body" and chosen["specific_force"].frame != "world":
         return
     norm = np.linalg.norm(fields["quaternion"], axis=1, keepdims=True)
@@ -327,9 +336,9 @@ def _backfilled(values: np.ndarray) -> np.ndarray | None:
 def decompress_quaternion(packed: np.ndarray) -> np.ndarray:
     """Unit quaternions ``[w, x, y, z]`` (n, 4) from the firmware's 32-bit form (n,); NaN stays NaN.
 
-    The two top bits say which of x, y, z, w is largest and left out (positive); the others follow in that order, ten
-    bits each: a sign and nine bits of magnitude in units of 1 / (511 sqrt 2). Resolution 0.0014, so about 0.2 degrees.
-    Source: ``quatcompress.h`` of bitcraze/crazyflie-firmware (J. A. Preiss).
+    The two top bits give the index of the largest of x, y, z, w, which is positive and left out. The others follow in
+    that order with ten bits each: a sign and nine bits of magnitude in units of 1 / (511 sqrt 2). The resolution is
+    0.0014, about 0.2 degrees. Source: ``quatcompress.h`` of bitcraze/crazyflie-firmware (J. A. Preiss).
     """
     packed = np.asarray(packed, dtype=np.float64)
     valid = (packed >= 0) & (packed < 2.0**32)

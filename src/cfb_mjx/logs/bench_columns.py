@@ -1,4 +1,4 @@
-"""Columns of bench tables under the names of the programs that write them, in SI."""
+"""Recognise the columns of bench tables by the names that common programs use, and convert them to SI."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cfb_mjx.optional import not_none
 GRAVITY = 9.81
 RPM = 2 * np.pi / 60
 _UNITS: dict[str, dict[str, tuple[float, float]]] = {
-    # To SI: factor, and what is taken off before.
+    # Unit to (factor, offset): SI = (value - offset) * factor.
     "t": {"s": (1.0, 0.0), "ms": (1e-3, 0.0), "us": (1e-6, 0.0)},
     "u": {"1": (1.0, 0.0), "%": (1e-2, 0.0), "pwm": (1 / 65535, 0.0), "us": (1e-3, 1000.0)},
     "omega": {"rad/s": (1.0, 0.0), "rpm": (RPM, 0.0), "hz": (2 * np.pi, 0.0), "rev/s": (2 * np.pi, 0.0)},
@@ -40,7 +40,7 @@ _UNITS: dict[str, dict[str, tuple[float, float]]] = {
     },
     "vbat": {"v": (1.0, 0.0), "mv": (1e-3, 0.0)},
 }
-# Names without blanks, in the order in which they are preferred, and the unit where the header gives none.
+# Names without blanks, the preferred one first, each with its unit if the header has none.
 _NAMES: dict[str, tuple[tuple[str, str], ...]] = {
     "t": (("t", "s"), ("time", "s"), ("timestamp", "s")),
     "u": (
@@ -69,23 +69,23 @@ _NAMES: dict[str, tuple[tuple[str, str], ...]] = {
 _NUMBERED = re.compile(r"(?P<name>[a-z]+?)_?(?P<motor>[1-4])?")
 _UNIT_AT_END = re.compile(r"(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]\s*")
 _LETTERS = {"µ": "u", "μ": "u"}  # micro sign and Greek letter
-_APART = 0.02  # by which two sensors of one speed may differ
+_APART = 0.02  # relative difference allowed between two sensors of the same speed
 
 
 class _Header(NamedTuple):
     name: str
     unit: str | None
     stand: str
-    """Which of several powertrains, or sides, of a test stand; empty where the header does not say."""
+    """Powertrain or side of the test stand; empty if the header does not name one."""
 
 
 class Columns(NamedTuple):
     """Columns in SI.
 
     Attributes:
-        values: by ``t``, ``u``, ``omega``, ``force``, ``torque``, ``vbat``; ``u1`` and ``omega1`` for numbered ones.
-        names: the column's own name, for messages.
-        unit_said: the keys whose unit stands in the header.
+        values: columns by ``t``, ``u``, ``omega``, ``force``, ``torque``, ``vbat``; numbered ones by ``u1``, ``omega1``
+        names: the same keys to the column's name in the file, for messages.
+        unit_said: the keys whose unit is given in the header.
     """
 
     values: dict[str, np.ndarray]
@@ -94,7 +94,7 @@ class Columns(NamedTuple):
 
 
 def keys_of(table: Table) -> dict[str, list[str]]:
-    """What a table holds, and the columns that say it, the preferred one first."""
+    """Quantities of a table (keys as in `Columns`) to the columns that hold them, the preferred one first."""
     found: dict[str, list[tuple[int, str]]] = {}
     for column in table:
         match = _NUMBERED.fullmatch(_header(column).name)
@@ -108,10 +108,15 @@ def keys_of(table: Table) -> dict[str, list[str]]:
 
 
 def in_si(table: Table, path: Path, notes: list[str]) -> Columns:
-    """The columns that are known, in SI; of several for one thing the preferred one that reads something.
+    """The recognised columns, in SI. Of several columns for one quantity, the preferred one with nonzero readings.
+
+    Args:
+        table: the table as read.
+        path: the file, for messages.
+        notes: receives disagreements between sensors of the same speed.
 
     Raises:
-        CfbError: several powertrains side by side, cells that are not numbers, a unit that is not known.
+        CfbError: several powertrains side by side, cells that are not numbers, an unknown unit.
     """
     found = keys_of(table)
     stands = sorted({_header(c).stand for columns in found.values() for c in columns} - {""})
@@ -142,7 +147,7 @@ def _header(column: str) -> _Header:
     match = _UNIT_AT_END.fullmatch(text)
     name, unit = (match["name"], match["unit"]) if match else (text, None)
     unit = None if unit is None else re.sub(r"[\s·⋅*.]", "", unit)
-    # What stands in brackets before the unit explains the name: "force Fz (thrust) (N)".
+    # Brackets before the unit explain the name: "force Fz (thrust) (N)".
     name = re.sub(r"[\[(][^\[\]()]*[\])]", "", name)
     side = re.fullmatch(r"(?P<name>.{3,}?) (?P<side>[ab])", name.strip())
     if side and not stand:
@@ -155,17 +160,17 @@ def _converted(table: Table, key: str, column: str, path: Path) -> np.ndarray:
     default = dict(_NAMES[kind])[not_none(_NUMBERED.fullmatch(header.name))["name"]]
     known, unit = _UNITS[kind], default if header.unit is None else header.unit
     if unit not in known:
-        raise CfbError(f"{path}: column {column} is in {unit}, which is none of {', '.join(known)}; convert it.")
+        raise CfbError(f"{path}: column {column} is in {unit}, which is not one of {', '.join(known)}; convert it.")
     factor, zero = known[unit]
     values = np.asarray(table[column], float)
-    # Duty of 0 to 1 under the name pwm.
+    # A column named pwm may hold a duty of 0 to 1.
     if unit == "pwm" and np.nanmax(np.abs(values), initial=0.0) <= 1.001:
         factor = 1.0
     return (values - zero) * factor
 
 
 def _compare(chosen: str, readings: dict[str, np.ndarray], path: Path, notes: list[str]) -> None:
-    """Say where two sensors of one speed disagree: a wrong number of poles or of marks."""
+    """Add a note if two sensors of the same speed disagree, which means a wrong number of poles or marks."""
     for column, values in readings.items():
         both = (values > 0) & (readings[chosen] > 0)
         if column == chosen or both.sum() < 3:
@@ -173,6 +178,6 @@ def _compare(chosen: str, readings: dict[str, np.ndarray], path: Path, notes: li
         ratio = float(np.median(values[both] / readings[chosen][both]))
         if abs(ratio - 1) > _APART:
             notes.append(
-                f"{path.name}: {column} reads {ratio:.3f} times {chosen}, which was used: one of them counts a wrong "
+                f"{path.name}: {column} reads {ratio:.3f} times {chosen}, which was used; one of them has a wrong "
                 "number of poles or marks."
             )

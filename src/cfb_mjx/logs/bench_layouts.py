@@ -1,8 +1,9 @@
-"""Bench tables under the names of the programs that write them, brought into the layouts of `bench_tables`.
+"""Read bench tables with the column names of common programs, and convert them to the layouts of `bench_tables`.
 
-Known are those of Bitcraze's system identification and of labs after it (``pwm, vbat[V], rpm1..4, thrust[g]``, the
-whole vehicle on a scale; with ``weight[g]``, ``i[A]``, ``p[W]``; with ``time[ms]`` and steps of the command), and
-RCbenchmark's and Tyto's exports (``Thrust (N)``, ``Motor Optical Speed (RPM)``, ``ESC signal (µs)``).
+The known names are those of Bitcraze's system identification and of labs that use it (``pwm, vbat[V], rpm1..4,
+thrust[g]``, the whole vehicle on a scale; with ``weight[g]``, ``i[A]``, ``p[W]``; with ``time[ms]`` and steps of the
+command), and those of exports of RCbenchmark and Tyto (``Thrust (N)``, ``Motor Optical Speed (RPM)``,
+``ESC signal (µs)``).
 """
 
 from __future__ import annotations
@@ -22,22 +23,22 @@ from cfb_mjx.logs.bench_tables import FORCE_LIMIT, SPEED_LIMIT, MapTable, MotorR
 from cfb_mjx.logs.bench_tables import recognises as standard
 from cfb_mjx.logs.tabular import Table
 
-_DEAD = 0.5  # of the rows under command: with more zeros than that a sensor tells nothing
-_STEP, _STEPS, _AFTER, _ANSWERED = 0.05, 3, 5, 0.05
-_APART = 0.1  # s: rows further apart than this are no recording of a motor, which answers in 0.05
-_BACK_ROWS = 5
-_SETTLED = 0.01  # of the speed over 0.1 s: faster changes are not steady
+_DEAD = 0.5  # share of zeros in the rows under command above which a sensor is left out
+_STEP, _STEPS, _AFTER, _ANSWERED = 0.05, 3, 5, 0.05  # see `_command_before`
+_APART = 0.1  # s; rows further apart do not resolve a motor, whose time constant is about 0.05 s
+_BACK_ROWS = 5  # rows with time running backwards that are left out without an error
+_SETTLED = 0.01  # relative change of the speed in 0.1 s below which it counts as steady
 
 
 class Bench(NamedTuple):
-    """What one file holds, and what was done to read it."""
+    """Content of one file, and notes of what was done to read it."""
 
     parts: Sequence[MotorRecord | MapTable | SteadyPoints | ThrustPoints]
     notes: list[str]
 
 
 def recognises(table: Table) -> bool:
-    """Whether the columns are a bench table's rather than a flight's, under any of the known names."""
+    """Whether the columns are those of a bench table (under any of the known names), not of a flight."""
     if any(c in table for c in ("px", "qw", "wx", "ax", "ros_timestamp_x")):
         return False
     found = set(keys_of(table))
@@ -45,16 +46,16 @@ def recognises(table: Table) -> bool:
 
 
 def read_bench_table(table: Table, path: Path, rotors: int | None = None) -> Bench:
-    """What a bench table holds: command steps, steady points, thrust and torque.
+    """Content of a bench table: command steps, steady points, thrust and torque.
 
     Args:
-        table: as read.
-        path: named in messages.
-        rotors: of how many rotors the force and torque are. None: of four where several rotors' speeds stand beside one
-            force, else of one.
+        table: the table as read.
+        path: the file, for messages.
+        rotors: number of rotors that produce the measured force and torque. None: four if the table has speeds of
+            several rotors, else one.
 
     Raises:
-        CfbError: as `bench_tables.read_bench`; or nothing can be told from the columns.
+        CfbError: as `bench_tables.read_bench`, or the columns are not sufficient.
     """
     known = [column for columns in keys_of(table).values() for column in columns]
     steady = "t" not in table and {"u", "omega"} <= set(table) and not {"force", "torque"} & set(table)
@@ -73,8 +74,8 @@ def read_bench_table(table: Table, path: Path, rotors: int | None = None) -> Ben
         if command and "force" in si:
             return Bench([thrust_points(command, si["force"], path)], notes)
         raise CfbError(
-            f"{path}: has no rotor speed (a column rpm1..rpm4 or omega) and no thrust at commands, which tells neither "
-            "motors nor rotors; measure the speed too."
+            f"{path}: has no rotor speed (a column rpm1..rpm4 or omega) and no thrust against command, so neither "
+            "motors nor rotors can be fitted; measure the speed too."
         )
     si = _in_time(columns, path, notes)
     speeds = {key: si[key] for key in si if re.fullmatch(r"omega[1-4]?", key)}
@@ -103,34 +104,34 @@ def _refuse_commands_as_speed(speeds: dict[str, np.ndarray], names: dict[str, st
         known = values[np.isfinite(values)]
         if len(known) and np.median(known) > 0.8 * SPEED_LIMIT and known.max() > SPEED_LIMIT:
             raw = known / RPM
-            hint = "multiply it by 2 pi / 60" if not names[key].lower().startswith("rpm") else "it is in another unit"
+            hint = "multiply it by 2 pi / 60" if not names[key].lower().startswith("rpm") else "give the right unit"
             if names[key].lower().startswith("rpm") and raw.max() <= 65535.5:
                 hint = "these look like 16-bit commands; name the column pwm, and give a table with the speeds as well"
             raise CfbError(
-                f"{path}: column {names[key]} reaches {known.max():.0f} rad/s ({raw.max():.0f} rpm), which no rotor of "
-                f"this size turns; {hint}."
+                f"{path}: column {names[key]} reaches {known.max():.0f} rad/s ({raw.max():.0f} rpm), faster than any "
+                f"rotor of this size; {hint}."
             )
 
 
 def _in_time(columns: Columns, path: Path, notes: list[str]) -> dict[str, np.ndarray]:
-    """Rows in order of time, each with all readings; without the time where rows are measurements by themselves."""
+    """Rows in order of time, with gaps of sensors filled; without ``t`` if each row is a separate measurement."""
     si = dict(columns.values)
     if "t" in si:
         latest = np.maximum.accumulate(np.concatenate([[-np.inf], si["t"][:-1]]))
         forward = si["t"] > latest
         late = int(len(forward) - forward.sum())
         if 0 < late <= max(_BACK_ROWS, 0.02 * len(forward)):
-            notes.append(f"{path.name}: {late} rows whose time does not go on were left out.")
+            notes.append(f"{path.name}: {late} rows whose time does not increase were left out.")
             si = {key: values[forward] for key, values in si.items()}
         step = float(np.median(np.diff(si["t"]))) if len(si["t"]) > 1 else 0.0
         if step > _APART and "t" in columns.unit_said:
-            notes.append(f"{path.name}: rows are {step:.2g} s apart, so each is read as a point by itself.")
+            notes.append(f"{path.name}: rows are {step:.2g} s apart, so each is read as a separate steady point.")
             del si["t"]
     return _filled(si, path, notes)
 
 
 def _filled(si: dict[str, np.ndarray], path: Path, notes: list[str]) -> dict[str, np.ndarray]:
-    """Sensors that are read in turns leave cells empty; between two readings lies a line."""
+    """Interpolate linearly between the readings of sensors that are read in turns, which leaves cells empty."""
     known = {key: np.isfinite(values) for key, values in si.items()}
     fewest = min(int(k.sum()) for k in known.values())
     together = int(np.all(list(known.values()), axis=0).sum())
@@ -144,7 +145,7 @@ def _filled(si: dict[str, np.ndarray], path: Path, notes: list[str]) -> dict[str
 
 
 def _living(speeds, command, names, path: Path, notes: list[str]) -> dict[str, np.ndarray]:
-    """The speeds of sensors that read something; single zeros under command become NaN."""
+    """The speeds without dead sensors. Single zeros under command become NaN."""
     on = mean_of(command) > 2 * LEAST_COMMAND if command else mean_of(speeds) > 100.0
     living = {}
     for key, values in speeds.items():
@@ -186,7 +187,7 @@ def _parts(
     if force is None and torque is None:
         return parts
     count = rotors or (4 if len(si.keys() & {f"omega{i}" for i in range(1, 5)}) > 1 else 1)
-    # With thrust as the square of the speed, the root of the mean square is what carries the mean thrust.
+    # Thrust grows with the square of the speed, so the rms speed corresponds to the mean thrust.
     speed = np.sqrt(mean_of({key: values**2 for key, values in speeds.items()}))
     good = steady & np.isfinite(speed)
     for values in (force, torque):
@@ -194,22 +195,22 @@ def _parts(
     if command:
         good &= mean_of(command) > LEAST_COMMAND
     if not good.any():
-        said = f"in no row do speed and {names.get('force', names.get('torque'))} stand still together"
+        said = f"in no row are both speed and {names.get('force', names.get('torque'))} steady"
         if not parts:
-            raise CfbError(f"{path}: {said}, so nothing can be told; hold every command for half a second.")
+            raise CfbError(f"{path}: {said}, so nothing can be fitted; hold every command for half a second.")
         notes.append(f"{path.name}: {said}, so thrust and torque were left out.")
         return parts
     if force is not None and _pulls_down(force[good], speed[good]):
-        notes.append(f"{path.name}: {names['force']} falls with speed, so the stand counts a pull as negative; turned.")
+        notes.append(f"{path.name}: {names['force']} falls with speed; its sign was changed.")
         force = -force
     top = 0.0 if force is None else float(np.nanmax(np.abs(force), initial=0.0)) / count
     if top > FORCE_LIMIT and "force" in columns.unit_said:
         raise CfbError(
-            f"{path}: {names['force']} comes to {top:.3g} N a rotor, more than any of a Crazyflie pulls; give a table "
-            "of its own rotors, or correct the unit in the header."
+            f"{path}: {names['force']} comes to {top:.3g} N per rotor, more than any rotor of a Crazyflie; give a "
+            "table of a Crazyflie's rotors, or correct the unit in the header."
         )
     if count > 1:
-        notes.append(f"{path.name}: {names.get('force', names.get('torque'))} is what {count} rotors give together.")
+        notes.append(f"{path.name}: {names.get('force', names.get('torque'))} is the sum of {count} rotors.")
     table = {"omega": speed[good]}
     if force is not None:
         table["force"] = force[good] / count
@@ -226,10 +227,10 @@ def _pulls_down(force: np.ndarray, speed: np.ndarray) -> bool:
 
 
 def _command_before(record: MotorRecord, notes: list[str]) -> MotorRecord:
-    """The record with every command in the row from which it acts.
+    """The record with every command in the row from which on it acts.
 
-    Some scripts write a command, wait, and then write the row: the speed in it has already answered. A command that
-    acts from its row on cannot have moved the speed there.
+    Some scripts set a command, wait, and then write the row. The speed in that row has already responded to the
+    command. If this is the case after most steps, the commands are moved to the row before.
     """
     moved = []
     for u, speed in zip(record.command.T, record.rotor_speed.T, strict=True):
@@ -242,8 +243,8 @@ def _command_before(record: MotorRecord, notes: list[str]) -> MotorRecord:
     if len(moved) < _STEPS or not np.nanmedian(moved) > _ANSWERED:
         return record
     notes.append(
-        f"{record.name}: the speed answers in the very row of a new command, so each row's command is the one that "
-        "led to it; it was moved to the row before."
+        f"{record.name}: the speed responds in the same row as a new command, so each command was set before its row; "
+        "it was moved to the row before."
     )
     voltage = None if record.battery_voltage is None else record.battery_voltage[:-1]
     return dataclasses.replace(
@@ -261,7 +262,7 @@ def _of_one(part: MapTable, rotors: int) -> MapTable:
 
 
 def _steady(time: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """Rows whose speed has hardly changed for a tenth of a second."""
+    """Mask of the rows whose speed has hardly changed for a tenth of a second."""
     row = np.searchsorted(time, time - 0.1)
     change = np.abs(speed - speed[row])
     return (time - time[0] > 0.1) & (change <= _SETTLED * np.abs(speed)) if len(time) > 1 else np.ones(1, bool)

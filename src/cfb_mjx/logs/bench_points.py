@@ -1,4 +1,4 @@
-"""Points of bench tables at which a command was held: the speed at it, or the thrust, and the two joined."""
+"""Steady points of bench tables: rotor speed at a held command, thrust at a held command, and both joined."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from cfb_mjx.logs.bench_tables import MapTable, check_command, from_columns
 from cfb_mjx.logs.tabular import Table
 
 LEAST_COMMAND = 0.05
-_SAME = 0.003  # of full: commands that are the same in two tables
-_REPEATED = 20  # rows at one command from which it can be said what most of them say
-_APART_AT_LEVEL = 0.15
-_AGREE = 0.4  # of the readings of a speed
+_SAME = 0.003  # largest difference between equal commands of two tables
+_REPEATED = 20  # fewest rows at one command for detecting outliers
+_APART_AT_LEVEL = 0.15  # relative deviation from the typical speed that makes a reading an outlier
+_AGREE = 0.4  # least share of the readings that must agree on a speed
 
 
 @dataclass(frozen=True)
 class SteadyPoints:
-    """Commands and the speeds the rotors settle at, without time.
+    """Commands and steady rotor speeds, without time.
 
     Attributes:
         name: file name without its ending.
         command: (n,) in [0, 1].
         rotor_speed: (n,) rad/s.
         battery_voltage: (n,) V, or None.
-        readings: (n, k) rad/s of each of the k rotors that were read, NaN where one was not; None: one rotor's.
+        readings: (n, k) rad/s of each of k rotors, NaN where there is no reading; None for a single rotor.
     """
 
     name: str
@@ -38,16 +38,16 @@ class SteadyPoints:
 
     @property
     def rotors(self) -> int:
-        """How many rotors' speeds stand in a row."""
+        """Number of rotors with a speed in each row."""
         return 1 if self.readings is None else self.readings.shape[1]
 
 
 @dataclass(frozen=True)
 class ThrustPoints:
-    """Commands and the thrust at them, without a speed: `joined` finds it in another table of the same bench.
+    """Commands and thrust, without rotor speeds. `joined` takes the speeds from another table of the same bench.
 
     Attributes:
-        path: of the file, for messages.
+        path: the file, for messages.
         command: (n,) in [0, 1].
         force: (n,) N, of all rotors on the scale.
     """
@@ -58,16 +58,16 @@ class ThrustPoints:
 
 
 def mean_of(columns: dict[str, np.ndarray]) -> np.ndarray:
-    """Of the readings in a row; NaN where there is none."""
+    """Mean (n,) of the readings of each row; NaN if a row has none."""
     values = np.stack(list(columns.values()), axis=1)
     count = np.isfinite(values).sum(axis=1)
     return np.where(count > 0, np.nansum(values, axis=1) / np.maximum(count, 1), np.nan)
 
 
 def _agreeing(readings: np.ndarray, u: np.ndarray, path: Path, notes: list[str]) -> np.ndarray:
-    """Readings that most others at the same command agree with; the rest become NaN.
+    """Replace readings that differ from most others at the same command by NaN.
 
-    Half of the sensors may count blades twice for a while, and the median of a row is then of no rotor.
+    The median of a row is not enough: if half of the sensors count blades twice for a while, it is no rotor's speed.
     """
     kept = readings.copy()
     for level in np.unique(u[np.isfinite(u)].round(4)):
@@ -76,19 +76,19 @@ def _agreeing(readings: np.ndarray, u: np.ndarray, path: Path, notes: list[str])
         if rows.sum() < _REPEATED or np.isnan(known).all():
             continue
         typical = _typical(known[np.isfinite(known)])
-        # A supply that sags moves the speed by some per cent within a level.
+        # Within a level, voltage sag changes the speed by some per cent.
         kept[rows] = np.where(np.abs(known - typical) < _APART_AT_LEVEL * typical, known, np.nan)
     lost = int(np.isfinite(readings).sum() - np.isfinite(kept).sum())
     if lost:
         notes.append(
-            f"{path.name}: {lost} of {int(np.isfinite(readings).sum())} readings of speed are far from what most "
-            "at the same command say, and were left out."
+            f"{path.name}: {lost} of {int(np.isfinite(readings).sum())} readings of speed differ strongly from most "
+            "others at the same command, and were left out."
         )
     return kept
 
 
 def steady_points(speeds, command, voltage, path: Path, notes: list[str]) -> SteadyPoints:
-    """One point a row: the median of its rotors."""
+    """One point per row: the median speed of its rotors."""
     readings = _agreeing(np.stack(list(speeds.values()), axis=1), mean_of(command), path, notes)
     omega = np.full(len(readings), np.nan)
     read = np.isfinite(readings).any(axis=1)
@@ -104,6 +104,7 @@ def steady_points(speeds, command, voltage, path: Path, notes: list[str]) -> Ste
 
 
 def thrust_points(command, force: np.ndarray, path: Path) -> ThrustPoints:
+    """One point per row: the mean command and the thrust. Rows with a command up to `LEAST_COMMAND` are left out."""
     u = mean_of(command)
     good = np.isfinite(u) & np.isfinite(force) & (u > LEAST_COMMAND)
     if good.any():
@@ -112,13 +113,13 @@ def thrust_points(command, force: np.ndarray, path: Path) -> ThrustPoints:
 
 
 def joined(thrust: ThrustPoints, steady: list[SteadyPoints], rotors: int | None, notes: list[str]) -> MapTable:
-    """Thrust against the speed that another table of the same bench has at the same command.
+    """Thrust against rotor speed, with the speeds taken from other tables of the same bench at the same commands.
 
     Args:
         thrust: commands and forces.
         steady: commands and speeds.
-        rotors: on the scale; None: as many as the other table has speeds in a row.
-        notes: told what was joined.
+        rotors: number of rotors on the scale; None: as many as the other tables have speeds in a row.
+        notes: receives what was joined.
 
     Raises:
         CfbError: no other table has a speed at these commands.
@@ -133,14 +134,15 @@ def joined(thrust: ThrustPoints, steady: list[SteadyPoints], rotors: int | None,
     good = np.isfinite(speed)
     if not good.any():
         raise CfbError(
-            f"{thrust.path}: has no rotor speed (a column rpm1..rpm4 or omega), and thrust against command alone tells "
-            "neither motors nor rotors; measure the speed too, or give a table that has it at the same commands."
+            f"{thrust.path}: has no rotor speed (a column rpm1..rpm4 or omega), and thrust against command alone is "
+            "not sufficient to fit motors or rotors; measure the speed too, or give a table that has it at the same "
+            "commands."
         )
     count = rotors or max(s.rotors for s in steady)
     notes.append(
         f"{thrust.path.name}: thrust of {count} rotor{'s' * (count > 1)} at {int(good.sum())} of {len(good)} commands "
-        f"at which {', '.join(s.name for s in steady)} has a speed that most readings agree on; both must be of one "
-        "supply."
+        f"at which {', '.join(s.name for s in steady)} has a speed that most readings agree on; both must have been "
+        "measured with the same supply."
     )
     table = Table({"omega": speed[good], "force": thrust.force[good] / count})
     found = from_columns(table, thrust.path)
@@ -149,7 +151,7 @@ def joined(thrust: ThrustPoints, steady: list[SteadyPoints], rotors: int | None,
 
 
 def _typical(readings: np.ndarray) -> float:
-    """What most readings agree on to 5 %; NaN where fewer than two in five do: a sensor that counts blades twice."""
+    """The speed on which most readings agree within 5 %; NaN if fewer than two in five do (blades counted twice)."""
     x = np.sort(readings[readings > 0])
     if not len(x):
         return float("nan")

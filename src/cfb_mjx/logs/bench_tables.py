@@ -1,4 +1,4 @@
-"""Bench measurements as tables (csv or parquet): command steps, and force and torque against rotor speed."""
+"""Read bench measurements from tables (csv or parquet): command steps, and force and torque against rotor speed."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from cfb_mjx.logs.tabular import Table, read_table, require_numbers
 
 STEP_LAYOUT = "t (s), u or u1..u4 (0 to 1), omega or omega1..omega4 (rad/s)"
 MAP_LAYOUT = "omega (rad/s), force (N) and/or torque (N m), optionally motor (1 to 4)"
-# No Crazyflie rotor reaches 4000 rad/s, pulls 2 N or needs 0.02 N m: beyond, the column is in another unit.
+# No Crazyflie rotor reaches 4000 rad/s, 2 N or 0.02 N m; larger values are in another unit.
 SPEED_LIMIT, FORCE_LIMIT, TORQUE_LIMIT = 4000.0, 2.0, 0.02
 _FLIGHT = ("px", "qw", "wx", "ax", "ros_timestamp_x")
 
 
 @dataclass(frozen=True)
 class MotorRecord:
-    """One recording of k motors, from a flight or from a bench.
+    """Time series of k motors, from a flight or from a bench.
 
     Attributes:
-        name: of the recording, for messages.
+        name: name of the recording, for messages.
         time: (n,) s, increasing.
         command: (n, k) in [0, 1]; a row holds until the next.
         rotor_speed: (n, k) rad/s, NaN where a reading is missing.
-        motors: (k,) motor numbers 1..4; 0 where the recording does not say which.
-        battery_voltage: (n,) V of the supply of a bench; None where it was not measured, or for a flight.
+        motors: (k,) motor numbers 1..4; 0 if the recording does not say which.
+        battery_voltage: (n,) V, supply voltage of a bench; None if it was not measured, and for a flight.
     """
 
     name: str
@@ -41,20 +41,20 @@ class MotorRecord:
     battery_voltage: np.ndarray | None = None
 
     def segments(self) -> list[slice]:
-        """Stretches of rows without a gap (a gap is longer than three nominal intervals + 0.5 ms)."""
+        """Stretches of rows between gaps. A gap is longer than three nominal intervals + 0.5 ms."""
         return stretches(self.time, longest_step(np.median(np.diff(self.time))))
 
 
 @dataclass(frozen=True)
 class MapTable:
-    """Steady force and torque at rotor speeds.
+    """Steady force and torque against rotor speed.
 
     Attributes:
         name: file name without its ending.
         rotor_speed: (n,) rad/s.
         force: (n,) N, or None.
         torque: (n,) N m, magnitude, or None.
-        motor: (n,) numbers 1..4; 0 where the table does not say.
+        motor: (n,) motor numbers 1..4; 0 if the table does not say which.
     """
 
     name: str
@@ -65,25 +65,28 @@ class MapTable:
 
 
 def record_of(log: FlightLog) -> MotorRecord | None:
-    """The motors of a flight; None where its rotor speeds were not measured."""
+    """Commands and rotor speeds of a flight; None if its rotor speeds were not measured."""
     if log.rotor_speed is None:
         return None
     return MotorRecord(log.name, log.time, np.clip(log.command, 0, 1), log.rotor_speed, (1, 2, 3, 4))
 
 
 def recognises(table: Table) -> bool:
-    """Whether the columns are a bench table's rather than a flight's."""
+    """Whether the columns are those of a bench table, not of a flight."""
     if any(c in table for c in _FLIGHT):
         return False
     return "force" in table or "torque" in table or any(c == "u" or c.startswith("omega") for c in table)
 
 
 def read_bench(path: str | os.PathLike) -> MotorRecord | MapTable:
-    """Read and check a bench table; which kind it is follows from its columns.
+    """Read and check a bench table. Its kind follows from its columns.
+
+    Returns:
+        A `MapTable` if there is a column ``force`` or ``torque``, else a `MotorRecord`.
 
     Raises:
         CfbError: unreadable or empty file, missing columns, missing or infinite values, time that does not increase, or
-            another unit (rpm, percent, PWM, grams, millinewtons); one sentence with what to do.
+            another unit (rpm, percent, PWM, grams, millinewtons).
     """
     path = Path(path)
     return from_columns(read_table(path), path)
@@ -173,6 +176,7 @@ def _finite(table: Table, columns: list[str], path: Path) -> None:
 
 
 def check_command(command: np.ndarray, names: list[str], path: Path) -> None:
+    """Check that commands lie in [0, 1]; else raise `CfbError` with the likely unit."""
     low, high = float(command.min()), float(command.max())
     if low < -1e-3:
         raise CfbError(f"{path}: {names[0]} is negative ({low:.3g}); commands lie in [0, 1].")

@@ -1,8 +1,10 @@
-"""What a log's signals say about each other: displacement against velocity, turned attitude against gyro, velocity
-against accelerometer, gravity, and the motors against how the drone turns.
+"""Comparisons of signals of a log that measure the same motion.
 
-Every comparison is over short windows, per axis, with a lag of its own: a slope, a correlation, and how much of both
-signals stays unexplained. An axis that hardly moves decides nothing.
+Compared are displacement and velocity, attitude and gyro, velocity and accelerometer, accelerometer and gravity, drag
+and velocity, and roll and pitch with the motors.
+
+Each comparison is made per axis, over short windows, with a lag of its own. It yields a slope, a correlation, and the
+share of both signals that stays unexplained. An axis that hardly moves is not judged.
 """
 
 from __future__ import annotations
@@ -18,32 +20,33 @@ from cfb_mjx.logs.flight_log import FlightLog
 
 GRAVITY = 9.81
 CONTRADICTS = 0.2
-"""Unexplained share from which two signals contradict each other: at most 0.14 in 334 good flights; in another the
-estimated yaw is wrong for seconds."""
-_LAGS = (0.0, 0.01, 0.02, 0.04, 0.08, 0.12)  # s by which pose and velocity may be late
+"""Unexplained share from which two signals contradict each other. In 334 good flights it is at most 0.14; it is larger
+in one other flight, whose estimated yaw is wrong for some seconds."""
+_LAGS = (0.0, 0.01, 0.02, 0.04, 0.08, 0.12)  # s, candidate lags of pose and velocity
 _MOST_WINDOWS = 4000
-_TRIMMED = 0.1  # share of the worst windows that does not count: a glitch is no wrong unit
-_RARE = 0.03  # share of the liveliest windows that do not make an axis move
-_FEWEST = 10
-_BLOCK, _TURNED = 0.2, 1.0  # s and rad: within a block the body must not turn so far, or it has no axes of its own
-_PUSHES, _CROSSED = 0.4, 0.65  # correlations: with motion along the axis; against motion along the other
-_FAST = 5.0  # rad/s: rotations are compared over half the time
+_TRIMMED = 0.1  # share of the worst windows that is ignored, because a glitch is not a wrong unit
+_RARE = 0.03  # share of the windows with the most motion that is ignored when deciding whether an axis moves
+_FEWEST = 10  # windows
+_BLOCK, _TURNED = 0.2, 1.0  # s and rad: drag is averaged over blocks in which the body rotates less than this
+_PUSHES, _CROSSED = 0.4, 0.65  # correlations of force and velocity: wrong sign above; other axis below the negative
+_FAST = 5.0  # rad/s; above this, rotations are compared over windows half as long
 ORDER = (0, 1, 2, 3)
 
 
 @dataclasses.dataclass(frozen=True)
 class Relation:
-    """Two signals that should be the same, along one axis.
+    """Comparison of two signals that should be equal, along one axis.
 
     Attributes:
         name: ``displacement``, ``attitude``, ``velocity``, ``gravity``, ``upright`` or ``drag``.
         axis: ``x``, ``y``, ``z``; empty for gravity and upright.
-        slope: of the first, measured one on the second, which is integrated.
-        lag: s by which the first is late.
-        correlation: of the two.
-        unexplained: mean square of their difference over the mean of their mean squares; 0 agree, 2 have nothing in
-            common, 4 are opposite. Of drag, which only has a sign: twice its correlation where that is wrong.
-        moves: whether the axis moves enough to tell.
+        slope: regression slope of the measured signal on the integrated one.
+        lag: lag of the measured signal, s.
+        correlation: of the two signals.
+        unexplained: mean square of their difference over the mean of their mean squares: 0 for equal, 2 for unrelated,
+            4 for opposite signals. For drag, of which only the sign is checked: twice the correlation if the sign is
+            wrong, else 0.
+        moves: whether the axis moves enough to be judged.
     """
 
     name: str
@@ -56,19 +59,20 @@ class Relation:
 
     @property
     def contradicts(self) -> bool:
-        """Whether the two plainly are not the same."""
+        """Whether the two signals contradict each other."""
         return self.moves and self.unexplained > CONTRADICTS
 
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """Changes of a measured signal over windows, beside the integral of the one that should be its derivative.
+    """Changes of a measured signal over windows, and integrals over the same windows of the signal's derivative.
 
     Attributes:
-        time: (n,) s, where the windows begin.
-        width: of the windows, s.
-        lag: s by which the measured signal is late.
-        integrated: (n, 3). ``measured``: (n, 3).
+        time: (n,) s, start of each window.
+        width: length of the windows, s.
+        lag: lag of the measured signal, s.
+        integrated: (n, 3) integral of the derivative.
+        measured: (n, 3) change of the measured signal.
     """
 
     time: np.ndarray
@@ -79,13 +83,13 @@ class Comparison:
 
 
 _LEAST = {"displacement": 0.013, "attitude": 0.018, "velocity": 0.065}
-"""rms of either side, in m, rad and m/s over a window, from which an axis moves."""
+"""rms of either signal over a window (m, rad, m/s) from which an axis counts as moving."""
 
 
 def comparisons(log: FlightLog) -> dict[str, Comparison]:
-    """``displacement``, m, ``attitude``, rad, and ``velocity``, m/s, over windows.
+    """The comparisons ``displacement`` (m), ``attitude`` (rad) and ``velocity`` (m/s), over windows.
 
-    Those that the log is too short for are left out.
+    A comparison for which the log is too short is left out.
     """
     q = rotation.tidy(log.quaternion)
     turns = 0.05 if np.sqrt(np.mean(np.sum(log.body_rate**2, axis=1))) > _FAST else 0.1
@@ -102,14 +106,14 @@ def comparisons(log: FlightLog) -> dict[str, Comparison]:
 
 
 def kinematics(log: FlightLog) -> list[Relation]:
-    """The relations of pose, velocity, gyro and accelerometer, thirteen in all; fewer where the log is too short."""
+    """All thirteen relations of pose, velocity, gyro and accelerometer; fewer if the log is too short."""
     q = rotation.tidy(log.quaternion)
     found = [r for name, c in comparisons(log).items() for r in _relations(name, c)]
     return [*found, *_gravity(log, _acceleration(log, q)), *_drag(log, q)]
 
 
 def when(log: FlightLog, relation: Relation) -> str:
-    """`` between A and B s``: where a relation of three axes does not hold; empty for others."""
+    """Where a relation does not hold, as `` between A and B s``. Empty for gravity, upright and drag."""
     compared = comparisons(log).get(relation.name)
     if compared is None:
         return ""
@@ -124,7 +128,7 @@ def _acceleration(log: FlightLog, q: np.ndarray) -> np.ndarray:
 
 
 def _compared(log, width, integrand, change, centred=False) -> Comparison | None:
-    """``change(a, b)`` between rows beside the integral of ``integrand``, at the lag at which they are most alike."""
+    """Compare ``change(a, b)`` between rows with the integral of ``integrand``, at the lag with the best agreement."""
     time, step = log.time, log.nominal_interval
     gap = np.concatenate([[0], np.cumsum(np.diff(time) > log.gap_threshold)])
     steps = np.diff(time)[:, None]
@@ -143,7 +147,7 @@ def _compared(log, width, integrand, change, centred=False) -> Comparison | None
             continue
         x, y = integral[b] - integral[a], change(a + late, b + late)
         if centred:
-            # A tilted attitude or a biased accelerometer adds the same to every window.
+            # Remove the offset that a tilted attitude or an accelerometer bias adds to every window.
             x, y = x - np.median(x, axis=0), y - np.median(y, axis=0)
         cost = float(np.sum(_trimmed(np.sum((x - y) ** 2, axis=1))))
         if best is None or cost < best[0]:
@@ -156,7 +160,7 @@ def _relations(name: str, compared: Comparison) -> list[Relation]:
     for axis, (u, v) in enumerate(zip(compared.integrated.T, compared.measured.T, strict=True)):
         keep = _kept((u - v) ** 2)
         uu, vv, uv = (float(np.mean(p[keep])) for p in (u * u, v * v, u * v))
-        # Not of the kept windows: where the two contradict each other, the liveliest are those that were left out.
+        # From all windows, because contradicting signals have most of their motion in the windows trimmed above.
         both = u * u + v * v
         usual = both <= np.quantile(both, 1 - _RARE)
         size = float(np.sqrt(max(np.mean(p[usual] ** 2) for p in (u, v))))
@@ -183,7 +187,11 @@ def _trimmed(values: np.ndarray) -> np.ndarray:
 
 
 def _gravity(log: FlightLog, force: np.ndarray) -> list[Relation]:
-    """Over a whole flight the accelerometer reads gravity and the change of the velocity; free fall is short."""
+    """Relations of the accelerometer with gravity.
+
+    ``gravity``: over a whole flight, the mean specific force minus the mean change of the velocity is gravity.
+    ``upright``: the median specific force along body z is positive.
+    """
     if log.duration < 1.0:
         return []
     steps = np.diff(log.time)
@@ -200,7 +208,7 @@ def _gravity(log: FlightLog, force: np.ndarray) -> list[Relation]:
 
 
 def _drag(log: FlightLog, q: np.ndarray) -> list[Relation]:
-    """Along x and y of the body nothing but the air pushes, and that against the motion."""
+    """Check the sign of drag: along body x and y only the air exerts a force, and it opposes the velocity."""
     width = max(1, round(_BLOCK / log.nominal_interval))
     count = len(log) // width
     if count < _FEWEST:
@@ -209,7 +217,7 @@ def _drag(log: FlightLog, q: np.ndarray) -> list[Relation]:
     def means(values):
         return values[: count * width].reshape(count, width, -1).mean(axis=1)
 
-    # In a flip "along y" is another direction at the end of a block than at its beginning.
+    # In a flip, the body axes change their direction within a block.
     calm = _BLOCK * means(np.linalg.norm(log.body_rate, axis=1))[:, 0] < _TURNED
     if calm.sum() < _FEWEST:
         return []
@@ -233,15 +241,15 @@ def _drag(log: FlightLog, q: np.ndarray) -> list[Relation]:
 
 
 def agreement(log: FlightLog, source: str) -> dict[tuple[tuple[int, ...], int], float]:
-    """How well roll and pitch follow from the motors, by which motor stands in which column.
+    """Correlation of roll and pitch with the torque of the motors, for every order of the motor columns.
 
     Args:
         log: the flight.
         source: ``rotor_speed`` or ``command``.
 
     Returns:
-        Order of the columns (M1 to M4 stand in these, counted from 0) and sign of the command to the mean correlation
-        of both axes, -1 to 1. Empty without data.
+        Mean correlation of both axes, -1 to 1, for each key: the columns of M1 to M4, counted from 0, and the sign of
+        the command. Empty without data.
     """
     spectra = motor_spectra(log, source)
     if spectra is None:
@@ -254,7 +262,7 @@ def agreement(log: FlightLog, source: str) -> dict[tuple[tuple[int, ...], int], 
             pattern = np.zeros(4)
             pattern[list(order)] = ROLL_PITCH[axis]
             own = float(pattern @ power @ pattern)
-            # Motors that all do the same turn nothing.
+            # Motors with equal thrust produce no torque.
             told = own > 1e-6 * float(np.trace(power)) and turning[axis] > 0
             parts.append(cross[:, :, axis] @ pattern / np.sqrt(own * turning[axis]) if told else 0.0 * cross[:, 0, 0])
         both = np.mean(parts, axis=0)

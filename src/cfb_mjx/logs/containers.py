@@ -1,4 +1,4 @@
-"""What a file is, by its first bytes, where this library does not read it: its name and the way on."""
+"""Recognise files of unsupported kinds by their first bytes: the name of the kind, and advice for the user."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from cfb_mjx.files import read_bytes
 
 _TO_TABLE = "write its columns as csv or parquet (docs/logs.md has the layout)"
 _UNPACK = "unpack it and import what is inside"
-# First bytes, what that is, what to do. Longer marks stand before shorter ones they begin with.
+# First bytes, name, advice. A longer mark comes before a shorter one with the same beginning.
 _MARKS: tuple[tuple[bytes, str, str], ...] = (
     (b"version https://git-lfs.github.com", "a Git LFS pointer, not the file itself", "fetch it with: git lfs pull"),
     (b"#ROSBAG V1", "a ROS 1 bag of an old version", "migrate it with: rosbag fix"),
@@ -36,11 +36,11 @@ _PICKLE_OPENINGS = (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")
 
 
 def name_of(path: Path, head: bytes) -> tuple[str, str] | None:
-    """What a file of a kind that is not read is, and the way on; None for anything else.
+    """Name of an unsupported kind of file, and advice; None for any other file.
 
     Args:
-        path: of the file.
-        head: its first bytes, 64 or more where it has as many.
+        path: the file.
+        head: its first 64 bytes or more, or the whole of a shorter file.
     """
     for mark, name, remedy in _MARKS:
         if head.startswith(mark):

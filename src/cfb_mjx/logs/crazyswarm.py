@@ -1,10 +1,10 @@
 """Reader of ROS bags recorded with Crazyswarm2, or with Crazyswarm 1.
 
-The bag describes its messages; what it does not hold are the names of the variables in a custom log topic
-(``crazyflie_interfaces/LogDataGeneric``: header, firmware time stamp in ms, values). They stand in the
-``crazyflies.yaml`` the server was started with, under ``firmware_logging: custom_topics: NAME: {frequency, vars}`` of
-``all``, the robot's type or the robot (later ones win, as in IMRCLab/crazyswarm2). Crazyswarm 1 has them as parameters
-``genericLogTopic_NAME_Variables``.
+The bag describes its messages, but not the names of the variables in a custom log topic
+(``crazyflie_interfaces/LogDataGeneric``: header, firmware time stamp in ms, values). They are in the
+``crazyflies.yaml`` with which the server was started, under ``firmware_logging: custom_topics: NAME: {frequency,
+vars}`` of ``all``, the robot's type or the robot (later ones take precedence, as in IMRCLab/crazyswarm2). Crazyswarm 1
+has them as parameters ``genericLogTopic_NAME_Variables``.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from cfb_mjx.logs.streams import RADIO_WRAP_MS, Stream, ordered, unwrap
 from cfb_mjx.logs.variables import FIELDS, VariableMap, load_mapping
 
 _CRAZYSWARM_1 = re.compile(r"genericLogTopic_(\w+)_Variables")
-_TICK = 0.001  # s: the firmware's stamps are no finer, nor can another clock be brought closer to them
-_OVERTAKING = 0.1  # s by which messages may overtake each other on their way into the bag
-_BIN = 5.0  # s over which the fastest packet is looked for when two clocks are compared
-_STEPPED = 0.02  # s: fastest packets that scatter more than this mean that the computer's clock was set meanwhile
+_TICK = 0.001  # s, resolution of the firmware's time stamps, which limits the alignment of another clock with them
+_OVERTAKING = 0.1  # s by which messages may arrive out of order in the bag
+_BIN = 5.0  # s, width of the bins in which the fastest packet is used to compare two clocks
+_STEPPED = 0.02  # s; if the fastest packets scatter more than this, the computer's clock was adjusted meanwhile
 
 
 def read_crazyswarm(
@@ -50,17 +50,21 @@ def read_crazyswarm(
 ) -> FlightLog:
     """Read one robot's flight from a bag. `read_log` also validates the content.
 
-    Custom log topics are placed by their firmware time stamps. Other messages have only the time at which the computer
-    stamped them; it is brought onto the firmware's clock through the fastest packets of the custom topics, so what
-    travels by radio too is placed right but for its own jitter, and motion capture is early by the unknown shortest
-    time of a packet. Without firmware time stamps all rests on the computer's clock.
+    Custom log topics are placed in time by their firmware time stamps. Other messages have only a time stamp of the
+    computer. It is converted to the firmware's clock by means of the fastest packets of the custom topics. Messages
+    that also came by radio are then right except for their jitter; motion capture is early by the (unknown) shortest
+    transmission time of a packet. Without firmware time stamps, the computer's clock is used for all topics.
 
     Args:
         path: the ``.mcap``, ``.db3`` or ``.bag``, or the folder of a ROS 2 bag.
-        mapping: which variable is which column; a mapping file, or None for ``configs/logs/crazyflie.yaml``. Poses are
-            ``pose.x .. pose.qz``, odometry ``odom.x .. odom.wz``, the battery of Status ``status.battery_voltage``.
-        topics_yaml: the ``crazyflies.yaml`` in use; without it custom log topics cannot be read.
-        robot: its name, the first part of its topics; needed when the bag has several.
+        mapping: assigns variables to columns of the log; a mapping file, or None for ``configs/logs/crazyflie.yaml``.
+            Poses are ``pose.x .. pose.qz``, odometry ``odom.x .. odom.wz``, the battery of Status
+            ``status.battery_voltage``.
+        topics_yaml: the ``crazyflies.yaml`` used for the flight; without it custom log topics cannot be read.
+        robot: name of the robot, the first part of its topics; required if the bag has several.
+
+    Returns:
+        The log, not yet validated.
 
     Raises:
         CfbError: unreadable or damaged file, no or several robots, a custom topic whose number of values differs from
@@ -99,8 +103,8 @@ def _flight(
     names = {} if topics_yaml is None else _custom_topics(Path(topics_yaml), robot)
     try:
         read = [_table(topic, group, names, path, notes) for topic, group in by_topic.items()]
-    except AttributeError as error:  # a message of a known name with other fields
-        raise CfbError(f"{path}: a message is not what Crazyswarm2 records ({error}); record the bag again.") from None
+    except AttributeError as error:  # a message type with a known name and other fields
+        raise CfbError(f"{path}: a message differs from Crazyswarm2's ({error}); record the bag again.") from None
     tables = [t for t in read if t is not None]
     if topics_yaml is None and any(group[0].kind in (GENERIC, GENERIC_1) for group in by_topic.values()):
         notes.append(
@@ -124,7 +128,7 @@ def _flight(
 
 
 class _Table(NamedTuple):
-    """Messages of one topic: computer time (ns), firmware time (ms, 0 where unknown) and values by name."""
+    """Messages of one topic: computer time (ns), firmware time (ms; None if unknown) and values by name."""
 
     topic: str
     stamp_ns: np.ndarray
@@ -145,7 +149,7 @@ def _robot(messages: list[BagMessage], robot: str | None, path: Path) -> str:
 
 
 def _custom_topics(path: Path, robot: str) -> dict[str, list[str]]:
-    """Variable names per custom topic of the robot."""
+    """Custom topic of the robot to the names of its variables."""
     document = load_yaml(path)
     first = {m[1]: (m[0], v) for k, v in document.items() if (m := _CRAZYSWARM_1.fullmatch(str(k))) is not None}
     if first:
@@ -234,7 +238,7 @@ def _row(kind: str, message: Any) -> list[float]:
 
 
 def _one_clock(tables: list[_Table], path: Path, notes: list[str], warnings: list[str]) -> tuple[list[Stream], dict]:
-    """Streams in s on the firmware's clock where it is known, else on the computer's, and a report of how."""
+    """Streams on one clock (s): the firmware's if known, else the computer's. Also a report on the conversion."""
     if not tables:
         return [], {"of": "none"}
     origin = min(int(t.stamp_ns.min()) for t in tables)
@@ -246,25 +250,25 @@ def _one_clock(tables: list[_Table], path: Path, notes: list[str], warnings: lis
             firmware.append(None)
             continue
         ticks, wraps = unwrap(table.ticks_ms, RADIO_WRAP_MS)
-        # A topic that starts after an overflow of the 24-bit counter must land beside those that began before it.
+        # A topic may start after an overflow of the 24-bit counter; add the overflows that it missed.
         lag = float(np.median(seconds - ticks / 1e3))
         reference = lag if reference is None else reference
         ticks = ticks + RADIO_WRAP_MS * round((lag - reference) / (RADIO_WRAP_MS / 1e3))
         if wraps:
-            notes.append(f"{table.topic}: the 24-bit time stamp overflowed {wraps} times; it was continued.")
+            notes.append(f"{table.topic}: the 24-bit time stamp overflowed {wraps} times; this was undone.")
         firmware.append(ticks / 1e3)
     pairs = [(f, c) for f, c in zip(firmware, computer, strict=True) if f is not None]
     if pairs:
         slope, offset, clock = _fastest_packets(*(np.concatenate(p) for p in zip(*pairs, strict=True)))
         if clock["scatter_ms"] > _STEPPED * 1e3:
             warnings.append(
-                f"the computer's clock wandered by {clock['scatter_ms']:.0f} ms against the firmware's; poses may be "
-                "out of step with the gyro."
+                f"the computer's clock wandered by {clock['scatter_ms']:.0f} ms against the firmware's; poses may not "
+                "be in step with the gyro."
             )
         placed = [(c - offset) / slope if f is None else f for f, c in zip(firmware, computer, strict=True)]
     else:
         clock = {"of": "computer"}
-        notes.append("no topic has firmware time stamps; rows carry the time at which the computer stamped them.")
+        notes.append("no topic has firmware time stamps; rows have the computer's time stamps.")
         placed = computer
     streams = []
     for table, time, ticks in zip(tables, placed, firmware, strict=True):
@@ -275,7 +279,11 @@ def _one_clock(tables: list[_Table], path: Path, notes: list[str], warnings: lis
 
 
 def _fastest_packets(firmware: np.ndarray, computer: np.ndarray) -> tuple[float, float, dict]:
-    """Computer time as slope * firmware time + offset through the packets that travelled fastest, in bins of 5 s."""
+    """Fit computer time = slope * firmware time + offset to the fastest packet of each 5 s bin.
+
+    Returns:
+        Slope, offset (s), and a report on the fit.
+    """
     delay = computer - firmware
     bins = np.floor((firmware - firmware.min()) / _BIN).astype(int)
     order = np.lexsort((delay, bins))

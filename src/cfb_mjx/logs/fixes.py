@@ -1,4 +1,4 @@
-"""Changes of a log's conventions that a user may ask for, as ``--fix velocity-frame=body``."""
+"""Changes of a log's conventions (unit, axes, frame, order) that a user can request: ``--fix velocity-frame=body``."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _UNIT_WORDS = {
     "deg/s": "degrees per second",
     "mrad/s": "milliradians per second",
 }
-# Numbers that were taken for another unit on the way: an importer's mistake, undone the same way.
+# Undo a conversion that was applied to numbers that were already in the target unit.
 _UNDONE = {"gyro": {"rad/s": 180 / math.pi}, "accelerometer": {"m/s^2": 1 / _G}}
 TIMES = {"ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
 _SCALES = (0.1, 0.5, 2.0, 10.0, 0.01, 100.0)
@@ -52,7 +52,7 @@ _QUATERNIONS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
         lambda q: q[:, [3, 0, 1, 2]],
     ),
     "wxyz": (
-        "reading the quaternion as scalar-first [w, x, y, z], which was taken for scalar-last",
+        "reading the quaternion as scalar-first [w, x, y, z], which was read as scalar-last",
         lambda q: q[:, [1, 2, 3, 0]],
     ),
     "inverse": (
@@ -69,11 +69,11 @@ _QUATERNIONS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
         lambda q: q * [1.0, 1.0, -1.0, -1.0],
     ),
     "z-down-world": (
-        "reading the quaternion as from body axes with z up to a world with z down; turn it by half a turn about x",
+        "reading the quaternion as from body axes with z up to a world with z down; rotate it by 180 degrees about x",
         lambda q: rotation.multiply(np.broadcast_to([0.0, 1.0, 0.0, 0.0], q.shape), q),
     ),
     "z-down-body": (
-        "reading the quaternion as from body axes with z down to a world with z up; turn it by half a turn about x",
+        "reading the quaternion as from body axes with z down to a world with z up; rotate it by 180 degrees about x",
         lambda q: rotation.multiply(q, np.broadcast_to([0.0, 1.0, 0.0, 0.0], q.shape)),
     ),
     "pitch-inverted": ("reading the pitch with the opposite sign; negate it", lambda q: _repitched(q)),
@@ -87,7 +87,7 @@ COMMAND_UNITS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "percent": ("look like percent; divide the commands by 100", lambda u: u / 100.0),
     "pwm16": ("look like raw PWM in 0..65535; divide the commands by 65535", lambda u: u / 65535.0),
     "dshot": (
-        # 0 to 47 are no throttle but orders to the ESC, under which a motor stands.
+        # 0 to 47 are special commands to the ESC, not throttle; the motor stands still.
         "look like DSHOT values of 48 to 2047; subtract 47 and divide the commands by 2000",
         lambda u: np.clip((u - 47.0) / 2000.0, 0.0, None),
     ),
@@ -99,7 +99,7 @@ COMMAND_UNITS: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
     "0-1000": ("look like per mille; divide the commands by 1000", lambda u: u / 1000.0),
     "1023": ("look like 10-bit values in 0..1023; divide the commands by 1023", lambda u: u / 1023.0),
 }
-"""What commands that are no duty look like, with the remedy, and the duty they stand for."""
+"""Units of commands other than duty: the words of a message, with the remedy, and the conversion to duty."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,9 +107,9 @@ class Fix:
     """A change of convention.
 
     Attributes:
-        name: as ``--fix`` takes it.
-        words: what it does, to follow "... makes them agree".
-        apply: the log with it.
+        name: argument of ``--fix``.
+        words: what it does, as a phrase for messages ("reading the velocity in body axes").
+        apply: function that returns the changed log.
     """
 
     name: str
@@ -118,10 +118,10 @@ class Fix:
 
 
 def fix_of(name: str) -> Fix:
-    """The change that ``NAME=VALUE`` names.
+    """The change with a name of the form ``NAME=VALUE``.
 
     Raises:
-        CfbError: there is none of this name; the message lists what there is.
+        CfbError: there is no change with this name. The message lists similar names.
     """
     key, _, value = name.partition("=")
     part, _, kind = key.partition("-")
@@ -140,15 +140,15 @@ def fix_of(name: str) -> Fix:
         near = difflib.get_close_matches(name, [f.name for f in _named()], n=4, cutoff=0.3)
         raise CfbError(
             f"--fix {name}: there is no such change; "
-            f"{'like it are ' + ', '.join(near) + '; ' if near else ''}others are "
+            f"{'similar names are ' + ', '.join(near) + '; ' if near else ''}others are "
             "PART-axes=x,-y,z and PART-unit=UNIT for PART position, velocity, gyro or accelerometer, motors=2,1,3,4, "
-            "motors=inverted, time-scale=0.1 (docs/logs.md has all)."
+            "motors=inverted, time-scale=0.1 (docs/logs.md lists all)."
         )
     return made
 
 
 def candidates() -> Iterable[Fix]:
-    """All changes of what is not the motors', the likely ones first."""
+    """All changes except those of the motors, the most likely first."""
     yield from _named()
     yield from (not_none(_time(str(scale))) for scale in _SCALES)
     for part in _VECTORS:
@@ -160,11 +160,11 @@ def candidates() -> Iterable[Fix]:
 
 
 def motor_fixes(order: tuple[int, ...], sign: int = 1, key: str = "motors") -> tuple[Fix, ...]:
-    """The changes that bring motor columns into an order, and invert the commands if need be.
+    """The changes that reorder the motor columns and, if requested, invert the commands.
 
     Args:
-        order: the column each of M1 to M4 stands in, counted from 0.
-        sign: -1 where the commands are one minus the duty.
+        order: the column of each of M1 to M4, counted from 0.
+        sign: -1 if the commands are one minus the duty.
         key: ``motors`` for commands and rotor speeds, ``command-order`` or ``rotor-order`` for one of the two.
     """
     spec = ",".join(str(column + 1) for column in order)
@@ -173,7 +173,7 @@ def motor_fixes(order: tuple[int, ...], sign: int = 1, key: str = "motors") -> t
 
 
 def command_fixes() -> list[Fix]:
-    """Units of commands that are not duty."""
+    """The changes of unit for commands that are not duty."""
     return [
         Fix(f"command-unit={unit}", words, lambda log, f=f: log.replace(command=f(log.command)))
         for unit, (words, f) in COMMAND_UNITS.items()
@@ -187,7 +187,7 @@ def _named() -> list[Fix]:
         Fix("accelerometer-frame=world", "reading the specific force in world axes", _force_from_world),
         Fix(
             "accelerometer-gravity=subtracted",
-            "adding gravity to the specific force, from which it was subtracted (give what the accelerometer reads, "
+            "adding gravity to the specific force, from which it was subtracted (give the accelerometer's reading, "
             "gravity included)",
             lambda log: _with_gravity(log, in_world=False),
         ),
@@ -340,14 +340,14 @@ def _from_left_handed(log: FlightLog) -> FlightLog:
         position=log.position * mirror,
         velocity=log.velocity * mirror,
         specific_force=log.specific_force * mirror,
-        # A rotation is an axial vector: mirrored, it turns the other way about the axes in the mirror.
+        # A rate is an axial vector: a reflection reverses its components within the mirror plane.
         body_rate=log.body_rate * -mirror,
         quaternion=log.quaternion * [1.0, -1.0, 1.0, -1.0],
     )
 
 
 def _repitched(q: np.ndarray) -> np.ndarray:
-    """The same roll and yaw, the pitch negated (roll, pitch, yaw applied as R_z R_y R_x)."""
+    """Negate the pitch and keep roll and yaw (rotation R_z(yaw) R_y(pitch) R_x(roll))."""
     w, x, y, z = rotation.tidy(q).T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))

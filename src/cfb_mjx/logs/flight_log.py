@@ -16,7 +16,7 @@ from cfb_mjx.logs.gaps import longest_step, stretches
 
 REQUIRED = ("time", "position", "velocity", "quaternion", "body_rate", "specific_force", "command")
 OPTIONAL = ("rotor_speed", "battery_voltage")
-# The class has a method of the name slice.
+# An alias, because inside the class the name slice is a method.
 Rows = np.ndarray | slice
 _WIDTH = {
     "position": 3,
@@ -31,7 +31,7 @@ _WIDTH = {
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class FlightLog:
-    """A flight, sampled at ``n`` instants that need not be evenly spaced. Arrays are float64 and read-only.
+    """One flight, sampled at ``n`` instants that need not be evenly spaced. Arrays are float64 and read-only.
 
     A pause in the samples longer than `gap_threshold` is a gap: nothing in the library interpolates across it.
 
@@ -49,7 +49,7 @@ class FlightLog:
             ``observation_delay`` (s by which position, velocity and quaternion lag their row's time; None: unknown).
 
     Raises:
-        ValueError: arrays of the wrong shape (a programming mistake; `validate` judges the content).
+        ValueError: an array has the wrong shape. Only shapes are checked here; `validate` checks the content.
     """
 
     time: np.ndarray
@@ -75,19 +75,19 @@ class FlightLog:
                 raise ValueError(f"FlightLog.{field} has shape {array.shape}, expected {shape}")
             array.flags.writeable = False
             object.__setattr__(self, field, array)
-        # Through JSON, so that what is stored in a file is exactly what was in memory.
+        # A round trip through JSON makes the metadata in memory equal to the metadata read back from a file.
         given = json.loads(json.dumps(plain(self.metadata), allow_nan=False))
         defaults = {"name": "log", "source": "", "format": "memory", "observation_delay": None}
         object.__setattr__(self, "metadata", MappingProxyType(defaults | given))
 
     @property
     def name(self) -> str:
-        """Name of the log, unique among files of one folder (the file name without its ending)."""
+        """Name of the log: the file name without its ending."""
         return self.metadata["name"]
 
     @property
     def observation_delay(self) -> float | None:
-        """Seconds by which position, velocity and quaternion rows lag their time; None when the log does not say."""
+        """Lag of position, velocity and quaternion behind their row's time, s; None if unknown."""
         return self.metadata["observation_delay"]
 
     @property
@@ -104,7 +104,7 @@ class FlightLog:
 
     @property
     def gap_threshold(self) -> float:
-        """Two rows further apart than this, s, have a gap between them (three nominal intervals + 0.5 ms)."""
+        """Longest step between two rows without a gap, s: three nominal intervals + 0.5 ms."""
         return longest_step(self.nominal_interval)
 
     def gaps(self) -> np.ndarray:
@@ -120,17 +120,17 @@ class FlightLog:
         return self.rows((self.time >= start) & (self.time <= stop))
 
     def split(self, share: float) -> tuple[FlightLog, FlightLog]:
-        """The first ``share`` of the log's time, and the rest; a row on the border belongs to both."""
+        """Split in time into the first ``share`` (0 to 1) and the rest. Both include a row on the border."""
         border = self.time[0] + share * self.duration
         return self.slice(self.time[0], border), self.slice(border, self.time[-1])
 
     def rows(self, index: Rows) -> FlightLog:
-        """The rows that ``index`` (a mask, indices or a slice) selects."""
+        """The rows selected by ``index`` (a mask, indices or a slice)."""
         arrays = {f: getattr(self, f) for f in (*REQUIRED, *OPTIONAL)}
         return self.replace(**{f: None if a is None else a[index] for f, a in arrays.items()})
 
     def replace(self, **changes) -> FlightLog:
-        """A copy with some fields changed; ``metadata`` is merged into the present one instead of replacing it."""
+        """A copy with some fields replaced. ``metadata`` is merged into the existing metadata."""
         if "metadata" in changes:
             changes["metadata"] = dict(self.metadata) | dict(changes["metadata"])
         return dataclasses.replace(self, **changes)
@@ -152,10 +152,10 @@ class FlightLog:
 
 
 def require_own_names(logs: Sequence[FlightLog]) -> None:
-    """Refuse two logs of one name: results are listed by name.
+    """Check that no two logs have the same name, because results are listed by name.
 
     Raises:
-        CfbError: names the log.
+        CfbError: two logs have the same name.
     """
     names = [log.name for log in logs]
     for name in names:
@@ -164,12 +164,12 @@ def require_own_names(logs: Sequence[FlightLog]) -> None:
 
 
 def quantise_time(time: np.ndarray) -> np.ndarray:
-    """Round times (s) to whole nanoseconds, the resolution log files keep; applying it twice changes nothing."""
+    """Round times (s) to whole nanoseconds, the resolution of log files. Idempotent."""
     return from_nanoseconds(*to_nanoseconds(time))
 
 
 def to_nanoseconds(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Split times (s) into whole seconds and nanoseconds 0..999999999, both int64, exactly also for epoch times."""
+    """Split times (s) into whole seconds and nanoseconds 0..999999999, both int64. Exact for epoch times too."""
     time = np.asarray(time, dtype=np.float64)
     seconds = np.floor(time)
     nanos = np.rint((time - seconds) * 1e9)

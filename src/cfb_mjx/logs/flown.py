@@ -1,7 +1,7 @@
-"""Which rows of a recording are measured flight: no standing, no carrying, no glitches, no frozen estimates.
+"""Selection of the rows of a recording that are measured flight.
 
-What is taken out is told in the log's notes; where it lay within the flight it becomes a gap. Times keep their values,
-so that those in messages are those of the recording.
+Rows on the ground or in the hand, glitches and frozen estimates are left out. The log's notes and warnings report them.
+Within the flight they leave a gap. Times keep their values, so times in messages are those of the recording.
 """
 
 from __future__ import annotations
@@ -16,34 +16,34 @@ from cfb_mjx.logs import rotation
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.gaps import changes, runs
 
-_CARRIES = 0.5  # of the command in hover: with less for longer than a flip lasts nothing flies
-_FLIP = 0.7  # s: a drone in the air may fall this long with its motors low
-_CLEAR = 0.1  # m above where it stood: off the ground
-_SETTLED = 0.3  # s after it left the ground and before it came back: air flow and feet are not those of flight
-_SHORTEST = 0.2  # s: a stretch of flight shorter than this tells nothing
-_LEAP = 0.3  # m by which a position leaps against what the velocity says: no estimate of a flight does
-_BACK = 1.0  # s within which an excursion of the motion capture comes back
-_FROZEN = 0.15  # s that an estimate may stay the same to the last bit
-_FAR = 60.0  # usual bends of a signal from which a single value sticks out, if it is at least so far off:
+_CARRIES = 0.5  # share of the hover command below which, for longer than a flip, the drone is not flying
+_FLIP = 0.7  # s, longest time with low motors in flight
+_CLEAR = 0.1  # m above the floor from which the drone is off the ground
+_SETTLED = 0.3  # s left out after take-off and before landing, because of ground effect and contact
+_SHORTEST = 0.2  # s, shortest stretch of flight that is kept
+_LEAP = 0.3  # m, deviation of a step of the position from the velocity's prediction that counts as a jump
+_BACK = 1.0  # s within which a jump of the motion capture may jump back
+_FROZEN = 0.15  # s that an estimate may stay exactly the same
+_FAR = 60.0  # a spike exceeds the typical second difference of the signal by this factor, and these absolute limits:
 _STICKS_OUT = {"position": 0.05, "velocity": 0.3, "quaternion": 0.05, "body_rate": 2.0, "specific_force": 15.0}
-_RARELY = 0.2  # a fault in more than this share of the rows is no fault but what such a file is like
-_UNDER_COMMAND = 0.15  # of full: a brushless rotor turns at a third of its speed
-_SPIN_UP = 0.1  # s after which a motor under command has left standstill
+_RARELY = 0.2  # what occurs in a larger share of the rows is a property of the file, not a fault
+_UNDER_COMMAND = 0.15  # command from which a rotor must turn; a brushless one reaches a third of its speed
+_SPIN_UP = 0.1  # s after which a motor under command turns
 
 
 def flown_part(log: FlightLog, path: Path, keep_ground: bool = False) -> FlightLog:
-    """The log without rows that are no measured flight; notes and warnings say what was left out.
+    """The log without rows that are not measured flight. Its notes and warnings report what was left out.
 
     Args:
         log: as read, not yet validated.
-        path: named in messages.
-        keep_ground: leave in what was recorded on the ground and in the hand.
+        path: the file, for messages.
+        keep_ground: keep rows recorded on the ground and in the hand.
 
     Raises:
-        CfbError: nothing of it is flight.
+        CfbError: the log contains no flight.
     """
     if len(log) < 2 or not (np.diff(log.time) > 0).all():
-        return log  # for `validate` to refuse
+        return log  # `validate` refuses it
     notes: list[str] = []
     warnings: list[str] = []
     log = _without_lost_readings(log, warnings)
@@ -51,9 +51,9 @@ def flown_part(log: FlightLog, path: Path, keep_ground: bool = False) -> FlightL
         log = _airborne(log, path, notes)
     if not all(np.isfinite(getattr(log, f)).all() for f in ("position", "velocity", "quaternion")):
         return log
-    log = _without(log, _leaps(log), "the position leaps by more than the velocity allows", warnings)
-    log = _without(log, _spikes(log), "single rows stick out of both their neighbours", warnings)
-    log = _without(log, _frozen(log), "position, velocity and attitude stay the same to the last bit", warnings)
+    log = _without(log, _leaps(log), "the position jumps by more than the velocity allows", warnings)
+    log = _without(log, _spikes(log), "single rows differ strongly from both their neighbours", warnings)
+    log = _without(log, _frozen(log), "position, velocity and attitude stay exactly the same", warnings)
     if not notes and not warnings:
         return log
     said = {"notes": notes, "warnings": warnings}
@@ -61,16 +61,16 @@ def flown_part(log: FlightLog, path: Path, keep_ground: bool = False) -> FlightL
 
 
 def without_spans(log: FlightLog, spans: Sequence[str], path: Path) -> FlightLog:
-    """The log without the rows that a user wants left out.
+    """The log without the spans that a user wants left out.
 
     Args:
         log: as read.
-        spans: ``A:B`` leaves out the rows from A to B, both included, in s as the log's times count; ``:B`` all up to
-            B, ``A:`` all from A on.
-        path: named in messages.
+        spans: ``A:B`` leaves out the rows from A to B (s, in the log's own time, both included); ``:B`` all up to B,
+            ``A:`` all from A on.
+        path: the file, for messages.
 
     Raises:
-        CfbError: a span that is none, or in which the log has no rows; too little remains.
+        CfbError: a span is invalid or contains no rows, or fewer than two rows remain.
     """
     gone = np.zeros(len(log), dtype=bool)
     for span in spans:
@@ -97,21 +97,19 @@ def without_spans(log: FlightLog, spans: Sequence[str], path: Path) -> FlightLog
 
 
 def _without_lost_readings(log: FlightLog, warnings: list[str]) -> FlightLog:
-    """A rotor under command does not stand still: a reading of 0 there is none."""
+    """Replace rotor speeds of 0 under command by NaN: the rotor must be turning, so they are lost readings."""
     if log.rotor_speed is None:
         return log
     on = log.command > _UNDER_COMMAND
     row = np.arange(len(log))[:, None]
-    # The last row without command, or before the log: how long each motor has been under it.
+    # Time since each motor's last row without command; infinite if it has had a command since the first row.
     off = np.maximum.accumulate(np.where(on, -1, row), axis=0)
     since = np.where(off >= 0, log.time[:, None] - log.time[np.maximum(off, 0)], np.inf)
     lost = (log.rotor_speed == 0) & on & (since > _SPIN_UP)
     if not lost.any():
         return log
     told = ", ".join(f"motor {m + 1} {lost[:, m].mean():.1%}" for m in range(4) if lost[:, m].any())
-    warnings.append(
-        f"rotor speeds of 0 under command are lost readings and became NaN: {told} of the rows are such dead readings."
-    )
+    warnings.append(f"rotor speeds of 0 under command are dead readings and became NaN: {told} of the rows.")
     return log.replace(rotor_speed=np.where(lost, np.nan, log.rotor_speed))
 
 
@@ -119,7 +117,7 @@ def _airborne(log: FlightLog, path: Path, notes: list[str]) -> FlightLog:
     command, z = log.command.mean(axis=1), log.position[:, 2]
     top = float(np.percentile(command, 95))
     if top <= 0:
-        raise CfbError(f"{path}: the motors are off throughout, so nothing of it is flight; --keep-ground reads it.")
+        raise CfbError(f"{path}: the motors are off throughout, so there is no flight in it; --keep-ground reads it.")
     carries = command >= _CARRIES * float(np.median(command[command > 0.3 * top]))
     flies, stood = carries.copy(), []
     for start, stop in runs(~carries):
@@ -145,8 +143,8 @@ def _airborne(log: FlightLog, path: Path, notes: list[str]) -> FlightLog:
         return log
     if not keep.any():
         raise CfbError(
-            f"{path}: nothing of it is flight: the motors are low or the drone stays where it stood; --keep-ground "
-            "reads it all the same."
+            f"{path}: there is no flight in it: the motors are low, or the drone does not leave the ground; "
+            "--keep-ground reads it anyway."
         )
     gone = log.duration - float(sum(log.time[b - 1] - log.time[a] for a, b in runs(keep)))
     notes.append(
@@ -157,7 +155,7 @@ def _airborne(log: FlightLog, path: Path, notes: list[str]) -> FlightLog:
 
 
 def _leaps(log: FlightLog) -> np.ndarray:
-    """Rows between a leap of the position and the leap back, or beside one that stays."""
+    """Rows between a jump of the position and the jump back, or next to a jump that stays."""
     bad = np.zeros(len(log), dtype=bool)
     new = np.flatnonzero(changes(log.position))
     if len(new) < 3:
@@ -180,7 +178,7 @@ def _leaps(log: FlightLog) -> np.ndarray:
 
 
 def _spikes(log: FlightLog) -> np.ndarray:
-    """Rows in which one value is far from the two beside it, which agree: a bad packet, a changed digit."""
+    """Rows in which a value differs strongly from its two neighbours, which agree: a bad packet, a changed digit."""
     bad = np.zeros(len(log), dtype=bool)
     if len(log) < 20:
         return bad
@@ -188,7 +186,7 @@ def _spikes(log: FlightLog) -> np.ndarray:
         values = getattr(log, field)
         if not np.isfinite(values).all():
             continue
-        if field == "quaternion":  # whose sign may jump
+        if field == "quaternion":  # its sign may change from row to row
             if np.linalg.norm(values, axis=1).min() < 0.5:
                 continue
             values = rotation.tidy(values)
@@ -201,12 +199,12 @@ def _spikes(log: FlightLog) -> np.ndarray:
 
 
 def _frozen(log: FlightLog) -> np.ndarray:
-    """Rows in which a whole estimate repeats for far longer than it usually does."""
+    """Rows in which the whole estimate stays constant for much longer than usual."""
     estimate = np.concatenate([log.position, log.velocity, log.quaternion], axis=1)
     same = ~changes(estimate)
     bad = np.zeros(len(log), dtype=bool)
     held = [(a, b, log.time[b - 1] - log.time[a - 1]) for a, b in runs(same) if a > 0]
-    # Where it is held between packets of its own, most rows repeat.
+    # If the estimate has packets of its own at a lower rate, many rows repeat it.
     usual = float(np.median([length for *_, length in held])) if same.mean() > _RARELY else 0.0
     for start, stop, length in held:
         bad[start:stop] = length > max(_FROZEN, 5 * usual)

@@ -1,8 +1,8 @@
-"""Reader of MCAP files whose messages are JSON or protobuf, as Foxglove's tools and people's own recorders write them.
+"""Reader of MCAP files with JSON or protobuf messages, written by Foxglove's tools or by other recorders.
 
-Numbers of all messages are taken by name: ``/cf1/imu`` with ``{"angular_velocity": {"x": ..}}`` holds
-``cf1.imu.angular_velocity.x``. Poses, transforms, velocities and IMU readings in the usual fields are known by them,
-firmware variables by their names wherever these stand; for names of one's own a mapping is proposed, as for tables.
+The numbers of all messages are named by topic and field: ``/cf1/imu`` with ``{"angular_velocity": {"x": ..}}`` gives
+``cf1.imu.angular_velocity.x``. Poses, transforms, velocities and IMU readings are recognised by the usual field names,
+firmware variables by their names anywhere in a message. For unknown names a mapping is proposed, as for tables.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from cfb_mjx.logs.tabular import Table
 from cfb_mjx.logs.variables import MissingNames, VariableMap, load_mapping
 
 _STAMP = re.compile(r"(?:.*\.)?(?:timestamp|stamp|time)\.(?P<part>n(?:ano)?(?:sec|s)\w*|sec\w*|secs)")
-# Where fields of common messages end, and what they are called in `configs/logs/crazyflie.yaml`.
+# Endings of the fields of common messages, and their names in `configs/logs/crazyflie.yaml`.
 _KNOWN = (
     (re.compile(r"(?:.*\.)?(?:position|translation)\.([xyz])"), "pose.{}"),
     (re.compile(r"(?:.*\.)?(?:orientation|rotation)\.([wxyz])"), "pose.q{}"),
@@ -36,12 +36,12 @@ _KNOWN = (
     (re.compile(r"(?:.*\.)?(?:angular_velocity|body_rate)\.([xyz])"), "imu.w{}"),
     (re.compile(r"(?:.*\.)?(?:linear_acceleration|specific_force)\.([xyz])"), "imu.a{}"),
 )
-_LONGEST = 64  # numbers of one array: longer ones are images and point clouds
-_OVERTAKING = 0.1  # s by which messages may overtake each other on their way into the file
+_LONGEST = 64  # longest array that is read; longer ones are images and point clouds
+_OVERTAKING = 0.1  # s by which messages may arrive out of order in the file
 
 
 def recognises(path: str | os.PathLike) -> bool:
-    """Whether an MCAP holds JSON or protobuf messages of others; this library's own files are none."""
+    """Whether an MCAP holds JSON or protobuf messages and was not written by this library."""
     data = read_bytes(path)
     known = data[-(1 << 16) :] if data.endswith(mcap_stream.MAGIC) else data[: 1 << 16]
     return b"cfb_mjx." not in known and (b"json" in known or b"protobuf" in known)
@@ -50,15 +50,18 @@ def recognises(path: str | os.PathLike) -> bool:
 def read_foxglove(path: str | os.PathLike, mapping: str | os.PathLike | VariableMap | None = None) -> FlightLog:
     """Read a flight from JSON or protobuf messages. `read_log` also validates the content.
 
-    Messages of one topic with the same fields form a stream; streams are merged onto the rows of the gyro. A message's
-    time is that of its own ``timestamp`` or ``header.stamp``, else that of its recording.
+    Messages of one topic with the same fields form a stream; streams are merged onto the rows of the gyro. The time of
+    a message is its ``timestamp`` or ``header.stamp``, or else the time of recording.
 
     Args:
         path: the MCAP file.
-        mapping: which number is which column; a mapping file, or None for ``configs/logs/crazyflie.yaml``.
+        mapping: assigns numbers to columns of the log; a mapping file, or None for ``configs/logs/crazyflie.yaml``.
+
+    Returns:
+        The log, not yet validated.
 
     Raises:
-        UnknownNames: names of its own, for which a mapping can be proposed.
+        UnknownNames: the messages have unknown names, for which a mapping can be proposed.
         CfbError: damaged file, messages that do not fit their description, several topics with a pose, time that goes
             back, required signals that were not recorded.
     """
@@ -80,14 +83,14 @@ def read_foxglove(path: str | os.PathLike, mapping: str | os.PathLike | Variable
         if proposal is None:
             raise
         raise UnknownNames(
-            f"{path}: its messages have names of their own, which look like {', '.join(proposal.fields)}; cfb import "
-            "writes a mapping to check, to be given with --mapping FILE.",
+            f"{path}: its messages have unknown names, which look like {', '.join(proposal.fields)}; cfb import writes "
+            "a proposed mapping: check it, then give it with --mapping FILE.",
             proposal.text,
         ) from error
 
 
 def _streams(data: bytes, path: Path, notes: list[str], warnings: list[str]) -> list[Stream]:
-    """One stream per topic and set of fields, in s since the first message."""
+    """One stream per topic and set of fields, with the time since the first message, s."""
     groups: dict[tuple[str, tuple[str, ...]], list[tuple[int, list[float]]]] = {}
     unstamped: set[str] = set()
     for message in mcap_stream.messages(data, path, warnings, _decoder):
@@ -101,7 +104,7 @@ def _streams(data: bytes, path: Path, notes: list[str], warnings: list[str]) -> 
             group.append((logged if stamp is None else stamp, list(values.values())))
     if unstamped:
         listed = ", ".join(sorted(unstamped))
-        notes.append(f"{listed}: messages without a time of their own; that of their recording was used.")
+        notes.append(f"{listed}: messages without a time of their own; the time of recording was used.")
     if not groups:
         raise CfbError(
             f"{path}: the MCAP file holds no JSON or protobuf messages with numbers; record the flight again."
@@ -119,7 +122,7 @@ def _streams(data: bytes, path: Path, notes: list[str], warnings: list[str]) -> 
 
 
 def _decoder(channel: Any, schema: Any) -> Callable[[bytes], dict[str, float]] | None:
-    """Numbers by name of a channel's messages."""
+    """Decoder of a channel's messages to numbers by name; None for an encoding that is not read."""
     if channel.message_encoding == "json":
         parse = json.loads
     elif channel.message_encoding == "protobuf" and schema is not None:
@@ -136,7 +139,7 @@ def _decoder(channel: Any, schema: Any) -> Callable[[bytes], dict[str, float]] |
 
 
 def _collect(value: Any, name: str, out: dict[str, float]) -> None:
-    """Numbers of a message by the names of the fields that lead to them."""
+    """Collect the numbers of a message in ``out``, keyed by the path of field names."""
     if isinstance(value, bool | int | float):
         out[name] = float(value)
     elif isinstance(value, dict):
@@ -153,7 +156,7 @@ def _collect(value: Any, name: str, out: dict[str, float]) -> None:
 
 
 def _stamp(numbers: dict[str, float]) -> int | None:
-    """The message's own time, ns."""
+    """The message's own time stamp, ns; None if it has none."""
     parts: dict[str, int] = {}
     for name, value in numbers.items():
         match = _STAMP.fullmatch(name)
@@ -165,10 +168,10 @@ def _stamp(numbers: dict[str, float]) -> int | None:
 
 
 def _with_known_names(streams: list[Stream], mapping: VariableMap, path: Path, guess: bool) -> list[Stream]:
-    """Streams whose numbers have the mapping's names besides their own, where their fields or their names tell them.
+    """The streams, with recognised numbers also under the mapping's names.
 
     Raises:
-        CfbError: two topics hold the same, and ``guess`` says that no mapping of the user's decides.
+        CfbError: two topics hold the same quantity, and there is no user's mapping (``guess``) that chooses one.
     """
     out: list[Stream] = []
     homes: dict[str, str] = {}
@@ -179,13 +182,13 @@ def _with_known_names(streams: list[Stream], mapping: VariableMap, path: Path, g
             told = next((word.format(m[1]) for p, word in _KNOWN if (m := p.fullmatch(name))), None)
             if (told := firmware.get(name, told)) is not None:
                 known.setdefault(told, []).append(name)
-        # Two of the same in one message are a pose and its set-point.
+        # A quantity that occurs twice in one message is ambiguous, for example a pose and its set-point.
         clear = {told: names[0] for told, names in known.items() if len(names) == 1}
         for told, name in clear.items():
             if homes.setdefault(told, stream.name) != stream.name and guess:
                 raise CfbError(
                     f"{path}: {homes[told]} and {stream.name} both hold {told}; say which is the drone's with "
-                    f"--mapping FILE, where {name} is the name of the latter."
+                    f"--mapping FILE, in which {name} is the name of the latter."
                 )
         values = stream.values | {told: stream.values[name] for told, name in clear.items()}
         out.append(Stream(stream.name, stream.time, values))
@@ -193,7 +196,7 @@ def _with_known_names(streams: list[Stream], mapping: VariableMap, path: Path, g
 
 
 def _table(streams: list[Stream]) -> Table:
-    """All numbers on the rows of the longest stream, each held: what names are told from."""
+    """All numbers, held, on the rows of the longest stream, as input for a proposed mapping."""
     longest = max(streams, key=lambda s: len(s.time))
     table = Table({"t": longest.time})
     for stream in streams:

@@ -1,4 +1,4 @@
-"""What a gap in the samples is, for every kind of recording."""
+"""Definition of a gap in the samples, for every kind of recording, and helpers for runs of rows."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 def longest_step(interval: float) -> float:
-    """Two rows further apart than this, s, have a gap between them: three nominal intervals + 0.5 ms."""
+    """Longest step between two rows without a gap, s: three nominal intervals + 0.5 ms."""
     return 3.0 * interval + 0.5e-3
 
 
@@ -19,11 +19,11 @@ def stretches(time: np.ndarray, longest: float) -> list[slice]:
 
 
 def changes(values: np.ndarray) -> np.ndarray:
-    """Which rows of (n, columns) differ from the one before; the first does."""
+    """(n,) mask of the rows of (n, columns) that differ from the row before; the first row counts as different."""
     return np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
 
 
 def runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """First row of every run of true values, and the row behind its last."""
+    """Runs of true values, each as its first row and the row after its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]

@@ -1,4 +1,4 @@
-"""The gate behind every reader: a log that contradicts itself is named, with the change that mends it."""
+"""Verdict on a log: whether its signals contradict each other, and which change of convention makes them agree."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ from cfb_mjx.logs.fixes import TIMES, Fix, candidates, fix_of, motor_fixes
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.gaps import changes
 
-_ROWS = 6000  # of a long log that decide: the liveliest stretch
-_UNTOLD, _GONE = 0.5, 2.0  # cost of an axis that moved before a change and does not after it, or cannot be compared
-_SHORT, _RUSHED, _FARTHER = 1.0, 5.0, 0.1  # s that are too short to compare; ratio; m
-_DISORDER = 0.2  # share of rows whose position leaps
-_UNIT = 0.13  # by which a slope may be off after a change of unit: estimators stretch velocities by a tenth
-_MUCH = 1.5  # of the cost that a change takes off without mending all
-_ALIKE = 0.1  # changes that leave about as little are told as alternatives
-_PAIRS = 3  # of the best single changes are tried with a second one
-_MOTORS_TELL = 0.6
+_ROWS = 6000  # rows of a long log, those with the most motion, on which changes are tried
+_UNTOLD, _GONE = 0.5, 2.0  # cost of an axis that a change makes immobile, or impossible to compare
+_SHORT, _RUSHED, _FARTHER = 1.0, 5.0, 0.1  # s below which a log is too short to compare; ratio of distances; m
+_DISORDER = 0.2  # share of rows at which the position jumps
+_UNIT = 0.13  # tolerance of a slope after a change of unit, because estimators are off by a tenth in velocity
+_MUCH = 1.5  # least reduction of the cost by a change that does not resolve every contradiction
+_ALIKE = 0.1  # changes within this cost of the best one are given as alternatives
+_PAIRS = 3  # number of the best single changes that are tried together with a second one
+_MOTORS_TELL = 0.6  # correlation from which the motors are judged
 _NAMES = {
     "displacement": "the position moves {slope:.2f} times as far along {axis} as the velocity says",
     "attitude": "the attitude turns {slope:.2f} times as fast about {axis} as the gyro says",
     "velocity": "the velocity changes {slope:.2f} times as much along {axis} as the accelerometer says",
-    "gravity": "the specific force ax ay az reads {slope:.3g} g upwards in the mean",
+    "gravity": "the specific force ax ay az reads {slope:.3g} g upwards on average",
     "upright": "the specific force along z has a median of {slope:.3g} g (body axes are forward, left, up)",
-    "drag": "the accelerometer says that the air pushes along {axis} the way the drone moves, or across it",
+    "drag": "the accelerometer says that the air pushes the drone along {axis} in the direction of motion, or across",
 }
 
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """What the signals of a log say about each other.
+    """Result of comparing the signals of a log with each other.
 
     Attributes:
-        relations: of pose, velocity, gyro, accelerometer.
-        agreement: mean correlation of roll and pitch with the motors as they stand, by ``rotor_speed`` and
-            ``command``; what does not tell is left out.
-        problem: the contradiction, as half a sentence; None where there is none.
-        remedy: changes that make all agree; empty where none was found.
-        alternatives: other changes that do so as well.
-        left: how many comparisons still disagree with the remedy.
-        certain: that it is a fault though no change mends it.
+        relations: comparisons of pose, velocity, gyro and accelerometer.
+        agreement: mean correlation of roll and pitch with the motors in their present order, for ``rotor_speed`` and
+            ``command``; without the one that has no data.
+        problem: the contradiction, as a clause; None if there is none.
+        remedy: changes that make the signals agree; empty if none was found.
+        alternatives: other changes that do so too.
+        certain: whether the log is refused even without a remedy.
+        left: number of comparisons that still disagree after the remedy.
     """
 
     relations: list[Relation]
@@ -55,22 +55,22 @@ class Verdict:
     left: int = 0
 
     def sentence(self) -> str:
-        """The problem and what to do, without a full stop."""
+        """The problem and the remedy, without a full stop."""
         if not self.remedy:
             return str(self.problem)
         words = ", and ".join(fix.words for fix in self.remedy)
         flags = " ".join(f"--fix {fix.name}" for fix in self.remedy)
         others = "".join(f"; --fix {fix.name} would too" for fix in self.alternatives)
-        all_but = f"all signals agree but for {self.left} comparisons" if self.left else "all signals agree"
+        all_but = f"all signals agree except in {self.left} comparisons" if self.left else "all signals agree"
         return f"{self.problem}; {words}: that makes {all_but} ({flags} does it{others})"
 
     def report(self) -> dict:
-        """In JSON terms."""
+        """The comparisons as JSON-compatible values."""
         rows = [dataclasses.asdict(r) | {"contradicts": r.contradicts} for r in self.relations]
         return {"relations": rows, "motors": self.agreement}
 
     def summary(self) -> str:
-        """One line: what agrees, and what moves too little to tell."""
+        """One line: the signals that agree, and those with too little motion to be judged."""
         agree, gentle = {}, {}
         for r in self.relations:
             if r.name not in ("gravity", "upright", "drag") and not r.contradicts:
@@ -82,7 +82,7 @@ class Verdict:
         text = f"signals agree: {', '.join(said)}" if said else "signals: nothing moves enough to compare them"
         rest = [f"{name} {' '.join(axes)}" for name, axes in gentle.items()]
         rest += [] if motors or self.problem else ["motors"]
-        return f"{text}; too gentle to tell: {', '.join(rest)}" if rest and said else text
+        return f"{text}; too little motion to compare: {', '.join(rest)}" if rest and said else text
 
 
 def judge(log: FlightLog) -> Verdict:
@@ -98,7 +98,7 @@ def judge(log: FlightLog) -> Verdict:
         if not remedy:
             problem += consistency.when(log, max(bad, key=lambda r: r.unexplained))
         if heavy and not remedy:
-            problem += "; give what the accelerometer reads, gravity included, in m/s^2"
+            problem += "; give the accelerometer's reading, gravity included, in m/s^2"
         return Verdict(relations, {}, problem, remedy, alternatives, heavy, left)
     if (rushed := _rushed(log)) is not None:
         return Verdict(relations, {}, *rushed, certain=True)
@@ -108,7 +108,7 @@ def judge(log: FlightLog) -> Verdict:
 
 
 def _independent(log: FlightLog, relations: list[Relation]) -> list[Relation]:
-    """Without those between a signal and what was derived from it."""
+    """The relations without those between a derived signal and its source."""
     made = log.metadata.get("variables") or {}
     derived = {name for field, name in _OF.items() if "derived" in (made.get(field) or {})}
     return [r for r in relations if r.name not in derived]
@@ -118,7 +118,7 @@ _OF = {"velocity": "displacement", "body_rate": "attitude", "specific_force": "v
 
 
 def _worst(bad: list[Relation]) -> str:
-    # Gravity first, it is the plainest.
+    # Gravity first, because it is the easiest to understand.
     worst = max(bad, key=lambda r: (r.name in ("gravity", "upright"), r.name == "upright", min(r.unexplained, 4.0)))
     text = _NAMES[worst.name].format(slope=worst.slope, axis=worst.axis)
     if worst.name not in ("gravity", "upright"):
@@ -136,7 +136,10 @@ def _liveliest(log: FlightLog) -> FlightLog:
 
 
 def _cost(relations: list[Relation], moved: frozenset) -> tuple[float, int]:
-    """How little the relations agree, and how many contradict."""
+    """Cost of the disagreement between signals, and the number of contradictions.
+
+    ``moved`` has the axes that moved before a change: one that no longer moves, or is gone, adds to the cost.
+    """
     cost = sum(min(r.unexplained, 2.0) for r in relations if r.moves)
     there = {(r.name, r.axis) for r in relations}
     still = moved & {(r.name, r.axis) for r in relations if r.moves and r.name != "drag"}
@@ -146,9 +149,13 @@ def _cost(relations: list[Relation], moved: frozenset) -> tuple[float, int]:
 
 
 def _remedy(log: FlightLog) -> tuple[tuple[Fix, ...], tuple[Fix, ...], int]:
-    """Changes that make signals agree, others that do as well, and how many comparisons still disagree.
+    """Search for the change that makes the signals agree.
 
-    One change that mends all, else two; else the one that mends most, if that is much.
+    First a single change that resolves all contradictions, then a pair; else the best single change, if it reduces the
+    cost considerably.
+
+    Returns:
+        The change or changes, alternatives, and the number of comparisons that still disagree.
     """
     relations = consistency.kinematics(log)
     moved = frozenset((r.name, r.axis) for r in relations if r.moves)
@@ -168,13 +175,14 @@ def _remedy(log: FlightLog) -> tuple[tuple[Fix, ...], tuple[Fix, ...], int]:
     best, least = found[0]
     part = best[-1].name.split("=")[0]
     others = [f[0] for f, cost in found[1:] if len(best) == 1 and cost < least + _ALIKE]
-    # Of another part, or another unit of the same: a velocity that is 10 % off is feet or kilometres an hour.
+    # Changes of another signal, or another unit of the same: similar factors (ft/s, km/h) may fit equally well.
     others = [fix for fix in others if fix.name.split("=")[0] != part or part.endswith("-unit")]
     others = [fix for fix in others if part.endswith("-unit") or fix.name.split("-")[0] != part.split("-")[0]]
     return best, tuple(others[:2]), 0
 
 
 def _tried(log: FlightLog, moved: frozenset) -> list[tuple[float, int, Fix, int]]:
+    """Cost, number of contradictions, change and its rank, for every candidate."""
     found = []
     for rank, fix in enumerate(candidates()):
         if not fix.name.startswith("command"):
@@ -186,7 +194,7 @@ def _tried(log: FlightLog, moved: frozenset) -> list[tuple[float, int, Fix, int]
 
 
 def _exact(fix: Fix, relations: list[Relation]) -> bool:
-    """Whether a change of scale brings slopes to one: a sensor that is 40 % off is a fault to find, not knots."""
+    """Whether a change of scale brings the slopes to one. If not, the sensor has a scale error, not another unit."""
     if "unit" not in fix.name and "scale" not in fix.name:
         return True
     compared = [r for r in relations if r.moves and r.name in ("displacement", "attitude", "velocity")]
@@ -194,7 +202,7 @@ def _exact(fix: Fix, relations: list[Relation]) -> bool:
 
 
 def _rushed(log: FlightLog) -> tuple[str, tuple[Fix, ...]] | None:
-    """A log too short to compare, whose path is many times as long as its velocities allow: time in another unit."""
+    """Detect time in a wrong unit in a log too short to compare: it moves much further than its velocities allow."""
     if log.duration > _SHORT or len(log) < 20:
         return None
     steps = np.diff(log.time)[:, None]
@@ -209,25 +217,25 @@ def _rushed(log: FlightLog) -> tuple[str, tuple[Fix, ...]] | None:
 
 
 def _disorder(log: FlightLog) -> str | None:
-    """Rows that do not follow each other: the position leaps everywhere."""
+    """Detect rows that are not in order of time: the position jumps everywhere."""
     step = np.diff(log.time)
     moved = np.linalg.norm(np.diff(log.position, axis=0), axis=1)
     speed = np.linalg.norm(log.velocity[1:] + log.velocity[:-1], axis=1) / 2
     reach = float(np.linalg.norm(np.ptp(log.position, axis=0)))
     leaps = (moved > 20 * speed * step + 0.02 * reach) & (moved > 0.01)
-    # A unit that is wrong stretches all steps alike, and leaves the path smooth.
+    # A wrong unit scales all steps equally, so the path stays smooth.
     bend = np.linalg.norm(np.diff(log.position, n=2, axis=0), axis=1)
     rough = float(np.median(bend)) > 0.5 * float(np.median(moved)) and float(np.median(moved)) > 0.02 * reach
     if leaps.mean() < _DISORDER or not rough:
         return None
     return (
-        f"the position leaps in {leaps.mean():.0%} of the rows, so rows do not stand in order of time; sort them by it"
+        f"the position jumps in {leaps.mean():.0%} of the rows, so the rows are not in order of time; sort them by time"
     )
 
 
 def _repeated(log: FlightLog) -> str | None:
-    """Rows that come again, to the last bit: a copy pasted behind the original, or rows out of order."""
-    # Of one attitude's two quaternions the same: a copy may have got the other sign.
+    """Detect rows that repeat earlier rows exactly: a part of the log was pasted twice, or rows are out of order."""
+    # Make w positive, because a copy may have the other of the two quaternions of an attitude.
     q = log.quaternion * np.where(log.quaternion[:, :1] < 0, -1.0, 1.0)
     rows = np.concatenate([log.position, log.velocity, q, log.body_rate, log.specific_force], axis=1)
     kept = np.flatnonzero(changes(rows))
@@ -254,7 +262,7 @@ def _judge_motors(log: FlightLog, relations: list[Relation]) -> Verdict:
         found = consistency.agreement(log, source)
         if found:
             agreement[source] = found[ORDER, 1]
-            # Inverted commands turn the drone as another order does; only its thrust tells them apart.
+            # Inverted commands act on roll and pitch like another order; only the thrust distinguishes the two.
             likely = -1 if motor_checks.heaves_against(log, source) else 1
             best = max(found, key=lambda key: (round(found[key], 3), key[1] * likely))
             if found[best] > _MOTORS_TELL and found[best] - found[ORDER, 1] > motor_checks.BETTER:
@@ -262,8 +270,8 @@ def _judge_motors(log: FlightLog, relations: list[Relation]) -> Verdict:
     for source, ((order, sign), value) in moving.items():
         what = "rotor speeds" if source == "rotor_speed" else "commands"
         problem = (
-            f"roll and pitch do not follow from the {what} as they stand (correlation {agreement[source]:.2f}; in "
-            f"another order {value:.2f})"
+            f"roll and pitch do not follow from the {what} in their present order (correlation "
+            f"{agreement[source]:.2f}; in another order {value:.2f})"
         )
         return Verdict(relations, agreement, problem, motor_fixes(order, sign))
     problem = motor_checks.implausible(log)

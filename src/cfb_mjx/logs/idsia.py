@@ -2,8 +2,8 @@
 
 Source: Busetto et al., "Nonlinear system identification for a nano-drone benchmark", Control Engineering Practice 172,
 2026, repository idsia-robotics/nanodrone-sysid-benchmark. A Crazyflie 2.1 Brushless with AI-deck and flow deck, 45 g.
-The data carry no licence; this module reads files the user has obtained and nothing of them is part of the library.
-docs/logs.md lists what each column really holds; every conversion below has its reason there.
+The data have no licence. This module reads files that the user has obtained; no data of them are part of the library.
+docs/logs.md describes the content of each column and explains every conversion below.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ POSITION, VELOCITY = ("x", "y", "z"), ("vx", "vy", "vz")
 QUATERNION = ("qw", "qx", "qy", "qz")  # stored scalar last; reading by name reorders
 GYRO, ACCELERATION = ("wx", "wy", "wz"), ("ax", "ay", "az")
 COMMAND = tuple(f"m{i}_thrust" for i in range(1, 5))
-# What the benchmark's own csv files call what its parquet files call STAMPS.
+# Names in the benchmark's csv files to the names in its parquet files (STAMPS).
 _STAMPS_OF_CSV = {
     "ros_timestamp": "ros_timestamp_x",
     "ros_timestamp_motors": "ros_timestamp_y",
@@ -34,35 +34,35 @@ STAMPS = ("ros_timestamp_x", "ros_timestamp_y", "ros_timestamp")  # state, motor
 COLUMNS = ("t", *POSITION, *VELOCITY, *QUATERNION, *GYRO, *ACCELERATION, *COMMAND, *ERPM, *STAMPS, "Vbat")
 
 PROCESSED = ("m1_rads", "rx")
-"""Columns that only the benchmark's processed files have: rotor speeds and a rotation vector."""
+"""Columns that exist only in the benchmark's processed files: rotor speeds and a rotation vector."""
 
 VEHICLE_MASS = 0.045  # kg, with both decks (the benchmark's description)
 RAD_PER_S_PER_ERPM = 2.0 * np.pi / 60.0 / 6.0  # 12 poles: 6 electrical turns per mechanical one
 ERPM_LIMIT, ERPM_INVALID = 1.75e5, 65535.0
 TAKE_OFF_HEIGHT, AFTER_TAKE_OFF, BEFORE_LANDING = 0.35, 1.0, 0.5  # m, s, s
-ACCELERATION_LIMIT, RATE_LIMIT = 60.0, 12.0  # m/s^2, rad/s: beyond these an estimator glitch, not flight
-# Pose and velocity lag the gyro of the same row: correlating the rate of turn of the quaternion with the gyro gives 6
-# to 10 ms (mean 7.7) on all eleven flights examined, the vertical velocity against the accelerometer 9 to 15 ms where
-# their packets carry one stamp. 8 ms, the default of the evaluation protocol, agrees with both.
+ACCELERATION_LIMIT, RATE_LIMIT = 60.0, 12.0  # m/s^2, rad/s; larger values are estimator glitches
+# Pose and velocity lag the gyro of the same row. The rate of the quaternion, correlated with the gyro, lags by 6 to
+# 10 ms (mean 7.7) on all eleven flights examined; the vertical velocity lags the accelerometer by 9 to 15 ms where
+# their packets have the same stamp. 8 ms, the default of the evaluation protocol, agrees with both.
 OBSERVATION_DELAY = 0.008  # s
-# Gyro behind rotor speed on the five flights whose state and motor packets carry identical stamps: 3.1 to 3.8 ms, the
-# delay of the measuring chain itself. What exceeds it is the packet shift, a whole number of samples.
+# Lag of the gyro behind the rotor speeds on the five flights whose state and motor packets have identical stamps: 3.1
+# to 3.8 ms, the delay of the measuring chain itself. The rest of a lag is the packet shift, a whole number of samples.
 CHAIN_LAG = 0.0035  # s
-HELD_RUN = 3  # held copies in a row that make a gap: dropping 3 of 100 Hz leaves 40 ms, just above the gap threshold
+HELD_RUN = 3  # shortest run of held copies that is dropped: 3 rows at 100 Hz leave 40 ms, just above the gap threshold
 
 
 def recognises(table: Table) -> bool:
-    """Whether the columns are those of the benchmark rather than of the tabular layout."""
+    """Whether the columns are those of the benchmark."""
     return "m1_thrust" in table and ("ros_timestamp_x" in table or "ros_timestamp_motors" in table)
 
 
 def read_idsia(path: str | os.PathLike, motor_shift: float | None = None) -> FlightLog:
-    """Read one flight of the benchmark, cut to the airborne part, time starting at 0.
+    """Read one flight of the benchmark, cut to the airborne part, with time starting at 0.
 
     Args:
         path: a parquet (or csv) file of the benchmark's raw merges.
-        motor_shift: s by which to delay the motor columns, rounded to whole samples; 0 leaves them as recorded;
-            None estimates it (`estimate_command_shift`) and leaves them when the estimate is not reliable.
+        motor_shift: delay of the motor columns, s, rounded to whole samples; 0 leaves them as recorded. None estimates
+            it (`estimate_command_shift`), and leaves them as recorded if the estimate is not reliable.
 
     Returns:
         The log. Metadata adds ``vehicle_mass``, ``alignment`` (estimate, what was applied) and ``cleaning`` (counts).
@@ -75,20 +75,20 @@ def read_idsia(path: str | os.PathLike, motor_shift: float | None = None) -> Fli
 
 
 def read_as_published(path: str | os.PathLike) -> FlightLog:
-    """A flight as the benchmark's own evaluation takes it: every row as it is, nothing cut, shifted or left out.
+    """Read a flight as the benchmark's own evaluation does: every row unchanged, nothing cut, shifted or left out.
 
     Args:
         path: one of the benchmark's processed files (``data/real/processed``), parquet or csv.
 
     Raises:
-        CfbError: unreadable file, missing columns, or a raw merge, which nobody has processed.
+        CfbError: unreadable file, missing columns, or an unprocessed raw merge.
     """
     path = Path(path)
     table = read_table(path)
     if not any(name in table for name in PROCESSED):
         raise CfbError(
-            f"{path}: is a raw merge of the benchmark, which its own evaluation does not take as it is; give a file of "
-            "data/real/processed, or leave out --official."
+            f"{path}: is a raw merge of the benchmark, but the benchmark's evaluation uses processed files; give a "
+            "file of data/real/processed, or leave out --official."
         )
     log, _ = _as_logged(table, path)
     alignment_of = {"applied": False, "applied_ms": 0.0, "chosen_by": "benchmark"}
@@ -103,7 +103,7 @@ def from_columns(table: Table, path: Path, motor_shift: float | None = None) -> 
 
 
 def _as_logged(table: Table, path: Path) -> tuple[FlightLog, Table]:
-    """Every row in this library's conventions, and the table with the packets' stamps under the names of `STAMPS`."""
+    """The log with every row, in this library's conventions, and the table with packet stamps named as in `STAMPS`."""
     if "ros_timestamp_motors" in table and "ros_timestamp_x" not in table:
         table = Table(
             {_STAMPS_OF_CSV.get(name, name): values for name, values in table.items()}, table.notes, table.warnings
@@ -155,7 +155,7 @@ def _as_logged(table: Table, path: Path) -> tuple[FlightLog, Table]:
 
 
 def _clean(log: FlightLog, held: np.ndarray, path: Path, motor_shift: float | None) -> FlightLog:
-    """Align the motor packets, drop held copies and glitches so that they become gaps, keep the airborne part."""
+    """Align the motor packets, drop held copies and glitches (they become gaps), and keep the airborne part."""
     airborne = _airborne(log, path)
     glitch = _glitches(log, held[:, 0])
     keep = airborne & ~_runs(held[:, 0], HELD_RUN) & ~_runs(held[:, 1], HELD_RUN) & ~glitch
@@ -171,7 +171,7 @@ def _clean(log: FlightLog, held: np.ndarray, path: Path, motor_shift: float | No
     samples = round(shift / log.nominal_interval)
     log = alignment.delay_by_samples(log, samples)
     state_held, motors_held, sensor_held = (_runs(held[:, i], HELD_RUN) for i in range(3))
-    # The motors' held copies move with them.
+    # Held copies of motor packets are shifted with the motor columns.
     motors_held = motors_held[np.clip(np.arange(len(held)) - samples, 0, len(held) - 1)]
     keep = airborne & ~(state_held | motors_held | sensor_held | glitch)
     first = log.time[np.argmax(airborne)]
@@ -217,7 +217,7 @@ def _airborne(log: FlightLog, path: Path) -> np.ndarray:
 
 
 def _glitches(log: FlightLog, state_held: np.ndarray) -> np.ndarray:
-    """Rows to drop around implausible jumps: one more row on each side, so that what remains is a gap."""
+    """Rows to drop because of implausible jumps, with one more row on each side so that a gap remains."""
     fresh = np.flatnonzero(~state_held)  # a held copy hides a step and doubles the next one
     jump = np.linalg.norm(np.diff(log.velocity[fresh], axis=0), axis=1) / np.diff(log.time[fresh]) > ACCELERATION_LIMIT
     bad = np.linalg.norm(log.body_rate, axis=1) > RATE_LIMIT
@@ -230,7 +230,7 @@ def _glitches(log: FlightLog, state_held: np.ndarray) -> np.ndarray:
 
 
 def _runs(mask: np.ndarray, length: int) -> np.ndarray:
-    """The part of ``mask`` that lies in runs of at least ``length`` true values."""
+    """The true values of ``mask`` that are in runs of at least ``length``."""
     out = np.zeros_like(mask)
     for start, stop in runs(mask):
         out[start:stop] = stop - start >= length

@@ -1,4 +1,4 @@
-"""Reading a flight log from MCAP with the message descriptions embedded in the file."""
+"""Read a flight log from MCAP, using the message descriptions embedded in the file."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ def read_mcap(path: str | os.PathLike) -> FlightLog:
     """Read a log that `write_mcap` wrote. `read_log` also validates the content.
 
     Raises:
-        CfbError: the file is missing, not an MCAP, cut short, damaged (checksums), holds other topics, or its topics
-            do not share one set of time stamps.
+        CfbError: the file is missing, not an MCAP, cut short, damaged (checksums), or holds other topics; or its
+            topics have different time stamps.
     """
     path = Path(path)
     data = read_bytes(path)
@@ -36,7 +36,7 @@ def read_mcap(path: str | os.PathLike) -> FlightLog:
     refuse_bombs(data, path)
     try:
         schemas, channels, payloads, record = _records(data)
-    except Exception as error:  # the MCAP library lets struct, codec and lookup errors of damaged bytes through
+    except Exception as error:  # on damaged bytes, the MCAP library raises struct, codec and lookup errors
         raise CfbError(f"{path}: the MCAP file is {_diagnosis(data, error)}; copy or export it again.") from None
     _check_origin(path, schemas, channels, record)
     try:
@@ -53,7 +53,7 @@ def read_mcap(path: str | os.PathLike) -> FlightLog:
 
 
 def _records(data: bytes):
-    """Channels, schemas, message payloads per topic in file order, and the log's metadata record; checks all CRCs."""
+    """Schemas, channels, message payloads per channel in file order, and the log's metadata record. Checks all CRCs."""
     from mcap.records import Channel, Message, Metadata, Schema
     from mcap.stream_reader import StreamReader
 
@@ -90,7 +90,7 @@ def _check_origin(path: Path, schemas: dict, channels: dict, record: dict) -> No
     if not ours or not record:
         listed = ", ".join(topics[:8]) + (", ..." if len(topics) > 8 else "") if topics else "none"
         raise CfbError(
-            f"{path}: this MCAP has topics {listed}; it was not written by cfb_mjx, export it to the tabular layout "
+            f"{path}: this MCAP has topics {listed}; it was not written by cfb_mjx. Export it to the tabular layout "
             "instead (see docs/logs.md)."
         )
     if record.get("format_version") != mcap_schema.FORMAT_VERSION:
@@ -109,7 +109,7 @@ def _check_origin(path: Path, schemas: dict, channels: dict, record: dict) -> No
 
 
 def _decode(schemas: dict, channels: dict, payloads: dict) -> dict[str, np.ndarray]:
-    """Per topic an (n, 2 + columns) list of rows: seconds, nanoseconds, values."""
+    """Topic to its (n, 2 + columns) table of rows: seconds, nanoseconds, values."""
     columns = {t.topic: t.columns for t in mcap_schema.TOPICS} | {mcap_schema.POSE: _POSE_COLUMNS}
     tables = {}
     for identifier, channel in channels.items():
@@ -143,7 +143,7 @@ def _assemble(path: Path, tables: dict[str, np.ndarray], metadata: dict) -> Flig
     fields = {t.field: tables[t.topic][:, 2:] for t in mcap_schema.TOPICS if t.topic in tables}
     if "battery_voltage" in fields:
         fields["battery_voltage"] = fields["battery_voltage"][:, 0]
-    # The file being read names the log; where the data first came from stays on record.
+    # The log is named after this file; ``origin`` keeps the file from which the data first came.
     origin = {k: metadata.get(k) for k in ("name", "source", "format")}
     metadata = {"origin": origin} | metadata | {"name": path.stem, "source": path.name, "format": "mcap"}
     return FlightLog(

@@ -1,7 +1,8 @@
-"""The topics of a flight log in MCAP and their protobuf messages, described in code (no generated files).
+"""Topics of a flight log in MCAP and their protobuf messages, defined in code (no generated files).
 
-The pose uses Foxglove's published message, field names and numbers as in https://github.com/foxglove/foxglove-sdk
-(schemas/proto/foxglove), so that Foxglove and rerun draw it. The other topics have one small message each.
+The pose uses Foxglove's published message, with the field names and numbers of
+https://github.com/foxglove/foxglove-sdk (schemas/proto/foxglove), so that Foxglove and rerun draw it. The other topics
+have one small message each.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Topic(NamedTuple):
 
 
 _XYZ, _MOTORS = ("x", "y", "z"), ("m1", "m2", "m3", "m4")
-POSE = "/pose"  # the only topic that carries two fields: position and quaternion
+POSE = "/pose"  # the only topic with two fields: position and quaternion
 TOPICS = (
     Topic("/velocity", "cfb_mjx.Velocity", "velocity", _XYZ, "world"),
     Topic("/body_rate", "cfb_mjx.BodyRate", "body_rate", _XYZ, "body"),
@@ -100,10 +101,10 @@ def descriptor_set(message: str) -> bytes:
 
 
 def message_class(name: str, descriptors: bytes) -> type[Any]:
-    """The Python class of a message from a serialised FileDescriptorSet, in a descriptor pool of its own.
+    """The Python class of a message from a serialised FileDescriptorSet, in a separate descriptor pool.
 
-    Raises:
-        Whatever protobuf raises for damaged or incomplete descriptors; the reader turns it into a `CfbError`.
+    For damaged or incomplete descriptors, protobuf raises errors of several types; the reader turns them into a
+    `CfbError`.
     """
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 

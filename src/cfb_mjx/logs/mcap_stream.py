@@ -1,4 +1,4 @@
-"""Messages of an MCAP file in file order, with its checksums, and what to say of a damaged one."""
+"""Read the messages of an MCAP file in file order, check its checksums, and report damage."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 from cfb_mjx.errors import CfbError
 
 MAGIC = b"\x89MCAP0\r\n"
-_LARGEST_CHUNK = 1 << 29  # bytes; writers make chunks of about a megabyte
+_LARGEST_CHUNK = 1 << 29  # bytes; writers usually make chunks of about a megabyte
 
 
 def refuse_bombs(data: bytes, path: Path) -> None:
-    """Refuse a chunk (record type 6) that would unpack to more than any recording of a flight holds."""
+    """Refuse a file with a chunk (record type 6) that would unpack to more than any recording of a flight."""
     position = len(MAGIC)
     while position + 9 <= len(data):
         kind, length = data[position], int.from_bytes(data[position + 1 : position + 9], "little")
@@ -27,7 +27,7 @@ def refuse_bombs(data: bytes, path: Path) -> None:
 
 
 def lacks_checksums(data: bytes) -> bool:
-    """Whether a chunk (record type 6) was written without the CRC of its content, or messages (5) outside chunks."""
+    """Whether a chunk (record type 6) has no CRC of its content, or messages (type 5) were written outside chunks."""
     position = len(MAGIC)
     while position + 9 <= len(data):
         kind, length = data[position], int.from_bytes(data[position + 1 : position + 9], "little")
@@ -39,7 +39,7 @@ def lacks_checksums(data: bytes) -> bool:
 
 
 class Decoded(NamedTuple):
-    """One message: its channel, the schema of it (None for some JSON), time of recording (ns) and content."""
+    """One message: channel, schema (None for some JSON), time of recording (ns) and decoded content."""
 
     channel: Any
     schema: Any
@@ -50,13 +50,13 @@ class Decoded(NamedTuple):
 def messages(
     data: bytes, path: Path, warnings: list[str], decoder_of: Callable[[Any, Any], Callable[[bytes], Any] | None]
 ) -> Iterator[Decoded]:
-    """Every message that can be decoded.
+    """Iterate over the messages that can be decoded.
 
     Args:
         data: content of the file.
-        path: named in messages.
-        warnings: told what was lost after something could be read.
-        decoder_of: for a channel and its schema what decodes its messages, None where they are not wanted.
+        path: the file, for messages.
+        warnings: receives what could not be read after the first message.
+        decoder_of: returns the decoder of a channel's messages, given channel and schema; None to skip the channel.
 
     Raises:
         CfbError: nothing could be read.
@@ -87,7 +87,7 @@ def messages(
                     content = decode(item.data)
                     read += 1
                     yield Decoded(channel, schema, item.log_time, content)
-    except Exception as error:  # the MCAP library lets struct, codec and lookup errors of damaged bytes through
+    except Exception as error:  # on damaged bytes, the MCAP library raises struct, codec and lookup errors
         reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
         kind = "cut short" if not data.endswith(MAGIC) else "damaged"
         if not read:

@@ -1,4 +1,4 @@
-"""Writing a flight log as MCAP: self-describing protobuf channels that Foxglove, rerun and this library open."""
+"""Write a flight log as MCAP: self-describing protobuf channels that Foxglove, rerun and this library can read."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ def write_mcap(log: FlightLog, path: str | os.PathLike) -> None:
     """Write a log as MCAP: chunked, zstd-compressed, with checksums. Values survive bit for bit, times to 1 ns.
 
     Args:
-        log: the flight. ``rotor_speed`` and ``battery_voltage`` become topics only when measured.
-        path: the file; an earlier one is replaced only when the new one is complete.
+        log: the flight. ``rotor_speed`` and ``battery_voltage`` are written only if they were measured.
+        path: the file. An existing file is replaced only when the new one is complete.
 
     Raises:
         CfbError: the folder is missing or the file cannot be written.
@@ -41,7 +41,7 @@ def write_mcap(log: FlightLog, path: str | os.PathLike) -> None:
 
 def _write_messages(writer, log: FlightLog) -> None:
     seconds, nanos = (a.tolist() for a in to_nanoseconds(log.time))
-    # MCAP's own clock is unsigned; a log that starts before zero is shifted there, its messages keep their time stamps.
+    # MCAP's log time is unsigned, so it is shifted for a log that starts before zero. Messages keep their time stamps.
     shift = -min(seconds[0], 0) if seconds else 0
     channels = [_pose_channel(writer, log)]
     channels += [_channel(writer, t, log) for t in mcap_schema.TOPICS if getattr(log, t.field) is not None]

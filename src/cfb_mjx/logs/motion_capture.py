@@ -1,8 +1,8 @@
-"""Where the drone was, by motion capture that was logged beside the estimate it flew by.
+"""Pose and velocity from motion capture that was logged together with the drone's own estimate.
 
-An estimate is not where the drone was. A Crazyflie's own turns some per cent further than its gyro and moves some per
-cent faster than its own position, where motion capture in the same files turns as the gyro does (docs/logs.md has the
-numbers). What a model is judged by, or fitted to, is better taken from there.
+The estimate differs from the true motion. A Crazyflie's estimate rotates some per cent further than its gyro and moves
+some per cent faster than its own position, whereas motion capture in the same files rotates as the gyro does
+(docs/logs.md has the numbers). For fitting and evaluating models, motion capture is therefore the better reference.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from cfb_mjx.logs.gaps import longest_step
 from cfb_mjx.logs.resample import interpolate
 
 POSITION, ATTITUDE = (0.045, 3), (0.025, 2)
-"""Half a span, s, over which a polynomial of this degree smooths the samples: a tenth of a second is how fast a
-Crazyflie's velocity changes, and an attitude changes twice as fast."""
+"""Half width of the smoothing window, s, and degree of the local polynomial. A Crazyflie's velocity changes within a
+tenth of a second, its attitude twice as fast."""
 JUMP = 0.1
-"""rad by which two samples turn otherwise than the gyro where markers were taken for others: ten times their noise."""
+"""Difference of the rotations by motion capture and gyro, rad, that means confused markers: ten times the noise."""
 LATEST, SPAN = 0.03, 0.1
-"""How late motion capture may be behind the gyro, s, and the span over which the two are compared, s."""
+"""Largest lag of motion capture behind the gyro, s, and the span over which the two are compared, s."""
 SLOWEST, FEWEST = 0.02, 100
-"""Interval of the samples, s, and their number."""
+"""Largest interval of the samples, s, and least number of samples."""
 UNLIKE = 0.2
-"""Unexplained share (as in `consistency.CONTRADICTS`) from which an attitude is not that of the gyro's body."""
+"""Unexplained share (as in `consistency.CONTRADICTS`) from which an attitude does not belong to the gyro's body."""
 TURNING = 0.03
-"""rad in `SPAN`, rms: what turns less does not tell where the markers' axes are."""
+"""Least rms rotation in `SPAN`, rad, for estimating the markers' axes."""
 SLOW = 0.3
-"""m/s: slower motion says little about how much too fast an estimate is."""
+"""Least rms horizontal velocity, m/s, for judging an estimate's velocity."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Capture:
-    """Samples of motion capture, on a log's clock.
+    """Samples of motion capture, on the clock of a log.
 
     Attributes:
         time: (m,) s, increasing.
-        position: (m, 3) m.
-        quaternion: (m, 4) scalar first.
+        position: (m, 3) m, world.
+        quaternion: (m, 4) ``[w, x, y, z]``, body to world.
     """
 
     time: np.ndarray
@@ -49,22 +49,23 @@ class Capture:
     quaternion: np.ndarray
 
     def only(self, keep: np.ndarray) -> Capture:
-        """Some of the samples."""
+        """The samples selected by a mask."""
         return Capture(self.time[keep], self.position[keep], self.quaternion[keep])
 
 
 def with_pose_of(log: FlightLog, capture: Capture) -> FlightLog:
-    """The log with pose and velocity by motion capture, smoothed; rows without enough samples about them go.
+    """The log with pose and velocity replaced by smoothed motion capture.
 
-    Samples that turn otherwise than the gyro (markers taken for others) are left out. The attitude is made that of
-    the gyro's axes, which markers seldom share. ``observation_delay`` becomes how late the samples are behind the gyro.
+    Samples that disagree with the gyro's rotation (confused markers) are left out, and rows without enough samples
+    around them are dropped. The attitude is rotated to the gyro's axes, with which the markers are rarely aligned.
+    ``observation_delay`` becomes the lag of the samples behind the gyro.
 
     Args:
-        log: with the drone's own pose.
-        capture: at least 50 Hz, so that a span of smoothing holds enough.
+        log: the flight, with the drone's own estimate of the pose.
+        capture: samples at 50 Hz or more, so that a smoothing window holds enough of them.
 
     Raises:
-        CfbError: too few samples with an attitude, an attitude that does not turn as the gyro, or no row left.
+        CfbError: too few samples with an attitude, an attitude that does not rotate as the gyro does, or no row left.
     """
     known = np.isfinite(capture.position).all(axis=1) & np.isfinite(capture.quaternion).all(axis=1)
     known &= np.abs(np.linalg.norm(capture.quaternion, axis=1) - 1) < 0.05
@@ -84,19 +85,21 @@ def with_pose_of(log: FlightLog, capture: Capture) -> FlightLog:
     gyro, seen = turns(log, turned, good, late, SPAN)
     if np.sum((seen - gyro) ** 2) > UNLIKE * np.sum(gyro**2 + seen**2) / 2 and _rms(gyro) > TURNING:
         raise CfbError(
-            f"{log.name}: the attitude by motion capture does not turn as the gyro does, so it is no attitude of the "
-            "drone; leave out --motion-capture to take the estimate."
+            f"{log.name}: the attitude by motion capture does not turn as the gyro does, so it is not the attitude of "
+            "the drone; leave out --motion-capture to take the estimate."
         )
     (position, velocity), placed = _smoothed(good.time, good.position, log.time, *POSITION)
     (quaternion, _), faced = _smoothed(good.time, good.quaternion, log.time, *ATTITUDE)
     rows = placed & faced
     if not rows.any():
-        raise CfbError(f"{log.name}: motion capture covers no row of the log; take the estimate.")
+        raise CfbError(
+            f"{log.name}: motion capture covers no row of the log; leave out --motion-capture to take the estimate."
+        )
     quaternion[~rows] = [1.0, 0.0, 0.0, 0.0]
     found = log.replace(position=position, velocity=velocity, quaternion=rotation.tidy(quaternion)).rows(rows)
     lost = f", {int((~rows).sum())} rows of the log have none" if not rows.all() else ""
     blind = f", {int((~known).sum())} without an attitude" if not known.all() else ""
-    wrong = f", {int((~keep).sum())} that turn otherwise than the gyro left out" if not keep.all() else ""
+    wrong = f", {int((~keep).sum())} that turn differently from the gyro left out" if not keep.all() else ""
     sits = ", ".join(f"{x + 0.0:.1f}" for x in np.rad2deg(rotation.rotation_vector(axes)).round(1))
     said = (
         f"pose and velocity by motion capture: {len(capture.time)} samples{blind}{wrong}{lost}; smoothed over "
@@ -108,7 +111,7 @@ def with_pose_of(log: FlightLog, capture: Capture) -> FlightLog:
 
 
 def compared(estimate: FlightLog, captured: FlightLog) -> str | None:
-    """In a sentence how far an estimate leans and how fast it moves beside motion capture; None where they agree."""
+    """One sentence with the ratios of the estimate's tilt and velocity to motion capture's; None if they agree."""
     rows = np.searchsorted(estimate.time, captured.time)
     speed, true_speed = estimate.velocity[rows, :2], captured.velocity[:, :2]
     if _rms(true_speed) < SLOW:
@@ -118,32 +121,32 @@ def compared(estimate: FlightLog, captured: FlightLog) -> str | None:
     if abs(further - 1) < 0.02 and abs(faster - 1) < 0.02:
         return None
     return (
-        f"the file holds motion capture too, and beside it the estimate leans {further:.2f} times as far and moves "
-        f"{faster:.2f} times as fast over ground: --motion-capture takes pose and velocity from there."
+        f"the file also holds motion capture; compared with it, the estimate leans {further:.2f} times as far and "
+        f"moves {faster:.2f} times as fast over ground: --motion-capture takes pose and velocity from motion capture."
     )
 
 
 def lean(quaternion: np.ndarray) -> np.ndarray:
-    """(n, 2) angle between body z and up, rad, towards body x and y."""
+    """Tilt (n, 2), rad: components along body x and y of the angle between body z and the vertical."""
     up = rotation.to_body(rotation.tidy(quaternion), np.array([0.0, 0.0, 1.0]))
     across = np.linalg.norm(up[:, :2], axis=1)
     return up[:, :2] * (np.arctan2(across, up[:, 2]) / np.maximum(across, 1e-9))[:, None]
 
 
 def turned_by_gyro(log: FlightLog) -> np.ndarray:
-    """(n, 4) how the gyro says the drone turned since the first row."""
+    """Integrated gyro: quaternions (n, 4) of the rotation since the first row."""
     steps = np.diff(log.time)[:, None]
     middle = 0.5 * (log.body_rate[1:] + log.body_rate[:-1])
     steps = rotation.exponential(middle * np.where(steps > log.gap_threshold, 0.0, steps))
     whole, span = np.concatenate([[[1.0, 0.0, 0.0, 0.0]], steps]), 1
-    while span < len(whole):  # Products of all before each row, by twice as many at a time.
+    while span < len(whole):  # Cumulative product by doubling the span.
         whole[span:] = rotation.multiply(whole[:-span], whole[span:])
         span *= 2
     return rotation.tidy(whole)
 
 
 def _offsets(log: FlightLog, turned: np.ndarray, capture: Capture, late: float) -> np.ndarray:
-    """(m, 4) attitude by motion capture over that by the gyro, which drifts but never jumps."""
+    """Attitude by motion capture relative to the integrated gyro, (m, 4). It drifts, but does not jump."""
     own = rotation.tidy(interpolate(log.time, turned, capture.time - late))
     return rotation.multiply(capture.quaternion, rotation.conjugate(own))
 
@@ -158,14 +161,14 @@ def _between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def delay_behind(log: FlightLog, turned: np.ndarray, capture: Capture) -> float:
-    """How late the samples are, s: where they turn most as the gyro does, to half a millisecond."""
+    """Lag of the samples, s: the one at which their rotation agrees best with the gyro, to half a millisecond."""
 
     span = max(1, round(SPAN / float(np.median(np.diff(capture.time)))))
 
     def unlike(late: float) -> float:
         apart = _offsets(log, turned, capture, late)
         size = np.sort(_between(apart[:-span], apart[span:]))
-        # A few are of markers taken for others.
+        # Ignore the largest differences, which may come from confused markers.
         return float(np.sum(size[: int(0.8 * len(size))] ** 2))
 
     lags = np.arange(0.0, LATEST + 1e-9, 0.0005)
@@ -175,11 +178,11 @@ def delay_behind(log: FlightLog, turned: np.ndarray, capture: Capture) -> float:
 def turns(
     log: FlightLog, turned: np.ndarray, capture: Capture, late: float, span: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(k, 3) rotation vectors over spans, rad: by the gyro and by the capture, each in its own body axes."""
+    """Rotation vectors (k, 3), rad, over spans: by the gyro and by motion capture, each in its own body axes."""
     first = np.arange(len(capture.time))
     last = np.searchsorted(capture.time, capture.time + span)
     first, last = first[last < len(first)], last[last < len(first)]
-    # Neither a gap of the log nor one of the capture.
+    # Leave out spans with a gap of the log or of the capture.
     away = np.concatenate([[0], np.cumsum(np.diff(log.time) > log.gap_threshold)])
     there = np.searchsorted(log.time, capture.time - late).clip(0, len(log.time) - 1)
     whole = (away[there[first]] == away[there[last]]) & (capture.time[last] - capture.time[first] < 1.2 * span)
@@ -193,7 +196,10 @@ def turns(
 
 
 def marker_axes(log: FlightLog, turned: np.ndarray, capture: Capture, late: float) -> np.ndarray:
-    """(4,) attitude of the gyro's axes in those of the markers, from how both turn; none where they hardly do."""
+    """Attitude (4,) of the gyro's axes in the markers' axes, from the rotations of both.
+
+    The identity if they hardly rotate.
+    """
     from scipy.spatial.transform import Rotation
 
     gyro, seen = turns(log, turned, capture, late, SPAN)
@@ -208,9 +214,13 @@ def marker_axes(log: FlightLog, turned: np.ndarray, capture: Capture, late: floa
 
 
 def _believed(log: FlightLog, offsets: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Which samples are of the drone as most are: pieces without a jump that stand where the longest one stands."""
+    """Mask of the samples without confused markers.
+
+    The samples are divided at jumps relative to the gyro. The longest piece is kept, and every piece that continues a
+    kept one without a jump.
+    """
     gaps = log.time[log.gaps()]
-    # Nothing is known of how the drone turned in a gap of the log.
+    # The rotation in a gap of the log is unknown, so a difference across it is not a jump.
     across = np.searchsorted(gaps, time[1:]) > np.searchsorted(gaps, time[:-1])
     jumps = (_between(offsets[:-1], offsets[1:]) > JUMP) & ~across
     piece = np.concatenate([[0], np.cumsum(jumps)])
@@ -228,14 +238,14 @@ def _believed(log: FlightLog, offsets: np.ndarray, time: np.ndarray) -> np.ndarr
 
 
 def _smoothed(time: np.ndarray, values: np.ndarray, rows: np.ndarray, half: float, degree: int):
-    """Value and slope at each row of the polynomial through the samples about it, and where there are enough."""
+    """Value and slope at each row of a local least-squares polynomial, and the mask of rows with enough samples."""
     first, last = np.searchsorted(time, rows - half), np.searchsorted(time, rows + half)
     most = int(np.max(last - first, initial=1))
     index = first[:, None] + np.arange(most)
     counts = index < last[:, None]
     index = np.minimum(index, len(time) - 1)
     away = np.where(counts, (time[index] - rows[:, None]) / half, 0.0)
-    # Samples on both sides, none further than a gap, and one more than it takes.
+    # Samples on both sides, no gap between them, and at least two more than the degree of the polynomial.
     reach = longest_step(float(np.median(np.diff(time)))) / half
     before, after = (np.min(np.where(counts & side, np.abs(away), np.inf), axis=1) for side in (away <= 0, away >= 0))
     enough = (counts.sum(axis=1) > degree + 1) & (before + after < reach)

@@ -1,4 +1,4 @@
-"""What motors say of a log: rotors follow their own commands, all together they lift, and they carry a Crazyflie."""
+"""Checks of motor columns: each rotor follows its own command, more thrust lifts, and the thrust fits a Crazyflie."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from cfb_mjx.logs.fixes import COMMAND_UNITS, Fix, motor_fixes
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.optional import not_none
 
-_GAIN = (1100.0, 6500.0)  # rad/s of a rotor for a command of one, brushed and brushless
-_OFF = 0.03  # of full: the motors are off
+_GAIN = (1100.0, 6500.0)  # rad/s per unit of command: range for brushed and brushless rotors
+_OFF = 0.03  # command below which the motors count as off
 BETTER = 0.25
-"""By how much another order of motors must agree better to be named."""
-_FOLLOWS, _HEAVES = 0.6, 0.2
-_MASSES = (0.012, 0.16)  # kg that four rotors of a Crazyflie carry, by the nominal thrust curve
+"""By how much the correlation of another motor order must be larger for that order to be reported."""
+_FOLLOWS, _HEAVES = 0.6, 0.2  # correlations of a rotor with its command, and of thrust with specific force
+_MASSES = (0.012, 0.16)  # kg: plausible masses carried by four rotors, by the nominal thrust curve
 
 
 def implausible(log: FlightLog) -> str | None:
-    """What speeds for these commands, or a mass for this thrust, no Crazyflie has; None where all is plausible."""
+    """The problem, if rotor speeds do not fit the commands or the thrust does not fit a Crazyflie; else None."""
     return _gain(log) or _carried(log)
 
 
 def heaves_against(log: FlightLog, source: str) -> bool:
-    """Whether the drone is pushed down where all motors together pull more: commands are one minus the duty."""
+    """Whether more thrust of all motors pushes the drone down, which means that commands are one minus the duty."""
     return _heave(log, source) < -_HEAVES
 
 
 def _heave(log: FlightLog, source: str) -> float:
-    """Correlation of what all motors together change with the specific force along z."""
+    """Correlation of the sum over all motors with the specific force along z, both high-pass filtered."""
     thrust = not_none(log.rotor_speed) if source == "rotor_speed" else nominal_speeds(log)
     both = _swings(log, np.stack([np.nansum(thrust, axis=1), log.specific_force[:, 2]], axis=1))
     size = float(np.sqrt(np.mean(both[:, 0] ** 2) * np.mean(both[:, 1] ** 2)))
@@ -38,7 +38,10 @@ def _heave(log: FlightLog, source: str) -> float:
 
 
 def followed(log: FlightLog) -> tuple[str, tuple[Fix, ...]] | None:
-    """Each rotor must follow its own command; of two orders the one by which the drone turns is right."""
+    """Check that each rotor follows its own command; the problem and the remedy, or None.
+
+    If commands and speeds are in different orders, the order that agrees with roll and pitch is taken as right.
+    """
     if log.rotor_speed is None or log.duration < 1.0:
         return None
     known = np.isfinite(log.rotor_speed).all(axis=1)
@@ -56,7 +59,7 @@ def followed(log: FlightLog) -> tuple[str, tuple[Fix, ...]] | None:
     best = matrix[np.arange(4), order]
     if sorted(order) == [0, 1, 2, 3] and (best > _FOLLOWS).all() and np.max(best - own) > BETTER:
         follow = tuple(int(i) for i in order)  # command i drives the rotor in this column
-        problem = "rotor speeds do not follow the commands of their own motors but those of others"
+        problem = "rotor speeds do not follow the commands of their own motors, but those of other motors"
         turns = {s: consistency.agreement(log, s).get((ORDER, 1), 0.0) for s in ("rotor_speed", "command")}
         if turns["command"] > turns["rotor_speed"]:
             return problem, motor_fixes(follow, key="rotor-order")
@@ -65,7 +68,7 @@ def followed(log: FlightLog) -> tuple[str, tuple[Fix, ...]] | None:
 
 
 def _gain(log: FlightLog) -> str | None:
-    """How fast rotors turn for their commands."""
+    """Check the ratio of rotor speeds to commands."""
     if log.rotor_speed is None or not np.isfinite(log.rotor_speed).any():
         return None
     speed, command = float(np.nanmedian(log.rotor_speed)), float(np.median(log.command))
@@ -74,7 +77,7 @@ def _gain(log: FlightLog) -> str | None:
         return None
     force = float(np.median(log.specific_force[:, 2]))
     total = float(np.sum(np.median(log.command, axis=0)))
-    text = f"rotors turn at {speed:.0f} rad/s under commands of {command:.3g}, which no motor of a Crazyflie does"
+    text = f"rotors turn at {speed:.0f} rad/s under commands of {command:.3g}, which does not fit a Crazyflie"
     if force > 4.0 and _MASSES[0] < total / force < _MASSES[1] and speed / command > high:
         return f"{text}: the commands look like thrust in newtons; give the duty, motor.m1..m4 over 65535"
     if low < speed * 2 * np.pi / command < high:
@@ -83,7 +86,7 @@ def _gain(log: FlightLog) -> str | None:
 
 
 def _swings(log: FlightLog, values: np.ndarray) -> np.ndarray:
-    """Values without what is slower than half a second."""
+    """High-pass filter: subtract the moving average over half a second."""
     width = max(3, round(0.5 / log.nominal_interval) | 1)
     filled = np.where(np.isfinite(values), values, np.nanmean(values, axis=0))
     sums = np.cumsum(np.pad(filled, ((width // 2 + 1, width // 2), (0, 0)), mode="edge"), axis=0)
@@ -91,7 +94,7 @@ def _swings(log: FlightLog, values: np.ndarray) -> np.ndarray:
 
 
 def _carried(log: FlightLog) -> str | None:
-    """What the motors pull must carry a Crazyflie."""
+    """Check that the thrust carries the mass of a Crazyflie."""
     force = float(np.median(log.specific_force[:, 2]))
     if log.duration < 1.0 or force < 4.0 or np.median(log.command) < _OFF:
         return None
@@ -105,7 +108,7 @@ def _carried(log: FlightLog) -> str | None:
                 else ""
             )
             return (
-                f"rotors at {np.nanmedian(log.rotor_speed):.0f} rad/s carry {mass * 1e3:.3g} g, which is no "
+                f"rotors at {np.nanmedian(log.rotor_speed):.0f} rad/s carry {mass * 1e3:.3g} g, which does not fit a "
                 f"Crazyflie{hint}; give omega1..omega4 in rad/s"
             )
         return None
@@ -113,7 +116,12 @@ def _carried(log: FlightLog) -> str | None:
 
 
 def carried_by_commands(command: np.ndarray, force: float) -> str | None:
-    """What is wrong with commands within [0, 1] that carry no Crazyflie; None where they do."""
+    """The problem, if the thrust of commands within [0, 1] does not fit the mass of a Crazyflie; None if it does.
+
+    Args:
+        command: (n, 4) duty.
+        force: specific force in flight, m/s^2.
+    """
     low, high = _MASSES
     typical = np.median(command, axis=0)
     mass = carried_mass(GAIN * typical, force)
@@ -125,17 +133,18 @@ def carried_by_commands(command: np.ndarray, force: float) -> str | None:
             "over 65535"
         )
     return (
-        f"commands of {np.median(command):.3g} carry {mass * 1e3:.3g} g, which is no Crazyflie; give the duty in [0, 1]"
+        f"commands of {np.median(command):.3g} carry {mass * 1e3:.3g} g, which does not fit a Crazyflie; give the duty "
+        "in [0, 1]"
     )
 
 
 def carried_mass(rotor_speed: np.ndarray, force: float) -> float:
-    """kg that four rotors at these speeds carry at a specific force, by the nominal thrust curve."""
+    """Mass, kg, that four rotors at these speeds (rad/s) carry at a specific force (m/s^2), by the nominal curve."""
     return float(np.sum(nominal_thrust(rotor_speed))) / force
 
 
 def command_unit(command: np.ndarray, force: float) -> str | None:
-    """What commands outside [0, 1] look like, with the remedy; None if like nothing known.
+    """Likely unit of commands outside [0, 1], with the remedy, as words of a message; None if no unit fits.
 
     Args:
         command: (n, 4) as logged.
@@ -151,7 +160,7 @@ def command_unit(command: np.ndarray, force: float) -> str | None:
     total = float(np.sum(np.median(command, axis=0)))
     for unit, newton in (("grams", 9.81e-3), ("millinewtons", 1e-3)):
         if low < total * newton / force < high:
-            return f"look like thrust in {unit}, which is no duty; give the duty, motor.m1..m4 over 65535"
+            return f"look like thrust in {unit}, which is not a duty; give the duty, motor.m1..m4 over 65535"
     return None
 
 
@@ -167,7 +176,7 @@ _TOPS = {
 
 
 def _by_range(command: np.ndarray) -> list[str]:
-    """Units in the order in which their range fits: the narrowest that holds all values first."""
+    """Units whose range includes all values, the narrowest range first."""
     top, bottom = float(command.max()), float(command[command > 0].min(initial=np.inf))
     order = [unit for unit, limit in sorted(_TOPS.items(), key=lambda t: t[1]) if top <= limit]
     likely = "us" if bottom >= 900.0 and top <= 2100.0 else "dshot" if 255.5 < top <= 2047.5 else ""

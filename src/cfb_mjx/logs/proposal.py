@@ -1,4 +1,4 @@
-"""A mapping proposed for a table with names of its own, from those names and the size of the values."""
+"""Propose a mapping for a table with unknown column names, from the names and the size of the values."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cfb_mjx.logs.variables import DERIVED_FROM, FORMAT, UNITS
 
 _AXES = {"x": 0, "y": 1, "z": 2}
 _MEMBERS = {**_AXES, "w": 3, **{str(i): i for i in range(5)}}
-# What is left of a name without its axis or number, and what that is. Longer ones stand first.
+# Field, and the pattern of a column name without its axis or number.
 _STEMS: tuple[tuple[str, str], ...] = (
     ("body_rate", r"gyro(scope)?|ang(ular)?vel(ocity)?|angvelb?|bodyrates?|omegab?|rates?|w"),
     ("specific_force", r"acc(el|elerometer|eleration)?|linearacceleration|specificforce|imuacc|a"),
@@ -37,10 +37,10 @@ _GROUPS = re.compile(
 
 
 class UnknownNames(CfbError):
-    """A table whose columns have names of their own.
+    """The columns of a table have unknown names.
 
     Attributes:
-        mapping: text of the mapping file that was proposed for it.
+        mapping: text of the mapping file proposed for it.
     """
 
     def __init__(self, message: str, mapping: str):
@@ -56,7 +56,7 @@ class Proposal(NamedTuple):
 
 
 def propose(table: Mapping[str, np.ndarray | Text]) -> Proposal | None:
-    """A mapping for a table's columns; None where they do not hold a flight by any reading of their names."""
+    """Propose a mapping for the columns of a table; None if their names do not suggest a flight."""
     numbers = _numbers(table)
     found = _fields(numbers)
     if _missing(numbers, found) or min((len(v) for v in numbers.values()), default=0) < 2:
@@ -65,7 +65,7 @@ def propose(table: Mapping[str, np.ndarray | Text]) -> Proposal | None:
 
 
 def lacking(table: Mapping[str, np.ndarray | Text]) -> list[str]:
-    """What a flight needs and no column of a table is named after, in words."""
+    """Required signals, in words, for which no column has a suitable name."""
     numbers = _numbers(table)
     return _missing(numbers, _fields(numbers))
 
@@ -85,7 +85,7 @@ def _missing(numbers: Mapping[str, np.ndarray], found: Mapping[str, list[str]]) 
 
 
 def _fields(numbers: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
-    """Field to its columns, as their names tell."""
+    """Field to its columns, according to their names."""
     found = _families(numbers)
     if "quaternion" not in found:
         angles = {m[2].lower(): n for n in numbers if (m := _ANGLES.fullmatch(_plain(n))) and not m[1].endswith("rate")}
@@ -108,7 +108,7 @@ def _plain(name: str) -> str:
 
 
 def _families(numbers: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
-    """Field to its columns in order: names that differ in an axis or a number only."""
+    """Field to its columns, in order; the names of these columns differ only in an axis or a number."""
     groups: dict[tuple[str, str], dict[str, str]] = {}
     for name in numbers:
         bare = re.sub(r"\[[^\]]*\]|\([^)]*\)", "", name)
@@ -135,7 +135,7 @@ def _families(numbers: Mapping[str, np.ndarray]) -> dict[str, list[str]]:
 
 
 def _unit_of(name: str) -> str:
-    """What stands in brackets at the end of a header, in small letters."""
+    """Unit in brackets at the end of a header, in lower case."""
     match = re.search(r"[\[(]([^\[\]()]*)[\])]\s*$", name)
     return match[1].strip().lower() if match else ""
 
@@ -167,7 +167,7 @@ def _document(found: dict[str, list[str]], numbers: Mapping[str, np.ndarray]) ->
 
 
 def _unit(field: str, values: Mapping[str, np.ndarray]) -> str:
-    """As the size of the values says."""
+    """Guess the unit from the size of the values."""
     known = values[field][np.isfinite(values[field]).all(axis=1)]
     size = float(np.median(np.linalg.norm(known, axis=1))) if len(known) else 0.0
     top = float(np.abs(known).max(initial=0.0))
@@ -187,12 +187,13 @@ def _unit(field: str, values: Mapping[str, np.ndarray]) -> str:
 
 
 def _rate_unit(rate: np.ndarray, values: Mapping[str, np.ndarray]) -> str:
-    """By how much the attitude turns from row to row, beside how much the gyro changes over the same rows."""
+    """Guess the unit of the gyro: compare its size with the rotation of the attitude from row to row."""
     if "quaternion" in values and len(values["quaternion"]) == len(rate):
         q = rotation.tidy(values["quaternion"])
         turned = np.linalg.norm(rotation.rotation_vector(rotation.multiply(rotation.conjugate(q[:-1]), q[1:])), axis=1)
         spread = float(np.sum(turned)) / max(len(turned), 1)
-        # Rows of 1 to 20 ms: in rad/s a row turns by 1/1000 to 1/50 of the rate, in deg/s by a 57th of that.
+        # With intervals of 1 to 20 ms, the rotation per row is 1/1000 to 1/50 of a rate in rad/s, and a 57th of that
+        # for a rate in deg/s.
         ratio = spread / max(float(np.mean(np.linalg.norm(rate, axis=1))), 1e-9)
         if spread > 1e-5:
             return "deg/s" if ratio < 7e-4 else "rad/s"

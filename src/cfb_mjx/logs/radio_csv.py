@@ -1,8 +1,8 @@
-"""Reader of tables with firmware variable names as headers: what cfclient and scripts around cflib write.
+"""Reader of tables with firmware variable names as headers, written by cfclient or by scripts that use cflib.
 
 cfclient (``logdatawriter.py`` of bitcraze/crazyflie-clients-python) writes one file per log block: ``Timestamp`` in ms
-and the block's variables. Tables of several blocks leave cells empty where a block has no packet at a time. Scripts
-join names in their own way (``stateEstimate_x``), or write one value per line under ``timestamp, name, value``.
+and the block's variables. Tables of several blocks have empty cells where a block sent no packet. Scripts use other
+separators in names (``stateEstimate_x``), or write one value per line under ``timestamp, name, value``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cfb_mjx.logs.tabular import Table, Text, read_table, require_numbers
 from cfb_mjx.logs.variables import VariableMap, load_mapping
 
 _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-_SHORTEST, _LONGEST = 2e-4, 0.45  # s: no log block is faster or slower than this, so the unit must be another
+_SHORTEST, _LONGEST = 2e-4, 0.45  # s: limits of the interval of a log block; beyond them the time unit is wrong
 _CLOCK = re.compile(
     r"(?P<name>timestamp|time[_ .]?stamp|time[_ .]?tick|tick|time|t|stamp|clock|elapsed)"
     r"[_ .]*[\[(]?(?P<unit>s|sec|seconds|ms|us|ns)?[\])]?",
@@ -34,7 +34,7 @@ _HOST = re.compile(r"(host|pc|ros|unix|wall|system|log)[_ .]?(time|stamp|timesta
 _LONG = ({"name", "variable", "var", "key", "topic"}, {"value", "val", "data"})
 _PREFIX = re.compile(r"(?P<head>[A-Za-z0-9]+)[._/ :](?P<rest>.+[._/ :].+)")
 _NOT_MEASURED = frozenset(["sp", "ref", "des", "cmd", "target", "goal", "setpoint", "desired", "reference"])
-_FEWEST = 3  # columns with names of the firmware that make a table one of this kind
+_FEWEST = 3  # columns with firmware names from which a table is read as this format
 
 
 class Clock(NamedTuple):
@@ -42,17 +42,17 @@ class Clock(NamedTuple):
 
     column: str
     unit: str | None
-    """As its name says; None where it does not."""
+    """Unit in the column's name; None if the name has none."""
 
 
 def recognises(columns: Iterable[str], mapping: VariableMap) -> bool:
-    """Whether columns are named after logged variables, or name and value stand in columns of their own."""
+    """Whether columns have names of logged variables, or the table has a name column and a value column."""
     columns = list(columns)
     return len(_variables(columns, mapping)) >= _FEWEST or _long_form(columns) is not None
 
 
 def clock_of(columns: Iterable[str]) -> Clock | None:
-    """The time column: the firmware's clock rather than the computer's, a named one rather than ``t``."""
+    """The time column. The firmware's clock is preferred to the computer's, and a full name to ``t``."""
     found = []
     for column in columns:
         match = _CLOCK.fullmatch(column.strip())
@@ -73,21 +73,23 @@ def read_radio_csv(
 ) -> FlightLog:
     """Read tables of named variables. `read_log` also validates the content.
 
-    Columns that are filled in the same rows form a stream; streams, of all files, are merged onto the rows of the gyro,
-    each value held until its next one. A time stamp that overflows three bytes of milliseconds is continued.
+    Columns that are filled in the same rows form a stream. The streams of all files are merged onto the rows of the
+    gyro, and each value is held until the next one. Overflows of the 24-bit time stamp (in ms) are undone.
 
     Args:
-        path: csv (or parquet) with a time column (``Timestamp``) and columns like ``gyro.x``; several files, as
-            cfclient writes one per log block, are one flight.
-        mapping: which variable is which column; a mapping file, or None for ``configs/logs/crazyflie.yaml``.
-        time_unit: of the time column: ``s``, ``ms``, ``us`` or ``ns``. None takes what its name says, else ms for a
-            ``Timestamp`` and for other columns the only unit in which rows follow each other as in a log.
-        robot: whose columns to read where the names of several drones stand before those of variables
-            (``cf3/gyro.x``).
+        path: csv (or parquet) with a time column (``Timestamp``) and columns like ``gyro.x``; or several files of one
+            flight (cfclient writes one per log block).
+        mapping: assigns variables to columns of the log; a mapping file, or None for ``configs/logs/crazyflie.yaml``.
+        time_unit: unit of the time column: ``s``, ``ms``, ``us`` or ``ns``. None takes the unit from the column's name;
+            without one, ms for a ``Timestamp``, and for other columns the unit that gives plausible intervals.
+        robot: the drone to read, if variable names have the names of several drones as prefixes (``cf3/gyro.x``).
+
+    Returns:
+        The log, not yet validated.
 
     Raises:
-        CfbError: unreadable file, no time column, cells that are not numbers, a time column in another unit or that
-            goes back, required variables that were not logged, fewer than two rows.
+        CfbError: unreadable file, no time column, cells that are not numbers, time in another unit or running
+            backwards, required variables that were not logged, fewer than two rows.
     """
     paths = [Path(path)] if isinstance(path, str | os.PathLike) else [Path(p) for p in path]
     return from_columns([(read_table(p), p) for p in paths], mapping, time_unit, robot)
@@ -144,12 +146,12 @@ def _of_table(
 
 
 def _variables(columns: Iterable[str], mapping: VariableMap) -> dict[str, str]:
-    """Logged name to column: the same name, or the same but for what joins its parts, or what stands before it."""
+    """Logged name to column. Separators and a prefix in the column's name are ignored."""
     return {name: same[0] for name, same in _candidates(columns, mapping).items()}
 
 
 def _candidates(columns: Iterable[str], mapping: VariableMap) -> dict[str, list[str]]:
-    """Logged name to the columns that may be it: several where a table holds several drones."""
+    """Logged name to the columns that may hold it; more than one if a table holds several drones."""
     columns = list(columns)
     wanted = _bare_names(mapping)
     found: dict[str, str] = {}
@@ -170,7 +172,7 @@ def _candidates(columns: Iterable[str], mapping: VariableMap) -> dict[str, list[
 
 
 def logged_names(names: Iterable[str], mapping: VariableMap) -> dict[str, str]:
-    """Name to the logged variable it ends in: ``cf1.log.gyro.x`` to ``gyro.x``."""
+    """Name to the logged variable that it ends with: ``cf1.log.gyro.x`` to ``gyro.x``."""
     wanted = _bare_names(mapping)
     found = {}
     for name in names:
@@ -183,26 +185,26 @@ def logged_names(names: Iterable[str], mapping: VariableMap) -> dict[str, str]:
 
 
 def _of_one_drone(columns: Iterable[str], mapping: VariableMap, path: Path, robot: str | None) -> dict[str, str]:
-    """Logged name to column, of the drone that was asked for where there are several."""
+    """Logged name to column, for the requested drone if there are several."""
     candidates = _candidates(columns, mapping)
     heads = {c: _PREFIX.fullmatch(c.strip()) for same in candidates.values() for c in same}
     drones = {m["head"] for same in candidates.values() if len(same) > 1 for c in same if (m := heads[c])}
     if robot is not None:
         mine = {n: [c for c in same if (m := heads[c]) and m["head"] == robot] for n, same in candidates.items()}
         if not any(mine.values()):
-            there = f"those of {', '.join(sorted(drones))}" if drones else "of one drone only"
-            raise CfbError(f"{path}: has no columns of {robot}; they are {there}.")
+            there = f"those of {', '.join(sorted(drones))}" if drones else "those of one drone, without its name"
+            raise CfbError(f"{path}: has no columns of {robot}, only {there}.")
         return {name: same[0] for name, same in mine.items() if same}
     if drones:
         raise CfbError(
-            f"{path}: holds the flights of several drones ({', '.join(sorted(drones))}); say whose with --robot "
+            f"{path}: holds the flights of several drones ({', '.join(sorted(drones))}); choose one with --robot "
             f"{min(drones)}."
         )
     return {name: same[0] for name, same in candidates.items()}
 
 
 def _bare_names(mapping: VariableMap) -> dict[str, str]:
-    """The mapping's names by what is left of them without what joins their parts."""
+    """The mapping's names, keyed by the same names without separators."""
     return {_bare(v): v for choices in mapping.choices.values() for c in choices for v in c.variables}
 
 
@@ -211,7 +213,7 @@ def _bare(name: str) -> str:
 
 
 def _long_form(columns: Iterable[str]) -> tuple[str, str] | None:
-    """The columns with names and values of a table of one value per line."""
+    """Name column and value column of a table with one value per line; None for any other table."""
     by_name = {c.strip().lower(): c for c in columns}
     name, value = (next((by_name[n] for n in sorted(names) if n in by_name), None) for names in _LONG)
     return None if name is None or value is None or len(by_name) > 5 else (name, value)
@@ -243,14 +245,14 @@ def _of_long_form(table, name_column, value_column, path, mapping, time_unit, ro
 def _seconds(
     ticks: np.ndarray, clock: Clock, asked: str | None, path: Path, notes: list[str]
 ) -> tuple[np.ndarray, str]:
-    """Time in s, and the unit it was read in."""
+    """Time in s, and the unit in which the column was read."""
     unit = asked or clock.unit or _guessed_unit(ticks, clock)
     if unit == "ms" and len(ticks) and (ticks == np.rint(ticks)).all() and np.abs(ticks).max() < 2.0**62:
         ticks, wraps = unwrap(ticks.astype(np.int64), RADIO_WRAP_MS)
         if wraps:
-            notes.append(f"the 24-bit time stamp overflowed {wraps} times; it was continued.")
+            notes.append(f"the 24-bit time stamp overflowed {wraps} times; this was undone.")
     if asked is None and clock.unit is None and unit != "ms":
-        notes.append(f"column {clock.column} was read in {unit}, in which its rows follow each other as in a log.")
+        notes.append(f"column {clock.column} was read in {unit}, because this gives plausible sampling intervals.")
     return np.asarray(ticks, dtype=np.float64) * _UNITS[unit], unit
 
 
@@ -263,7 +265,7 @@ def _guessed_unit(ticks: np.ndarray, clock: Clock) -> str:
 
 
 def _streams(columns: dict[str, np.ndarray], time: np.ndarray) -> list[Stream]:
-    """Columns with values in exactly the same rows belong together; each such group is named after its first."""
+    """One stream per group of columns with values in the same rows, named after its first column."""
     groups: dict[bytes, list[str]] = {}
     for name, values in columns.items():
         filled = ~np.isnan(values)
@@ -288,7 +290,7 @@ def _check_unit(streams: list[Stream], path: Path, unit: str) -> None:
 
 
 def _require_one_flight(tables: Sequence[tuple[Table, Path]], streams: list[Stream]) -> None:
-    """Files that are to be one flight must have been recorded during the same time."""
+    """Refuse several files whose recordings do not overlap in time."""
     if len(tables) < 2 or not streams:
         return
     latest_start, earliest_end = max(s.time[0] for s in streams), min(s.time[-1] for s in streams)
@@ -296,5 +298,5 @@ def _require_one_flight(tables: Sequence[tuple[Table, Path]], streams: list[Stre
         late = max(streams, key=lambda s: s.time[0])
         raise CfbError(
             f"{', '.join(str(path) for _, path in tables)}: these are not one flight: {late.name} begins at "
-            f"{latest_start:.3f} s, when another has ended ({earliest_end:.3f} s); import each flight by itself."
+            f"{latest_start:.3f} s, after another has ended ({earliest_end:.3f} s); import each flight separately."
         )

@@ -1,4 +1,4 @@
-"""Opening a log of any supported format."""
+"""Read a log of any supported format."""
 
 from __future__ import annotations
 
@@ -58,26 +58,28 @@ def read_log(
     """Read and validate a flight log.
 
     Args:
-        path: the file; the folder of a ROS 2 bag; or several tables of one flight, as cfclient writes one per log
-            block.
-        format: one of `FORMATS`; None detects it from the file's content. ``mcap`` is this library's own, ``tabular``
+        path: the file; the folder of a ROS 2 bag; or several tables of one flight (cfclient writes one per log block).
+        format: one of `FORMATS`; None detects it from the content. ``mcap`` is this library's own format, ``tabular``
             and ``idsia`` are parquet or csv, ``usd_card`` is the Crazyflie's micro SD card binary, ``crazyswarm`` a
             ROS bag (MCAP, sqlite3 or ROS 1), ``radio_csv`` a table with firmware variable names as headers, ``ulog`` a
-            log of PX4, ``foxglove`` an MCAP of JSON or protobuf messages. Arrays by name (.npz, .mat) are tables.
-        keep_ground: leave in what is not flight: standing, take-off, landing, being carried. This library's own files
-            are never cut.
-        cut: stretches to leave out, in s of the log's own time: ``12.5:15``, ``:3`` (all up to 3 s), ``40:``.
-        fix: changes of convention to make, in this order, as a refusal names them: ``velocity-frame=body``
-            (`cfb_mjx.logs.fixes`). Nothing of the kind is done unasked.
+            log of PX4, ``foxglove`` an MCAP of JSON or protobuf messages. Named arrays (.npz, .mat) are read as tables.
+        keep_ground: keep rows that are not flight: standing, take-off, landing, being carried. Rows of this library's
+            own files are never cut.
+        cut: spans to leave out, in s of the log's own time: ``12.5:15``, ``:3`` (all up to 3 s), ``40:``.
+        fix: changes of convention to apply, in this order, as named in the error message of a refused log:
+            ``velocity-frame=body`` (`cfb_mjx.logs.fixes`). Conventions are never changed automatically.
         **options: ``motor_shift`` for ``idsia`` (`cfb_mjx.logs.read_idsia`); ``mapping`` for ``usd_card``,
             ``crazyswarm``, ``radio_csv``, ``ulog`` and ``foxglove``; ``topics_yaml`` for ``crazyswarm``
             (`cfb_mjx.logs.read_crazyswarm`); ``time_unit`` for ``radio_csv`` (`cfb_mjx.logs.read_radio_csv`); ``robot``
-            for both; ``motion_capture=True`` takes pose and velocity from motion capture that a Crazyflie logged beside
-            its estimate (`cfb_mjx.logs.motion_capture`). An option that is None or False counts as not given.
+            for both; ``motion_capture=True`` takes pose and velocity from motion capture that was logged together with
+            the estimate (`cfb_mjx.logs.motion_capture`). An option that is None or False counts as not given.
+
+    Returns:
+        The validated log.
 
     Raises:
-        UnknownNames: a table with names of its own, for which a mapping can be proposed.
-        CfbError: one sentence naming the file, what is wrong with it and what to do.
+        UnknownNames: the table has unknown column names, for which a mapping can be proposed.
+        CfbError: the log cannot be read or is refused. One sentence names the file, the error and the remedy.
     """
     return read_judged(path, format, keep_ground=keep_ground, cut=cut, fix=fix, **options)[0]
 
@@ -91,7 +93,7 @@ def read_judged(
     fix: Sequence[str] = (),
     **options: Any,
 ) -> tuple[FlightLog, Verdict]:
-    """As `read_log`; returns beside the log what its signals say about each other."""
+    """As `read_log`; also returns the result of comparing the log's signals with each other."""
     several = not isinstance(path, str | os.PathLike)
     paths = [Path(p) for p in path] if several else [Path(path)]
     if not paths:
@@ -104,14 +106,14 @@ def read_judged(
         raise CfbError(f"{first}: unknown log format {format!r}; choose one of {', '.join(FORMATS)}.")
     if len(paths) > 1 and format != "radio_csv":
         raise CfbError(
-            f"{', '.join(map(str, paths))}: several files are one flight only where they are tables of log blocks, and "
-            f"{first} is of the format {format}; import them one by one."
+            f"{', '.join(map(str, paths))}: several files can be one flight only if they are tables of log blocks, but "
+            f"{first} has the format {format}; import them one by one."
         )
     if unknown := sorted(set(options) - set(_OPTIONS.get(format, ()))):
         flags = ", ".join(_FLAGS.get(name, name) for name in unknown)
         raise CfbError(f"{first}: the {format} format has no option {flags}; leave it out.")
     changes = [fix_of(name) for name in fix]
-    # What damage or another unit makes of numbers may overflow; the checks find it.
+    # Damaged values, or values in a wrong unit, may overflow; the checks report them.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         return _checked(paths, format, options, tables, changes, cut, keep_ground)
 
@@ -133,7 +135,7 @@ def _checked(
         told = [f"--fix {change.name}: {change.words}, as asked." for change in changes]
         log = log.replace(metadata={"notes": [*(log.metadata.get("notes") or ()), *told]})
     log = without_spans(log, cut, first)
-    if format in ("mcap", "idsia"):  # cut when it was imported; cut by its own rules
+    if format in ("mcap", "idsia"):  # mcap was cut when it was imported; idsia has rules of its own
         return examine(log, first)
     return examine(flown_part(log, first, keep_ground), first)
 
@@ -170,33 +172,33 @@ def _of_tables(tables: list[tabular.Table], paths: list[Path], format: str, opti
 
 
 def _or_proposed(tables: list[tabular.Table], paths: list[Path], format: str, options: dict[str, Any]) -> FlightLog:
-    """The log; where the columns have names of their own, a mapping for them is proposed."""
+    """The log. For columns with unknown names, raise `UnknownNames` with a proposed mapping."""
     try:
         return _of_tables(tables, paths, format, options)
     except MissingNames as error:
         if sum(name in tables[0] for names in tabular.COLUMNS.values() for name in names) > _OWN_LAYOUT:
-            raise  # this library's own layout, not whole
+            raise  # this library's own layout, with columns missing
         proposal = propose(tables[0]) if len(tables) == 1 else None
         if proposal is None and format == "tabular":
             raise CfbError(f"{paths[0]}: {_not_told(tables[0], read_bytes(paths[0], 64), paths[0])}.") from None
         if proposal is None:
             raise
         raise UnknownNames(
-            f"{paths[0]}: its columns have names of their own, which look like {', '.join(proposal.fields)}; cfb "
-            "import writes a mapping to check, to be given with --mapping FILE.",
+            f"{paths[0]}: its columns have unknown names, which look like {', '.join(proposal.fields)}; cfb import "
+            "writes a proposed mapping: check it, then give it with --mapping FILE.",
             proposal.text,
         ) from error
 
 
 def _not_told(table: tabular.Table, head: bytes, path: Path) -> str:
-    """Why a table of foreign names is no flight, and what to do about it."""
+    """Why a table with unknown column names cannot be read as a flight, and the remedy."""
     names = list(table)
     listed = ", ".join(names[:_LISTED]) + (f" and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
     what = f"{arrays.kind(head)} has arrays" if arrays.recognises(path, head) else "it has columns"
     missing = ", ".join(lacking(table)) or "more than one row"
     return (
-        f"{what} {listed}, and none is known by its name to hold {missing}; record that too, or say which it is with "
-        f"--mapping FILE, a changed copy of configs/logs/crazyflie.yaml, or by the names {tabular.LAYOUT}"
+        f"{what} {listed}, and none is known by its name to hold {missing}; record that too, or name the columns with "
+        f"--mapping FILE, a changed copy of configs/logs/crazyflie.yaml, or rename them to {tabular.LAYOUT}"
     )
 
 
@@ -205,17 +207,20 @@ def _table(path: Path) -> tabular.Table:
     return arrays.read_arrays(path) if arrays.recognises(path, head) else tabular.read_table(path)
 
 
-_OWN_LAYOUT = 17  # of its columns that make a table one of the tabular layout
-_LISTED = 12  # names of a foreign table in a message
+_OWN_LAYOUT = 17  # a table with more of the tabular layout's columns than this is in that layout
+_LISTED = 12  # most column names in a message
 
 
 def _detect(paths: list[Path], options: dict[str, Any], tables: dict[Path, tabular.Table]) -> str:
-    """The format of files, from what they hold; tables that were read for it are kept."""
+    """The format of files, detected from their content.
+
+    Tables read for this are stored in ``tables``, and the mapping of a known data set in ``options``.
+    """
     path = paths[0]
     if path.is_dir():
         if (path / "metadata.yaml").exists():
             return "crazyswarm"
-        raise CfbError(f"{path}: this is a folder and not one of a ROS 2 bag; give the log itself.")
+        raise CfbError(f"{path}: this is a folder, but not the folder of a ROS 2 bag; give the log itself.")
     head = read_bytes(path, 64)
     if head.startswith(ulog.MAGIC):
         return "ulog"

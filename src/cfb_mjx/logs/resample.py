@@ -1,4 +1,4 @@
-"""Putting a log on a uniform time grid without inventing samples in its gaps."""
+"""Resample a log to a uniform time grid, without samples in its gaps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LINEAR = ("position", "velocity", "body_rate", "specific_force", "battery_volta
 def interpolate(time: np.ndarray, values: np.ndarray, instants: np.ndarray) -> np.ndarray:
     """Linear interpolation of (n, k) values at instants of any shape; the first and last row hold beyond the ends.
 
-    It knows nothing of gaps: whoever asks across one has to.
+    It interpolates across gaps too; the caller must avoid that.
     """
     return np.stack([np.interp(instants, time, column) for column in values.T], axis=-1)
 
@@ -22,24 +22,24 @@ def resample(log: FlightLog, rate: float) -> FlightLog:
     """Resample to instants ``time[0] + k / rate``.
 
     Position, velocity, gyro, specific force, rotor speed and voltage are interpolated linearly, quaternions along the
-    shorter great circle (slerp), commands held. No instant inside a gap gets a sample, so a gap stays a gap.
-    Nothing is low-pass filtered: resampling to a lower rate aliases what lies above its half.
+    shorter great circle (slerp); commands are held. Instants inside a gap get no sample, so a gap stays a gap.
+    There is no low-pass filter: frequencies above half of a lower rate are aliased.
 
     Args:
-        log: at least two rows.
-        rate: Hz.
+        log: the flight, with at least two rows.
+        rate: sampling rate, Hz.
 
     Returns:
         The resampled log; its metadata gains ``resampled_hz``.
 
     Raises:
-        ValueError: ``rate`` is not positive, or no instant of the grid falls into the log.
+        ValueError: ``rate`` is not positive and finite.
     """
     if not rate > 0.0 or not np.isfinite(rate):
         raise ValueError(f"rate must be positive, got {rate}")
     t = log.time
     grid = quantise_time(t[0] + np.arange(int(np.floor(log.duration * rate + 1e-6)) + 1) / rate)
-    # A nanosecond of rounding must not push an instant over a row it coincides with.
+    # Tolerance of a nanosecond, so that rounding does not move an instant past the row that it coincides with.
     before = np.clip(np.searchsorted(t, grid + 1e-9, side="right") - 1, 0, len(t) - 1)
     after = np.minimum(before + 1, len(t) - 1)
     on_row = np.abs(grid - t[before]) <= 1.5e-9
@@ -50,7 +50,7 @@ def resample(log: FlightLog, rate: float) -> FlightLog:
 
     def linear(values):
         w = weight.reshape(-1, *[1] * (values.ndim - 1))
-        # Written so that weight 0 returns the row itself, also beside an invalid (NaN) rotor speed.
+        # With weight 0, return the row itself even if the next rotor speed is invalid (NaN).
         return np.where(w == 0.0, values[before], (1.0 - w) * values[before] + w * values[after])
 
     fields = {f: linear(getattr(log, f)) for f in _LINEAR if getattr(log, f) is not None}

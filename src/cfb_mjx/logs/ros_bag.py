@@ -1,8 +1,7 @@
-"""ROS bags: telling them from other files, decoding the messages that hold a flight.
+"""ROS bags: recognise them, and decode the messages that hold a flight.
 
-MCAP, the storage of ROS 2 since Iron, is read with its checksums; sqlite3 (Humble and before) and ROS 1 have none and
-are
-read by the library `rosbags <https://gitlab.com/ternaris/rosbags>`_.
+MCAP, the storage of ROS 2 since Iron, is read with its checksums. Bags in sqlite3 (Humble and before) and ROS 1 bags
+have no checksums; they are read with the library `rosbags <https://gitlab.com/ternaris/rosbags>`_.
 """
 
 from __future__ import annotations
@@ -19,15 +18,15 @@ from cfb_mjx.logs.mcap_stream import MAGIC
 
 SQLITE, ROS1 = b"SQLite format 3\0", b"#ROSBAG V2.0"
 _LOG_DATA = "std_msgs/Header header\nuint32 timestamp\nfloat{}[] values\n"
-"""Bags in sqlite3 do not describe their messages; this one is Crazyswarm2's own."""
+"""Definition of Crazyswarm2's own message, because bags in sqlite3 do not describe their messages."""
 
 GENERIC = "crazyflie_interfaces/LogDataGeneric"
 GENERIC_1 = "crazyflie_driver/GenericLogData"
-"""Of Crazyswarm 1: without the firmware's time stamp."""
+"""Message of Crazyswarm 1, which has no firmware time stamp."""
 POSE, ODOMETRY, STATUS = "geometry_msgs/PoseStamped", "nav_msgs/Odometry", "crazyflie_interfaces/Status"
 IMU = "sensor_msgs/Imu"
 _XYZ_QUATERNION = ("x", "y", "z", "qw", "qx", "qy", "qz")
-# Message type to the variables made of it; those of a custom log topic come from the crazyflies.yaml.
+# Message type to the variables read from it; those of a custom log topic come from the crazyflies.yaml.
 VARIABLES = {
     GENERIC: (),
     GENERIC_1: (),
@@ -51,7 +50,7 @@ class BagMessage(NamedTuple):
 def recognises(path: str | os.PathLike) -> bool:
     """Whether an MCAP is a ROS 2 bag with messages of the types in `VARIABLES`.
 
-    Its summary says so; an unfinished file has none, there the profile decides.
+    This is taken from the summary; for an unfinished file, which has none, from the profile.
     """
     with open(path, "rb") as file:
         head = file.read(85)  # magic, record type (1 byte), its length (8), length of the profile (4), profile
@@ -64,11 +63,11 @@ def recognises(path: str | os.PathLike) -> bool:
             summary = file.read()
     if not footer.endswith(MAGIC):
         return _profile(head) == b"ros2"
-    # An IMU alone is anybody's.
+    # An IMU alone does not identify a bag of Crazyswarm.
     kinds = [kind.replace("/", "/msg/").encode() for kind in VARIABLES if kind != IMU]
     if b"ros2" in summary and any(kind in summary for kind in kinds):
         return True
-    # A file that lost a part has its summary elsewhere than it says.
+    # In a file that lost a part, the stored position of the summary is wrong, so search the whole file.
     return _profile(head) == b"ros2" and any(kind in data for data in [read_bytes(path)] for kind in kinds)
 
 
@@ -77,11 +76,15 @@ def _profile(head: bytes) -> bytes:
 
 
 def read_messages(data: bytes, path: Path, warnings: list[str]) -> list[BagMessage]:
-    """Messages of the types in `VARIABLES` in file order.
+    """Messages of the types in `VARIABLES`, in file order.
+
+    Args:
+        data: content of the file.
+        path: the file, for messages.
+        warnings: receives what could not be read after the first message.
 
     Raises:
-        CfbError: nothing could be read, or a message is encoded otherwise. What is lost after something could be read
-            goes into ``warnings``.
+        CfbError: nothing could be read, or a message has another encoding.
     """
     from mcap_ros2.decoder import DecoderFactory
 
@@ -107,14 +110,14 @@ def read_messages(data: bytes, path: Path, warnings: list[str]) -> list[BagMessa
     ]
     if foreign:
         raise CfbError(
-            f"{path}: {', '.join(sorted(foreign))} is not encoded as CDR with ros2msg descriptions, which is what this "
-            "library reads; record the bag again with a newer rosbag2 (storage mcap)."
+            f"{path}: {', '.join(sorted(foreign))} is not encoded as CDR with ros2msg descriptions, the only encoding "
+            "that this library reads; record the bag again with a newer rosbag2 (storage mcap)."
         )
     return out
 
 
 class Bag(NamedTuple):
-    """Messages of a bag, what kind of file it is, and whether its values are covered by checksums."""
+    """Messages of a bag, its storage format in words, and whether checksums cover its values."""
 
     messages: list[BagMessage]
     storage: str
@@ -124,8 +127,12 @@ class Bag(NamedTuple):
 def read_bag(path: Path, warnings: list[str]) -> Bag:
     """Messages of the types in `VARIABLES`, of a file or of the folder of a ROS 2 bag.
 
+    Args:
+        path: the file or folder.
+        warnings: receives what could not be read after the first message.
+
     Raises:
-        CfbError: nothing could be read. What is lost after something could be read goes into ``warnings``.
+        CfbError: nothing could be read.
     """
     if path.is_dir():
         return _read_folder(path, warnings)
@@ -137,7 +144,7 @@ def read_bag(path: Path, warnings: list[str]) -> Bag:
         return Bag(_by_rosbags(path, ".db3", warnings), "a ROS 2 bag in sqlite3 storage", False)
     if head.startswith(ROS1):
         return Bag(_by_rosbags(path, ".bag", warnings), "a ROS 1 bag", False)
-    raise CfbError(f"{path}: this is no ROS bag; give the .mcap, .db3 or .bag, or the folder of a ROS 2 bag.")
+    raise CfbError(f"{path}: this is not a ROS bag; give the .mcap, .db3 or .bag, or the folder of a ROS 2 bag.")
 
 
 def _read_folder(path: Path, warnings: list[str]) -> Bag:
@@ -162,7 +169,7 @@ def _by_rosbags(path: Path, suffix: str, warnings: list[str]) -> list[BagMessage
     out: list[BagMessage] = []
     try:
         with scratch() as folder:
-            # The library goes by the file's ending.
+            # rosbags chooses the format by the file's ending.
             link = Path(folder) / f"bag{suffix}"
             link.symlink_to(path.resolve())
             with AnyReader([link], default_typestore=stores[32]) as reader:
@@ -172,11 +179,11 @@ def _by_rosbags(path: Path, suffix: str, warnings: list[str]) -> list[BagMessage
                     for c in reader.connections
                     if (name := c.msgtype.replace("/msg/", "/")) in VARIABLES
                     and c.topic.count("/") >= 2
-                    # Its fields differ between versions.
+                    # The fields of Status differ between versions.
                     and (described or name != STATUS)
                 ]
                 for connection, logged, raw in reader.messages(connections=wanted):
-                    # Classes of messages are made while reading.
+                    # Any, because the classes of messages are generated while reading.
                     content: Any = cast(Any, reader.deserialize(raw, connection.msgtype))
                     single = False
                     if connection.msgtype == kind:
@@ -185,7 +192,7 @@ def _by_rosbags(path: Path, suffix: str, warnings: list[str]) -> list[BagMessage
                             content, single = stores[64].deserialize_cdr(raw, kind), False
                     name = connection.msgtype.replace("/msg/", "/")
                     out.append(BagMessage(connection.topic, name, logged, content, single))
-    except Exception as error:  # of damaged bytes come errors of sqlite, struct, codecs and lookups
+    except Exception as error:  # damaged bytes raise errors of sqlite, struct, codecs and lookups
         reason = str(error).splitlines()[0][:160] if str(error) else type(error).__name__
         if not out:
             what = "ROS 2 bag in sqlite3 storage" if suffix == ".db3" else "ROS 1 bag"

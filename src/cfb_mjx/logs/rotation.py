@@ -26,19 +26,19 @@ def conjugate(q: np.ndarray) -> np.ndarray:
 
 
 def to_body(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """World vectors (n, 3) in body axes: R(q)^T v."""
+    """Rotate world vectors (n, 3) to body axes: R(q)^T v."""
     return to_world(conjugate(q), vector)
 
 
 def to_world(q: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Body vectors (n, 3) in world axes: R(q) v."""
+    """Rotate body vectors (n, 3) to world axes: R(q) v."""
     w, u = q[..., :1], q[..., 1:]
     t = 2.0 * np.cross(u, vector)
     return vector + w * t + np.cross(u, t)
 
 
 def rotation_vector(q: np.ndarray) -> np.ndarray:
-    """Rotation vectors (rad, the shorter way round) of unit quaternions, (n, 4) to (n, 3)."""
+    """Rotation vectors (n, 3), rad, of at most half a turn, from unit quaternions (n, 4)."""
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, q[..., :1])
@@ -46,7 +46,7 @@ def rotation_vector(q: np.ndarray) -> np.ndarray:
 
 
 def tidy(q: np.ndarray) -> np.ndarray:
-    """Unit norm and a sign that does not jump from row to row. A tidy array comes back bit for bit the same."""
+    """Normalise (n, 4) quaternions and make their sign continuous from row to row. Idempotent, bit for bit."""
     norm = np.linalg.norm(q, axis=-1, keepdims=True)
     q = np.where(np.abs(norm - 1.0) > 1e-12, q / norm, q)
     flips = np.sum(q[1:] * q[:-1], axis=-1) < 0
@@ -55,9 +55,9 @@ def tidy(q: np.ndarray) -> np.ndarray:
 
 
 def exponential(vector: np.ndarray) -> np.ndarray:
-    """Unit quaternions of rotation vectors (rad), inverse of `rotation_vector`."""
+    """Unit quaternions of rotation vectors (rad); inverse of `rotation_vector`."""
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
-    # sinc keeps the axis well defined at zero angle
+    # sinc avoids a division by zero at zero angle.
     return np.concatenate([np.cos(angle / 2.0), 0.5 * np.sinc(angle / (2.0 * np.pi)) * vector], axis=-1)
 
 

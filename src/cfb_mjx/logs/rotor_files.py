@@ -1,4 +1,4 @@
-"""Files that tell of motors and rotors, seen from their content: bench tables by their columns, all else a flight."""
+"""Read files about motors and rotors: bench tables, recognised by their columns, and flights."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from cfb_mjx.logs.tabular import read_table
 
 @dataclass(frozen=True)
 class RotorFiles:
-    """What some files hold.
+    """Data of motors and rotors from several files.
 
     Attributes:
-        records: motors in time, of flights and benches.
-        tables: steady force and torque at rotor speeds.
-        points: steady speeds at commands.
-        flights: the logs among the files.
-        notes: what was done to read them, in words.
+        records: time series of motors, from flights and benches.
+        tables: steady force and torque against rotor speed.
+        points: steady rotor speeds against command.
+        flights: the flight logs among the files.
+        notes: what the readers did, in words.
     """
 
     records: list[MotorRecord] = field(default_factory=list)
@@ -39,11 +39,14 @@ def read_rotor_files(paths: Sequence[Path], rotors: int | None = None) -> RotorF
     """Read flights and bench tables.
 
     Args:
-        paths: of the files, whatever each is.
-        rotors: of how many rotors force and torque are; None: as `read_bench_table` has it.
+        paths: flights and bench tables, in any order.
+        rotors: number of rotors that produce the measured force and torque; None: as in `read_bench_table`.
+
+    Returns:
+        The data of all files.
 
     Raises:
-        CfbError: a file that is neither, or a flight without rotor speeds.
+        CfbError: a file is neither a flight nor a bench table, or a flight has no rotor speeds.
     """
     found, thrust = RotorFiles(), []
     for path in paths:
@@ -64,7 +67,7 @@ def read_rotor_files(paths: Sequence[Path], rotors: int | None = None) -> RotorF
 
 
 def _bench(path: Path, rotors: int | None) -> Bench | None:
-    """What a bench table holds; None: it is none."""
+    """Content of a bench table; None if the file is not one."""
     head = read_bytes(path, 4)
     if path.suffix.lower() not in (".csv", ".txt", ".tsv", ".parquet") and head != b"PAR1":
         return None

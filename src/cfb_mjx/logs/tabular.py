@@ -1,4 +1,4 @@
-"""The tabular flight log (parquet or csv): one row per sample, columns named after what they hold."""
+"""Reader and writer of the tabular flight log (parquet or csv): one row per sample, one column per number."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ LAYOUT = (
 )
 
 
-_MOST_CELLS = 1 << 28  # a flight of an hour at 1 kHz in 40 columns is half of that
+_MOST_CELLS = 1 << 28  # a flight of one hour at 1 kHz in 40 columns has half as many
 
 
 class Text(NamedTuple):
-    """Stands for a column that does not hold numbers: the row (counted from 0) and content of its first such cell."""
+    """A column that does not hold numbers: its first such cell (row counted from 0, content), and all cells as text."""
 
     row: int
     cell: str
@@ -45,8 +45,8 @@ class Table(dict[str, np.ndarray | Text]):
     """Columns by name.
 
     Attributes:
-        notes: what was done to read them.
-        warnings: what was left out of them.
+        notes: what the reader did.
+        warnings: what the reader left out.
     """
 
     def __init__(self, columns=(), notes: list[str] | None = None, warnings: list[str] | None = None):
@@ -55,7 +55,7 @@ class Table(dict[str, np.ndarray | Text]):
         self.warnings = [] if warnings is None else warnings
 
     def numbers(self, column: str) -> np.ndarray:
-        """A column that holds numbers, as `require_numbers` sees to."""
+        """A column that holds numbers; check it with `require_numbers` first."""
         values = self[column]
         assert not isinstance(values, Text), f"column {column} holds text"
         return values
@@ -68,7 +68,7 @@ def read_table(path: str | os.PathLike) -> Table:
         path: a parquet file (recognised by its first bytes) or a text with a header line (`read_text_table`).
 
     Returns:
-        Column name to (n,) array with NaN for missing cells, or to `Text` for columns of anything but numbers.
+        Column name to (n,) array with NaN for missing cells, or to `Text` for columns that do not hold numbers.
 
     Raises:
         CfbError: the file is missing, empty, damaged, or not a table.
@@ -95,7 +95,7 @@ def read_table(path: str | os.PathLike) -> Table:
 
 
 def require_numbers(table: Table, columns: list[str], path: Path) -> None:
-    """Raise `CfbError` naming the first of ``columns`` that holds something else than numbers."""
+    """Check that ``columns`` hold numbers; raise `CfbError` for the first one that does not."""
     for column in columns:
         if isinstance(table[column], Text):
             row, cell, _ = table[column]
@@ -108,13 +108,13 @@ def require_numbers(table: Table, columns: list[str], path: Path) -> None:
 def _parquet(path: Path, notes: list[str]):
     import pyarrow.parquet as pq
 
-    # ParquetFile rather than read_table: the latter guesses partitions from folder names.
+    # Not read_table, because it guesses partitions from folder names.
     with pq.ParquetFile(path, memory_map=False, page_checksum_verification=True) as file:
         footer = file.metadata
         if footer.num_rows * max(footer.num_columns, 1) > _MOST_CELLS:
             raise CfbError(
                 f"{path}: the table has {footer.num_rows} rows and {footer.num_columns} columns, more than a flight "
-                "has; export the flight alone."
+                "has; export only the flight."
             )
         table = file.read()
         if not _has_checksums(path, footer):
@@ -124,7 +124,7 @@ def _parquet(path: Path, notes: list[str]):
 
 
 def _has_checksums(path: Path, footer) -> bool:
-    """Whether the first page of every column carries a CRC: the fourth field of its header (Thrift, compact)."""
+    """Whether the first page of every column has a CRC, which is the fourth field of its header (Thrift, compact)."""
     with open(path, "rb") as file:
         for group in range(footer.num_row_groups):
             for index in range(footer.num_columns):
@@ -144,7 +144,7 @@ def _has_checksums(path: Path, footer) -> bool:
 
 
 def _compare_with_footer(path: Path, footer, table) -> None:
-    """Refuse values beyond the least and greatest that the writer noted."""
+    """Refuse values outside the minimum and maximum stored in the footer."""
     import pyarrow.compute as pcm
 
     for index in range(footer.num_columns):
@@ -157,7 +157,7 @@ def _compare_with_footer(path: Path, footer, table) -> None:
         low, high = min(s.min for s in noted), max(s.max for s in noted)
         if found["min"] is not None and (found["min"] < low or found["max"] > high):
             raise CfbError(
-                f"{path}: column {name} holds values beyond {low} to {high}, which is what its writer noted, so the "
+                f"{path}: column {name} holds values beyond {low} to {high}, the range stored by its writer, so the "
                 "file is damaged; copy it again."
             )
 
@@ -202,7 +202,7 @@ def read_tabular(path: str | os.PathLike) -> FlightLog:
 
 
 def from_columns(table: Table, path: Path) -> FlightLog:
-    """Build a log from columns in the tabular layout; ``path`` names the file in messages and metadata."""
+    """Build a log from columns in the tabular layout. ``path`` is the file, for messages and metadata."""
     missing = [c for names in COLUMNS.values() for c in names if c not in table]
     partial = [
         c for names in OPTIONAL_COLUMNS.values() if any(c in table for c in names) for c in names if c not in table
@@ -219,7 +219,7 @@ def from_columns(table: Table, path: Path) -> FlightLog:
         return table.numbers(names[0]) if len(names) == 1 else np.stack([table.numbers(c) for c in names], axis=1)
 
     def measured(field: str) -> np.ndarray | None:
-        """A column without a single value means "not measured", as does a missing one."""
+        """The columns of an optional field; None if they are missing or have no values."""
         names = OPTIONAL_COLUMNS[field]
         values = stack(names) if names[0] in table else None
         return None if values is None or np.isnan(values).all() else values
@@ -239,13 +239,13 @@ def from_columns(table: Table, path: Path) -> FlightLog:
 
 
 def _held(values: np.ndarray) -> np.ndarray:
-    """The last known value of each row; before the first one that one."""
+    """Forward-fill NaN; rows before the first known value get that value."""
     known = np.flatnonzero(~np.isnan(values))
     return values[known[np.maximum(np.searchsorted(known, np.arange(len(values)), side="right") - 1, 0)]]
 
 
 def write_tabular(log: FlightLog, path: str | os.PathLike) -> None:
-    """Write the tabular layout, float64, as parquet or (path ending in ``.csv``) csv. Metadata is not kept.
+    """Write the tabular layout, float64, as parquet or csv, according to the ending of ``path``. Metadata is not kept.
 
     Raises:
         CfbError: the path ends in neither ``.parquet`` nor ``.csv``, or cannot be written.
@@ -262,7 +262,7 @@ def write_tabular(log: FlightLog, path: str | os.PathLike) -> None:
         values = getattr(log, field)
         if values is not None:
             columns |= dict(zip(names, np.reshape(values, (len(log), len(names))).T, strict=True))
-    # from_pandas=True turns NaN (an invalid rotor speed) into a missing value, the only kind csv can carry.
+    # from_pandas=True turns NaN (an invalid rotor speed) into a missing cell, because csv cannot store NaN.
     table = pa.table({c: pa.array(np.ascontiguousarray(v), from_pandas=True) for c, v in columns.items()})
     with replacing(path) as temporary:
         if path.suffix == ".csv":

@@ -1,4 +1,4 @@
-"""Tables in text as people's scripts leave them: delimiter, decimal comma, comments, encoding, a cut last line."""
+"""Reader of text tables: detects delimiter, decimal comma, comments, encoding and a truncated last line."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ NO_VALUE = (
 )
 _BOMS = ((b"\xef\xbb\xbf", "utf-8-sig"), (b"\xff\xfe", "utf-16"), (b"\xfe\xff", "utf-16"))
 _DELIMITERS = (",", ";", "\t", "|")
-_LOOKED_AT = 50  # lines that decide on the delimiter
+_LOOKED_AT = 50  # lines used to detect the delimiter
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 _VARIABLE = re.compile(r"[A-Za-z]\w*[./]\w+")
@@ -40,16 +40,16 @@ def read_text_table(path: Path, data: bytes, notes: list[str], warnings: list[st
     """Read a table from text.
 
     Args:
-        path: named in messages.
+        path: the file, for messages.
         data: content of the file.
-        notes: told what the file is written in where that is not plain csv.
-        warnings: told what was left out.
+        notes: receives the properties of the file that differ from plain csv.
+        warnings: receives what was left out.
 
     Returns:
-        A ``pyarrow.Table``; cells without a value, by any of the words in `NO_VALUE`, are null.
+        A ``pyarrow.Table``. Cells that are empty or hold one of the words in `NO_VALUE` are null.
 
     Raises:
-        CfbError: this is no text, it has no header line, or a line before the last has another number of cells.
+        CfbError: the file is not text, has no header line, or a line before the last has a wrong number of cells.
         pyarrow.ArrowException: cells that cannot be read.
     """
     import pyarrow.csv as pc
@@ -85,13 +85,13 @@ def read_text_table(path: Path, data: bytes, notes: list[str], warnings: list[st
     )
     first = table.column_names[0].strip() if table.num_columns else ""
     if table.num_columns > 1 and _INDEX.fullmatch(first):
-        # The index that pandas writes where nobody told it not to.
+        # The index column that pandas writes by default.
         table = table.remove_column(0)
     return table
 
 
 def _lines(path: Path, data: bytes, notes: list[str]) -> tuple[list[str], bool]:
-    """Lines that are neither empty nor comments, and whether the last one was ended by a line break."""
+    """Lines that are neither empty nor comments, and whether the last one ends with a line break."""
     text = _decoded(path, data, notes)
     ended = text.endswith(("\n", "\r"))
     lines, comments = [], []
@@ -103,7 +103,7 @@ def _lines(path: Path, data: bytes, notes: list[str]) -> tuple[list[str], bool]:
         elif stripped.strip(";,\t |"):
             lines.append(line.strip("\r\n") if "\t" in line else stripped)
     if comments and lines and _headerless(lines[0]):
-        # numpy.savetxt writes the names as a comment.
+        # numpy.savetxt writes the column names as a comment.
         delimiter = _delimiter(lines)
         width = len(_cells(lines[0], delimiter or " "))
         for comment in reversed(comments):
@@ -122,7 +122,7 @@ def _decoded(path: Path, data: bytes, notes: list[str]) -> str:
         if max(zeros) > 0.8 and min(zeros) < 0.2:
             encoding = "utf-16-le" if zeros[1] > zeros[0] else "utf-16-be"
         else:
-            raise CfbError(f"{path}: this is neither a text table nor another format this library knows.")
+            raise CfbError(f"{path}: this is neither a text table nor another format this library reads.")
     if encoding is not None:
         if encoding != "utf-8-sig":
             notes.append("the file is written in UTF-16.")
@@ -134,18 +134,18 @@ def _decoded(path: Path, data: bytes, notes: list[str]) -> str:
         return data.decode("utf-8")
     except UnicodeDecodeError:
         if sum(byte < 9 or 13 < byte < 32 for byte in data[:1000]) > 5:
-            raise CfbError(f"{path}: this is neither a text table nor another format this library knows.") from None
+            raise CfbError(f"{path}: this is neither a text table nor another format this library reads.") from None
         return data.decode("latin-1")
 
 
 def _delimiter(lines: list[str]) -> str | None:
-    """What most of the first lines are divided by, into as many cells each; None: white space."""
+    """The delimiter that divides most of the first lines into the same number of cells; None for white space."""
     some = lines[:_LOOKED_AT]
     best, most = None, 0
     for delimiter in _DELIMITERS:
         counts = Counter(len(_cells(line, delimiter)) for line in some)
         width = len(_cells(lines[0], delimiter))
-        # Agreement with the header counts: a decimal comma divides the numbers, but not the names.
+        # The header decides the number of cells, because a decimal comma splits numbers but not names.
         alike = counts[width] if width > 1 else 0
         if width > 1 and alike >= max(1, len(some) // 2) and width > most:
             best, most = delimiter, width
@@ -162,7 +162,7 @@ def _headerless(line: str) -> bool:
 
 
 def _is_long_row(cells: list[str]) -> bool:
-    """Time, name of a variable, value: one line of a table of one value per line, not of a header."""
+    """Whether a line is time, variable name and value, as in a table with one value per line, and not a header."""
     return (
         len(cells) == 3 and _is_number(cells[0]) and _is_number(cells[2]) and _VARIABLE.fullmatch(cells[1]) is not None
     )
@@ -175,7 +175,7 @@ def _is_number(cell: str) -> bool:
 def _whole_rows(
     path: Path, lines: list[str], delimiter: str, width: int, ended: bool, warnings: list[str]
 ) -> list[str]:
-    """The rows of the table; the last is left out where it was cut short."""
+    """The rows of the table, without the last one if it was cut short."""
     rows = lines[1:]
     if rows and '"' not in rows[-1] and rows[-1].count(delimiter) < width - 1:
         warnings.append("the last line was cut short and was left out.")

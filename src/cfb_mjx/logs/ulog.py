@@ -1,4 +1,4 @@
-"""Reader of PX4's ULog, by the library `pyulog <https://github.com/PX4/pyulog>`_."""
+"""Reader of PX4's ULog, using the library `pyulog <https://github.com/PX4/pyulog>`_."""
 
 from __future__ import annotations
 
@@ -23,11 +23,14 @@ def read_ulog(path: str | os.PathLike, mapping: str | os.PathLike | VariableMap 
     """Read a PX4 log. `read_log` also validates the content.
 
     Args:
-        path: the ``.ulg``.
-        mapping: which topic is which column; a mapping file, or None for ``configs/logs/px4.yaml``.
+        path: the ``.ulg`` file.
+        mapping: assigns topics to columns of the log; a mapping file, or None for ``configs/logs/px4.yaml``.
+
+    Returns:
+        The log, not yet validated.
 
     Raises:
-        CfbError: unreadable or damaged file, topics of a flight that were not logged, fewer than two rows.
+        CfbError: unreadable or damaged file, required topics that were not logged, fewer than two rows.
     """
     from pyulog import ULog
 
@@ -39,20 +42,20 @@ def read_ulog(path: str | os.PathLike, mapping: str | os.PathLike | VariableMap 
     data = read_bytes(path)
     whole = _framed(data)
     if whole[0] == len(data) and not any(data[at + 2] == ord("D") for at in whole[1]):
-        raise CfbError(f"{path}: the PX4 ULog holds no data, only what describes them; give the log of a flight.")
+        raise CfbError(f"{path}: the PX4 ULog holds no data, only definitions; give the log of a flight.")
     try:
         if not any(data[at + 2] in b"AL" for at in whole[1]):
             raise ValueError("it ends before its data")
-        # The library prints what it finds damaged.
+        # pyulog reports damage by printing.
         with contextlib.redirect_stdout(said):
             log = ULog(io.BytesIO(data[: whole[0]]), sorted({name.split(".")[0] for name in wanted}))
-    except Exception as error:  # of damaged bytes come errors of struct, lookups and text
+    except Exception as error:  # damaged bytes raise errors of struct, lookups and text
         reason = str(error).splitlines()[0][:120] if str(error) else type(error).__name__
         raise CfbError(f"{path}: the PX4 ULog is damaged or cut short ({reason}); copy it again.") from None
     notes: list[str] = ["a PX4 ULog has no checksums, so damage to values in it would go unnoticed."]
     warnings: list[str] = []
     if log.file_corruption or said.getvalue() or whole[0] < len(data):
-        warnings.append("the PX4 ULog is damaged in places, which were left out.")
+        warnings.append("the PX4 ULog is damaged in places; the damaged parts were left out.")
     streams = []
     for data in log.data_list:
         names = {f"{data.name}.{field}": field for field in data.data if f"{data.name}.{field}" in wanted}
@@ -71,7 +74,10 @@ _DEFINITIONS, _DATA = frozenset(b"BFIMPQ"), frozenset(b"ARDLCSO")
 
 
 def _framed(data: bytes) -> tuple[int, list[int]]:
-    """How far messages follow each other as they must, and where they begin: the library looks for more for ever."""
+    """Length of the valid part of the file, and the position of each message in it.
+
+    Only that part is given to pyulog, because on damaged data pyulog may search for the next message forever.
+    """
     at, starts = _HEADER, []
     while at + 3 <= len(data):
         size = int.from_bytes(data[at : at + 2], "little")

@@ -3,8 +3,8 @@
 Layout (little endian), as written by ``usddeck.c`` and read by ``tools/usdlog/cfusdlog.py`` of
 bitcraze/crazyflie-firmware: byte 0xBC; u16 version; u16 number of event types; per type u16 id, NUL-terminated name,
 u16 number of variables and as many NUL-terminated ``group.name(T)``, T a character of Python's struct module; records
-of u16 id, time stamp (version 2: u64 microseconds, version 1: u32 milliseconds) and packed values; CRC-32 of all that.
-The firmware writes the CRC when logging is switched off: a log that ended with the battery has none.
+of u16 id, time stamp (version 2: u64 microseconds, version 1: u32 milliseconds) and packed values; CRC-32 of all bytes
+before it. The firmware writes the CRC when logging is switched off, so a log that ended with an empty battery has none.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ MAGIC = b"\xbc"
 FIXED_FREQUENCY_ID, FIXED_FREQUENCY = 0xFFFF, "fixedFrequency"
 _RECORD = {1: struct.Struct("<HI"), 2: struct.Struct("<HQ")}
 _SECONDS_PER_TICK = {1: 1e-3, 2: 1e-6}
-# The firmware uses bBhHiIfe; the rest is what else the struct module could mean without doubt.
-_TYPES = {c: np.dtype(f"<{c}") for c in "bBhHiIqQefd"}  # numpy and struct agree on these
+# The firmware uses bBhHiIfe. The other types are accepted because numpy and struct define them identically.
+_TYPES = {c: np.dtype(f"<{c}") for c in "bBhHiIqQefd"}
 _VARIABLE = re.compile(r"([A-Za-z_][\w.]*)\((.)\)")
-# In a damaged file a row with more than this (SI) is damage: twice the range of the sensors, an arena of 1 km.
+# In a damaged file, larger values (SI) count as damage: twice the range of the sensors, an arena of 1 km.
 _IMPOSSIBLE = {"position": 1e3, "velocity": 1e2, "body_rate": 70.0, "specific_force": 500.0, "rotor_speed": 6000.0}
-_MAX_JUMP = 10.0  # s; in a damaged file a longer step of the clock is taken for damage
+_MAX_JUMP = 10.0  # s; in a damaged file, a longer step of the clock counts as damage
 
 
 @dataclasses.dataclass
@@ -50,12 +50,15 @@ class _Event:
 def read_usd_card(path: str | os.PathLike, mapping: str | os.PathLike | VariableMap | None = None) -> FlightLog:
     """Read a micro SD card log. `read_log` also validates the content.
 
-    A file without a valid checksum is read up to the first record that cannot be right; ``metadata["warnings"]`` says
-    so, and that values before it may be damaged too. Time starts at 0 at the first row.
+    A file without a valid checksum is read up to the first impossible record. A warning in ``metadata["warnings"]``
+    says so, and says that values before it may be damaged too. Time starts at 0 at the first row.
 
     Args:
         path: the file.
-        mapping: which variable is which column; a mapping file, or None for ``configs/logs/crazyflie.yaml``.
+        mapping: assigns variables to columns of the log; a mapping file, or None for ``configs/logs/crazyflie.yaml``.
+
+    Returns:
+        The log, not yet validated.
 
     Raises:
         CfbError: unreadable file, damaged header, unknown version, time that goes back in an intact file, required
@@ -64,7 +67,7 @@ def read_usd_card(path: str | os.PathLike, mapping: str | os.PathLike | Variable
     path = Path(path)
     data = read_bytes(path)
     if not data.startswith(MAGIC):
-        raise CfbError(f"{path}: does not begin with 0xBC, so it is no micro SD card log of a Crazyflie.")
+        raise CfbError(f"{path}: does not begin with 0xBC, so it is not a micro SD card log of a Crazyflie.")
     intact = len(data) > 9 and zlib.crc32(data[:-4]) == int.from_bytes(data[-4:], "little")
     version, events, start = _header(data, path)
     notes: list[str] = []
@@ -83,7 +86,7 @@ def read_usd_card(path: str | os.PathLike, mapping: str | os.PathLike | Variable
 
 
 def _cut_at_impossible(log: FlightLog) -> FlightLog:
-    """The rows of a damaged file before the first that no flight could have."""
+    """The rows of a damaged file before the first one with impossible values."""
     bad = (np.abs(np.linalg.norm(log.quaternion, axis=1) - 1.0) > 0.05) | (np.abs(log.command - 0.5) > 0.501).any(
         axis=1
     )
@@ -91,7 +94,7 @@ def _cut_at_impossible(log: FlightLog) -> FlightLog:
         if (values := getattr(log, field)) is not None:
             bad |= (np.abs(values) > limit).any(axis=1)
     first = int(np.argmax(bad))
-    # Nearly all rows impossible is a wrong unit rather than damage; validation will say which.
+    # If nearly all rows are impossible, the unit is wrong; validation reports that.
     if first < 2 or not bad.any():
         return log
     warning = (
@@ -101,7 +104,7 @@ def _cut_at_impossible(log: FlightLog) -> FlightLog:
 
 
 def _header(data: bytes, path: Path) -> tuple[int, list[_Event], int]:
-    """Version, event types and where the records begin."""
+    """Version, event types, and the position of the first record."""
 
     def fail(problem: str) -> NoReturn:
         raise CfbError(f"{path}: the header is damaged or cut short ({problem}); copy the log from the card again.")
@@ -151,7 +154,7 @@ def _header(data: bytes, path: Path) -> tuple[int, list[_Event], int]:
 
 
 def _scan(data, start, end, version, events, intact) -> tuple[str | None, int]:
-    """Find the records; returns what is wrong with the first one that cannot be right (None: none) and its place."""
+    """Find the records. Returns the fault of the first invalid one (None if all are valid) and its position."""
     head, by_id = _RECORD[version], {e.identifier: e for e in events}
     jump = int(_MAX_JUMP / _SECONDS_PER_TICK[version])
     latest, position = None, start
@@ -163,7 +166,7 @@ def _scan(data, start, end, version, events, intact) -> tuple[str | None, int]:
         if position + head.size + event.dtype.itemsize > end:
             break
         if not intact:
-            # Tasks of different priority write different events, so only the same event must be in order.
+            # Tasks of different priority write different events, so order is required only within one event.
             if event.ticks and tick < event.ticks[-1]:
                 return "its time goes back", position
             if latest is not None and abs(tick - latest) > jump:
@@ -195,7 +198,7 @@ def _warnings(intact: bool, problem: str | None, position: int, size: int) -> li
 
 
 def _streams(data: bytes, version: int, events: list[_Event], path: Path, notes: list[str]) -> list[Stream]:
-    """The events as streams, time in s since the vehicle started."""
+    """The events as streams, with the time since the vehicle started, in s."""
     whole = np.frombuffer(data, dtype=np.uint8)
     streams = []
     for event in events:
@@ -206,7 +209,7 @@ def _streams(data: bytes, version: int, events: list[_Event], path: Path, notes:
         if version == 1:
             ticks, wraps = unwrap(ticks.astype(np.int64), 1 << 32)
             if wraps:
-                notes.append(f"{event.name}: the 32-bit time stamp overflowed {wraps} times; it was continued.")
+                notes.append(f"{event.name}: the 32-bit time stamp overflowed {wraps} times; this was undone.")
         bytes_of = np.array(event.offsets)[:, None] + np.arange(event.dtype.itemsize)
         values = {}
         if names := event.dtype.names:

@@ -1,4 +1,4 @@
-"""What a recording holds, what it is good for, and what it lacks."""
+"""Summary of a recording: the measured signals, its possible uses, and what to log next time."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.gate import Verdict
 from cfb_mjx.logs.reading import read_judged
 
-_LIFTS, _ENOUGH = 4.0, 50  # m/s^2, rows
-_FAST, _SLOW = 240.0, 95.0  # rows per s: of 250 Hz and 100 Hz, with jitter
+_LIFTS, _ENOUGH = 4.0, 50  # least specific force along z of a row with thrust, m/s^2; fewest such rows
+_FAST, _SLOW = 240.0, 95.0  # Hz: limits for logs of 250 Hz and 100 Hz, with a margin for jitter
 
 
 @dataclass(frozen=True)
 class Recording:
-    """A recording that was read and judged, or why it was refused.
+    """A recording and the verdict on it, or the reason why it was refused.
 
     Attributes:
-        path: of its file or folder.
-        log: the flight; None where it was refused.
-        verdict: what its signals say about each other; None where it was refused.
-        refusal: why it was refused, in a sentence; None where it was not.
+        path: its file or folder.
+        log: the flight; None if the recording was refused.
+        verdict: result of comparing its signals with each other; None if it was refused.
+        refusal: why it was refused, in one sentence; None if it was not.
     """
 
     path: Path
@@ -36,11 +36,11 @@ class Recording:
 
     @classmethod
     def read(cls, path: Path, **options: Any) -> Recording:
-        """Read a recording, refused or not.
+        """Read a recording; an invalid one is returned with its ``refusal`` instead of raising an error.
 
         Args:
-            path: of its file or folder.
-            **options: of `cfb_mjx.logs.read_log`.
+            path: its file or folder.
+            **options: those of `cfb_mjx.logs.read_log`.
         """
         try:
             return cls(path, *read_judged(path, **options), None)
@@ -48,7 +48,7 @@ class Recording:
             return cls(path, None, None, str(error))
 
     def lines(self) -> list[str]:
-        """All that is known of it, in words."""
+        """Summary as lines of text."""
         if self.log is None or self.verdict is None:
             return [f"{self.path}: REFUSED", f"  {str(self.refusal).removeprefix(f'{self.path}: ')}"]
         log, verdict = self.log, self.verdict
@@ -58,12 +58,12 @@ class Recording:
             f"  {verdict.summary()}",
             *(f"  {line}" for line in _carries(log)),
             *(f"  {line}" for line in remarks(log)),
-            f"  good for: {', '.join(good_for(log, verdict)) or 'a look'}",
+            f"  good for: {', '.join(good_for(log, verdict)) or 'viewing only'}",
             *(f"  next time: {line}" for line in next_time(log, verdict)),
         ]
 
     def report(self) -> dict[str, Any]:
-        """In JSON terms."""
+        """Summary as JSON-compatible values."""
         if self.log is None or self.verdict is None:
             return {"refused": self.refusal}
         log, verdict = self.log, self.verdict
@@ -85,18 +85,18 @@ class Recording:
 
 
 def extent(log: FlightLog) -> str:
-    """Rows, duration, rate and gaps, in words."""
+    """One phrase with rows, duration, rate and gaps."""
     gaps = len(log.gaps())
     return f"{len(log)} rows, {log.duration:.1f} s at {1 / log.nominal_interval:.0f} Hz, {gaps} gap{'s' * (gaps != 1)}"
 
 
 def remarks(log: FlightLog) -> list[str]:
-    """What its reader had to say: warnings, then notes."""
+    """Warnings, then notes, of the importer."""
     return [*(log.metadata.get("warnings") or ()), *(log.metadata.get("notes") or ())]
 
 
 def measured(log: FlightLog) -> list[str]:
-    """What was measured, and what was derived from other columns."""
+    """Names of the signals in the log; those derived from other columns are marked."""
     derived = log.metadata.get("variables") or {}
     names = ("position", "velocity", "quaternion", "body_rate", "specific_force", "command")
     said = [f"{n.replace('_', ' ')}{' (derived)' if 'derived' in (derived.get(n) or {}) else ''}" for n in names]
@@ -109,7 +109,10 @@ def measured(log: FlightLog) -> list[str]:
 
 
 def carried_mass(log: FlightLog) -> float | None:
-    """kg that the measured rotor speeds carry in the median row, by the paper's thrust curve; None without speeds."""
+    """Mass, kg, that the measured rotor speeds carry by the paper's thrust curve (median of the rows in flight).
+
+    None if no rotor speeds were measured, or too few rows have thrust.
+    """
     if log.rotor_speed is None:
         return None
     known = np.isfinite(log.rotor_speed).all(axis=1) & (log.specific_force[:, 2] > _LIFTS)
@@ -124,8 +127,8 @@ def _carries(log: FlightLog) -> list[str]:
     if mass is None:
         return []
     return [
-        f"rotors of a Crazyflie Brushless carry {1e3 * mass:.1f} g at these speeds (the paper's curve): what the drone "
-        "weighs over that is its thrust scale"
+        f"rotors of a Crazyflie Brushless carry {1e3 * mass:.1f} g at these speeds (the paper's curve); the mass of "
+        "the drone divided by this is its thrust scale"
     ]
 
 
@@ -134,7 +137,7 @@ def _moving(verdict: Verdict, name: str) -> set[str]:
 
 
 def good_for(log: FlightLog, verdict: Verdict) -> list[str]:
-    """What can be learned from a flight, most wanted first."""
+    """Uses of a flight, the most important first."""
     rate, turning = 1 / log.nominal_interval, _moving(verdict, "attitude")
     found = []
     if {"x", "y"} <= turning and rate > _SLOW and log.duration > 3:
@@ -151,25 +154,25 @@ def good_for(log: FlightLog, verdict: Verdict) -> list[str]:
 
 
 def next_time(log: FlightLog, verdict: Verdict) -> list[str]:
-    """What a recording lacks."""
+    """Advice for the next recording: signals to log, rates, and manoeuvres to fly."""
     rate, turning = 1 / log.nominal_interval, _moving(verdict, "attitude")
     derived = log.metadata.get("variables") or {}
     found = []
     if log.rotor_speed is None:
-        found.append("log rotor speeds (motor.m1_rpm .. or rpm.m1 ..): they tell motors from aerodynamics")
+        found.append("log rotor speeds (motor.m1_rpm .. or rpm.m1 ..): they separate motors from aerodynamics")
     if log.battery_voltage is None:
-        found.append("log pm.vbat: battery_sag follows it")
+        found.append("log pm.vbat: battery_sag needs it")
     for field, names in (
         ("body_rate", "gyro.x y z"),
         ("specific_force", "acc.x y z"),
         ("velocity", "stateEstimate.vx vy vz"),
     ):
         if "derived" in (derived.get(field) or {}):
-            found.append(f"log {names}: a derived {field.replace('_', ' ')} is late and smooth")
+            found.append(f"log {names}: a derived {field.replace('_', ' ')} is delayed and smoothed")
     if rate < _FAST:
-        found.append(f"log at 250 Hz or more (now {rate:.0f}): a micro SD card does; see cfb import --print-config sd")
+        found.append(f"log at 250 Hz or more (now {rate:.0f}), with a micro SD card: see cfb import --print-config sd")
     if not {"x", "y"} <= turning:
-        found.append("change the attitude quickly (steps, doublets): inertia and motors do not show in a gentle flight")
+        found.append("change the attitude quickly (steps, doublets): a gentle flight does not show inertia and motors")
     elif "z" not in {r.axis for r in verdict.relations if r.name == "attitude" and r.moves}:
-        found.append("yaw quickly in one flight: J_z and J_m do not show otherwise")
+        found.append("yaw quickly in one flight: otherwise J_z and J_m cannot be identified")
     return found

@@ -1,4 +1,4 @@
-"""Refusing logs that would silently give wrong answers: order, gaps in the data, units and axis conventions."""
+"""Validation of a log: order of time, missing values, units and axis conventions."""
 
 from __future__ import annotations
 
@@ -13,35 +13,43 @@ from cfb_mjx.logs.tabular import COLUMNS, OPTIONAL_COLUMNS
 
 _NORM_TOLERANCE = 0.05
 _COMMAND_TOLERANCE = 1e-3
-# No Crazyflie rotor turns faster than about 2900 rad/s; twice that can only be another unit or a bad packet.
+# rad/s. No Crazyflie rotor turns faster than about 2900 rad/s, so twice that is another unit or a damaged packet.
 _ROTOR_SPEED_LIMIT = 6000.0
-_BEHIND = 20  # rows that follow a step back before the time is where it was: more are no rows out of order
-_FASTEST = 2.2e-4  # s between rows: no sensor of a Crazyflie is read more than 4000 times a second
-# No flight of a Crazyflie has more: an arena of 10 km, twice the range of gyro and accelerometer.
+_BEHIND = 20  # most rows per step back in time that can be rows out of order; more are another recording
+_FASTEST = 2.2e-4  # s between rows; no sensor of a Crazyflie is read at more than 4000 Hz
+# Impossible beyond these limits: an arena of 10 km, twice the range of gyro and accelerometer.
 _LIMITS = {"position": 1e4, "velocity": 60.0, "body_rate": 70.0, "specific_force": 320.0}
 _UNITS = {"position": "m", "velocity": "m/s", "body_rate": "rad/s", "specific_force": "m/s^2"}
 
 
 def validate(log: FlightLog, path: str | os.PathLike) -> FlightLog:
-    """The log of `examine`, which also says what it takes and refuses."""
+    """Check a log and normalise it, as `examine` does; returns the log only.
+
+    Args:
+        log: the log as read.
+        path: the file, for messages.
+
+    Raises:
+        CfbError: the log is refused; `examine` lists the reasons.
+    """
     return examine(log, path)[0]
 
 
 def examine(log: FlightLog, path: str | os.PathLike) -> tuple[FlightLog, gate.Verdict]:
-    """Check a log and return it with unit quaternions of continuous sign and commands within [0, 1].
+    """Check a log, normalise its quaternions (unit norm, continuous sign) and clip its commands to [0, 1].
 
     Args:
         log: the log as read.
-        path: the file to name in messages.
+        path: the file, for messages.
 
     Returns:
-        The log, and what its signals say about each other. Where they contradict each other and no change is known
-        that makes them agree, a warning in its metadata says so.
+        The log, and the result of comparing its signals with each other. If they contradict each other and no change
+        of convention makes them agree, a warning in the log's metadata says so.
 
     Raises:
         CfbError: fewer than two rows; time that does not increase; NaN or infinity in a required column; quaternions
-            that are not unit; values out of range; signals that contradict each other where a change of unit, axes or
-            order makes them agree (see `cfb_mjx.logs.gate`).
+            more than 5 % from unit norm; values out of range; signals that contradict each other, if a change of unit,
+            axes or order makes them agree (see `cfb_mjx.logs.gate`).
     """
 
     def fail(problem: str):
@@ -63,7 +71,6 @@ def examine(log: FlightLog, path: str | os.PathLike) -> tuple[FlightLog, gate.Ve
         verdict = gate.judge(log)
     if verdict.remedy or (verdict.problem and verdict.certain):
         fail(verdict.sentence())
-    # A file of one's own that was checked before comes back bit for bit.
     _magnitudes(log, fail)
     if verdict.problem:
         said = f"signals contradict each other: {verdict.problem}; no change of unit, axes or order makes them agree."
@@ -81,7 +88,7 @@ def _finite(log: FlightLog, fail) -> None:
         values = getattr(log, field)
         if values is None:
             continue
-        # A rotor speed may be NaN (invalid sample), everything else must be there.
+        # Only a rotor speed may be NaN (invalid sample).
         bad = np.isinf(values) if field == "rotor_speed" else ~np.isfinite(values)
         bad = bad.reshape(len(log), -1)
         if bad.any():
@@ -102,7 +109,7 @@ def _time(log: FlightLog, fail) -> None:
         back = np.flatnonzero(steps < 0)
         behind = int((log.time < np.maximum.accumulate(log.time)).sum())
         if len(back) and behind > _BEHIND * len(back):
-            # Sorted by time two recordings would be shuffled into each other.
+            # Sorting by time would interleave two recordings, so do not suggest it.
             ends = f"from {log.time[back[0]]:.6g} to {log.time[back[0] + 1]:.6g} s in row {back[0] + 1}"
             fail(
                 f"t goes back {ends} (counted from 0; {len(back)} times in all), so the file holds several recordings "
@@ -163,7 +170,7 @@ def _rotor_speed(log: FlightLog, fail) -> None:
         )
     if speed.max() <= _ROTOR_SPEED_LIMIT:
         return
-    # The median tells a wrong unit from a few bad packets.
+    # The median distinguishes a wrong unit from a few damaged packets.
     turning = speed[speed > 0]
     if np.median(turning) > _ROTOR_SPEED_LIMIT:
         unit, factor = ("rpm", "2 pi / 60") if np.median(turning) < 4e4 else ("electrical rpm", "2 pi / 360 (12 poles)")

@@ -1,4 +1,4 @@
-"""Which logged variable is which `FlightLog` column: the mapping file, its units and its choices.
+"""Mapping files: they assign logged variables, with their units, to the columns of a `FlightLog`.
 
 The shipped mapping is ``configs/logs/crazyflie.yaml``, which also explains the keys. Names, units and signs follow the
 log groups of bitcraze/crazyflie-firmware.
@@ -22,7 +22,7 @@ FORMAT = "cfb_mjx.variables/1"
 DEFAULT = "crazyflie"
 _DATA_SETS = ("nanobench",)
 _RPM = 2.0 * math.pi / 60.0
-# Factors to SI. g: the firmware scales its accelerometer so that rest reads 1, so 1 g is the model's gravity.
+# Factors to SI. The firmware scales its accelerometer so that rest reads 1 g; hence 1 g is the model's gravity.
 UNITS: dict[str, dict[str, float]] = {
     "position": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
     "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
@@ -36,21 +36,21 @@ UNITS: dict[str, dict[str, float]] = {
 FIELDS = tuple(f for f in (*REQUIRED, *OPTIONAL) if f != "time")
 _WIDTH = {"quaternion": 4, "command": 4, "rotor_speed": 4, "battery_voltage": 1}
 _FORM_WIDTH = {"components": 4, "compressed": 1, "euler": 3}
-_FRAMES = {"velocity": "world", "specific_force": "body"}  # the only fields with a choice, and its default
+_FRAMES = {"velocity": "world", "specific_force": "body"}  # the fields whose frame can be chosen, and the default
 DERIVED_FROM = {
     "velocity": "position",
     "body_rate": "quaternion",
     "specific_force": "velocity",
     "command": "rotor_speed",
 }
-"""What a field can be derived from where it was not logged: its derivative is it, or holds it."""
+"""Field to the field it can be computed from if it was not logged."""
 _CHOICE_KEYS = {"variables", "unit", "sign", "frame", "form", "invalid"}
 _CAPTURED = ("position", "quaternion")
 _FIRMWARE_KEYS = ("version", "battery_compensation", "thrust_limit")
 
 
 class MissingNames(CfbError):
-    """Columns or variables that a log must have are missing: it has others, or the same under other names."""
+    """Required columns or variables are missing from a log, or have other names in it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,13 +58,13 @@ class Choice:
     """One way to fill a field.
 
     Attributes:
-        variables: logged names in the order of the field's columns; empty where the field is derived.
-        unit: of the logged numbers, a key of `UNITS` of the field.
-        factors: to SI, sign included, one per variable.
+        variables: logged names in the order of the field's columns; empty if the field is derived.
+        unit: unit of the logged numbers, a key of `UNITS` of the field.
+        factors: factors to SI including the sign, one per variable.
         frame: ``world`` or ``body``, for velocity and specific force.
-        form: of a quaternion: ``components``, ``compressed`` or ``euler``.
-        invalid: logged numbers that stand for a missing measurement.
-        derived: the field it is the derivative of, a value of `DERIVED_FROM`; empty where it was logged.
+        form: ``components``, ``compressed`` or ``euler``, for a quaternion.
+        invalid: logged numbers that mean "no measurement".
+        derived: the field it is computed from, a value of `DERIVED_FROM`; empty if it was logged.
     """
 
     variables: tuple[str, ...]
@@ -76,7 +76,7 @@ class Choice:
     derived: str = ""
 
     def report(self) -> dict:
-        """What was read, in JSON terms."""
+        """The choice as JSON-compatible values."""
         if self.derived:
             return {"derived": self.derived}
         extra = {k: getattr(self, k) for k in ("frame", "form") if getattr(self, k)}
@@ -88,27 +88,34 @@ class Choice:
 
 @dataclasses.dataclass(frozen=True)
 class VariableMap:
-    """A mapping file: the choices of every field in order of preference, and what the user states about the vehicle."""
+    """Content of a mapping file.
+
+    Attributes:
+        name: of the mapping.
+        choices: field to its choices, in order of preference.
+        firmware: what the user states about the firmware; None for an unknown entry.
+        observation_delay: lag of pose and velocity behind their row's time, s; None if unknown.
+        recognised_by: columns that identify a table of this data set; empty for a user's mapping.
+        motion_capture: position and attitude by motion capture, in order of preference.
+        by_motion_capture: whether pose and velocity are taken from motion capture.
+    """
 
     name: str
     choices: dict[str, tuple[Choice, ...]]
     firmware: dict[str, Any]
     observation_delay: float | None
     recognised_by: tuple[str, ...] = ()
-    """Columns that tell a table of this kind; none for mappings that a user names."""
     motion_capture: tuple[tuple[Choice, Choice], ...] = ()
-    """Position and attitude by motion capture, in order of preference."""
     by_motion_capture: bool = False
-    """Whether pose and velocity are to come from there."""
 
     def choose(self, available: Collection[str], path: Path) -> dict[str, Choice]:
-        """The first choice of each field whose variables are all available; optional fields may be absent.
+        """For each field the first choice whose variables are all available; optional fields may be absent.
 
         Raises:
-            CfbError: a required field has none; the message lists what is missing and what was found.
+            CfbError: a required field has no such choice. The message lists the missing and the found variables.
         """
         found = {}
-        # What others are derived from comes first.
+        # Last, because it can be derived from rotor speeds, which come after it in FIELDS.
         for field in sorted(FIELDS, key=lambda f: (f == "command", FIELDS.index(f))):
             for choice in self.choices.get(field, ()):
                 usable = choice.derived in found if choice.derived else all(v in available for v in choice.variables)
@@ -120,31 +127,33 @@ class VariableMap:
             wanted = "; ".join(f"{f} ({self._wanted(f, available)})" for f in missing)
             listed = ", ".join(sorted(available)) or "none"
             raise MissingNames(
-                f"{path}: no logged variables for {wanted}. Found: {listed}. Log the missing ones too, or say under "
-                "which names and units they are with --mapping FILE, a changed copy of "
-                "configs/logs/crazyflie.yaml (see "
+                f"{path}: no logged variables for {wanted}. Found: {listed}. Log the missing ones too, or give their "
+                "names and units with --mapping FILE, a changed copy of configs/logs/crazyflie.yaml (see "
                 "docs/logs.md)."
             )
         return found
 
     def logged_parts(self, field: str, available: Collection[str]) -> list[str]:
-        """Variables of a field that were logged without the others that it takes."""
+        """Variables of a field that were logged, although no choice is complete."""
         return sorted({v for c in self.choices.get(field, ()) for v in c.variables if v in available})
 
     def _wanted(self, field: str, available: Collection[str]) -> str:
         options = [c for c in self.choices.get(field, ()) if not c.derived]
         if not options:
             return "the mapping names none"
-        # The choice that lacks the fewest variables is the one the user most likely meant.
+        # The user most likely meant the choice that lacks the fewest variables.
         best = min(options, key=lambda c: sum(v not in available for v in c.variables) / len(c.variables))
         return "missing " + " ".join(v for v in best.variables if v not in available)
 
 
 def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
-    """Read a mapping file; None is the shipped one for a Crazyflie.
+    """Read a mapping file.
+
+    Args:
+        source: path of the file; None reads the shipped mapping for a Crazyflie.
 
     Raises:
-        CfbError: missing file, broken YAML, unknown keys, fields or units, wrong number of variables.
+        CfbError: missing file, invalid YAML, unknown keys, fields or units, wrong number of variables.
     """
     path = shipped("configs", "logs", f"{DEFAULT}.yaml") if source is None else Path(source)
     document = load_yaml(path)
@@ -185,7 +194,7 @@ def load_mapping(source: str | os.PathLike | None = None) -> VariableMap:
 
 
 def mapping_of(columns: Collection[str]) -> VariableMap | None:
-    """The shipped mapping of the data set that a table's columns tell; None for others."""
+    """The shipped mapping of the data set with these columns; None for any other table."""
     for name in _DATA_SETS:
         mapping = load_mapping(shipped("configs", "logs", f"{name}.yaml"))
         if set(mapping.recognised_by) <= set(columns):
@@ -198,7 +207,7 @@ def _choice(field: str, raw: dict, path: Path) -> Choice:
     if "derived" in raw:
         if raw != {"derived": DERIVED_FROM.get(field)}:
             possible = ", ".join(f"derived: {source} for {what}" for what, source in DERIVED_FROM.items())
-            raise CfbError(f"{path}: {where}: 'derived' stands alone, and is one of {possible}.")
+            raise CfbError(f"{path}: {where}: 'derived' must be the only key, and must be one of {possible}.")
         return Choice((), derived=raw["derived"])
     _only(raw, _CHOICE_KEYS, path, where)
     form = raw.get("form", "components") if field == "quaternion" else ""

@@ -44,7 +44,7 @@ __all__ = [
 
 
 def __getattr__(name: str):
-    # MuJoCo takes a second to import; the closed-form body does not need it.
+    # Importing MuJoCo takes a second, and the closed-form body does not need it.
     if name == "MjxBody":
         from cfb_mjx.model.mjx_body import MjxBody
 

@@ -1,6 +1,6 @@
-"""The closed-form rigid body, and the interface both bodies share.
+"""The closed-form rigid body, and the interface of bodies.
 
-A body turns a wrench into accelerations; the integrators in `cfb_mjx.model.integrate` serve every body.
+A body computes accelerations from a wrench; the integrators in `cfb_mjx.model.integrate` work with every body.
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ from cfb_mjx.parameters.parameters import Parameters
 
 @runtime_checkable
 class Body(Protocol):
-    """What carries the rotors: static (hashable, no arrays); its constants come with every call."""
+    """The body that carries the rotors. Static (hashable, no arrays); the parameters are passed with every call."""
 
     name: str
 
     def prepare(self, parameters: Parameters, dt) -> object:
-        """Quantities computed once per rollout with integration steps of ``dt`` seconds."""
+        """Compute what is needed once per rollout with integration steps of ``dt`` seconds."""
         ...
 
     def accelerations(self, prepared, state: Components, wrench: Wrench, gyroscopic: bool = True) -> tuple[Vec, Vec]:
         """Acceleration of the centre of gravity (world, m/s^2) and angular acceleration (body, rad/s^2).
 
-        ``wrench`` is about the centre of gravity, body axes. ``gyroscopic`` False leaves -J^-1 (omega x J omega) out.
+        ``wrench`` is about the centre of gravity in body axes. With ``gyroscopic`` False, -J^-1 (omega x J omega) is
+        left out.
         """
         ...
 
@@ -41,7 +42,7 @@ class _Prepared(eqx.Module):
 
 
 class RigidBody:
-    """Newton-Euler in closed form (paper eqs. 1-4), without ground: what stands on nothing falls."""
+    """Newton-Euler equations in closed form (paper eqs. 1-4), without ground contact."""
 
     name = "rigid"
 

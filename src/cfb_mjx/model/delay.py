@@ -1,4 +1,4 @@
-"""Late estimates: a buffer that gives back what was true some time ago, between samples if need be."""
+"""Delayed estimates: a buffer of past samples that is read at any delay, with linear interpolation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model.state import State
 
 _SLACK = 1e-3
-"""Of a sample: delays and steps are rounded to float32, and 0.008 / 0.004 must not become 3 samples for that."""
+"""Tolerance, in samples: delays and steps are rounded to float32, and 0.008 / 0.004 must not become 3 samples."""
 
 
 class DelayLine(eqx.Module):
@@ -26,25 +26,25 @@ class DelayLine(eqx.Module):
 
     @classmethod
     def filled(cls, sample: PyTree, dt: float, longest_delay: float) -> DelayLine:
-        """A line that has seen ``sample`` for ever.
+        """Return a line in which all samples are ``sample``.
 
         Args:
             sample: pytree of arrays.
             dt: time between pushes, s.
-            longest_delay: the longest delay that will be asked for, s (static; it sets the size).
+            longest_delay: longest delay that will be read, s (static; it determines the size).
         """
         count = math.ceil(longest_delay / dt - _SLACK) + 1
         return cls(jax.tree.map(lambda x: jnp.repeat(jnp.asarray(x)[None], count, axis=0), sample), dt)
 
     def push(self, sample: PyTree) -> DelayLine:
-        """Append the newest sample, forget the oldest."""
+        """Append the newest sample and drop the oldest."""
         shifted = jax.tree.map(
             lambda line, new: jnp.concatenate([jnp.asarray(new, line.dtype)[None], line[:-1]]), self.samples, sample
         )
         return DelayLine(shifted, self.dt)
 
     def push_all(self, samples: PyTree) -> DelayLine:
-        """`push` of several samples, oldest first along a leading axis."""
+        """Append several samples, oldest first along a leading axis."""
         count = jax.tree.leaves(self.samples)[0].shape[0]
         shifted = jax.tree.map(
             lambda line, new: jnp.concatenate([jnp.asarray(new, line.dtype)[::-1], line])[:count], self.samples, samples
@@ -52,10 +52,13 @@ class DelayLine(eqx.Module):
         return DelayLine(shifted, self.dt)
 
     def read(self, delay: Float[Array, ""] | float) -> PyTree:
-        """The sample ``delay`` seconds before the newest, linear between samples.
+        """Return the sample ``delay`` seconds before the newest, interpolated linearly.
 
-        Quaternions of a `State` are interpolated along the shorter way and normalised. A delay that is traced and does
-        not lie within the line reads as NaN, and so fails whatever is computed from it.
+        Quaternions of a `State` are interpolated along the shorter arc and normalised. A traced delay that is negative
+        or longer than the line gives NaN.
+
+        Args:
+            delay: time before the newest sample, s.
 
         Raises:
             CfbError: the delay is negative, or longer than the line.
@@ -64,16 +67,16 @@ class DelayLine(eqx.Module):
         if not isinstance(delay, Tracer) and not _fits(np.asarray(delay) / self.dt, count):
             longest = (count - 1) * self.dt
             raise CfbError(
-                f"A delay of {delay:g} s does not fit in a line of {longest:g} s; fill one for the longest delay."
+                f"A delay of {delay:g} s does not fit in a line of {longest:g} s; fill the line for the longest delay."
             )
         at = jnp.asarray(delay) / self.dt
         inside = jnp.where(at < 0, 0.0, jnp.where(at > count - 1, count - 1.0, at))
         at = jnp.where(_fits(at, count), inside, jnp.nan)
-        # Weights instead of indexing: the same cost for few samples, and differentiable in the delay.
+        # Weights, not indexing: the same cost for few samples, and differentiable with respect to the delay.
         weights = jnp.maximum(0.0, 1.0 - jnp.abs(jnp.arange(count) - at))
 
         def blend(line):
-            # A count or a flag is blended as a number; weights cast to integers would lose it.
+            # Integers and booleans are interpolated as floats: weights cast to integers would vanish.
             line = line if jnp.issubdtype(line.dtype, jnp.inexact) else line.astype(weights.dtype)
             return jnp.tensordot(weights.astype(line.dtype), line, axes=1)
 

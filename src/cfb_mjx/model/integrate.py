@@ -1,6 +1,6 @@
-"""Time steps of the body: leapfrog with Euler's equations to order 4, MuJoCo's semi-implicit Euler, and classical RK4.
+"""Integrators of the body: leapfrog with Euler's equations to order 4, MuJoCo's semi-implicit Euler, classical RK4.
 
-All take accelerations as functions of (state, stage), where the stage says at which point of the rotors' path the
+All take the accelerations as a function of (state, stage). The stage selects the point of the rotors' path at which the
 loads are evaluated: 0 start, 1 middle, 2 end.
 """
 
@@ -15,25 +15,25 @@ from cfb_mjx.model.vector import Vec, exponential, multiply, renormalise
 
 START, MIDDLE, END = 0, 1, 2
 Accelerations = Callable[..., tuple[Vec, Vec]]
-"""(state, stage, gyroscopic=True) to linear (world) and angular (body) acceleration. ``gyroscopic`` False leaves out
-what the angular velocity of a free body does by itself, -J^-1 (omega x J omega)."""
+"""Function of (state, stage, gyroscopic=True) that returns linear (world) and angular (body) acceleration. With
+``gyroscopic`` False the angular acceleration of a free body, -J^-1 (omega x J omega), is left out."""
 
 
 def leapfrog(accelerations: Accelerations, state: Components, dt, inertia: Vec) -> Components:
-    """Half a step of drift, the loads' kick, half a step of drift; the body turns by Euler's equations. Second order.
+    """Half a step of drift, a kick by the loads, half a step of drift; rotation by Euler's equations. Second order.
 
-    Loads are evaluated once, in the middle of the step. Under their torque, fixed in body axes, the angular velocity
-    follows Euler's equations by Runge and Kutta, order 4: what a free body loses of its energy goes with the sixth
-    power of the angle turned per step (docs/accuracy.md). The attitude follows by one rotation, Magnus' series to
-    order 4 (A. Iserles, S. P. Norsett, On the solution of linear differential equations in Lie groups, Phil. Trans. R.
-    Soc. A 357, 1999).
+    The loads are evaluated once, in the middle of the step. Under their torque, constant in body axes, the angular
+    velocity follows Euler's equations by a Runge-Kutta method of order 4: the energy error of a free body grows with
+    the sixth power of the angle turned per step (docs/accuracy.md). The attitude follows by one rotation, the Magnus
+    series to order 4 (A. Iserles, S. P. Norsett, On the solution of linear differential equations in Lie groups, Phil.
+    Trans. R. Soc. A 357, 1999).
 
-    Forces that depend on velocity or angular velocity see those before the kick.
+    Forces that depend on velocity or angular velocity are evaluated with the values before the kick.
     """
     half, omega = 0.5 * dt, state.body_rate
     position = state.position + state.velocity * half
     factor = _factor(omega * (0.5 * half))
-    # One step of Newton's for the length: the factor's square is 1 + |half angle|^2, and the angle is small.
+    # One Newton step for the length: the square of the factor is 1 + |half angle|^2, and the angle is small.
     middle = multiply(state.quaternion, factor) * (1.5 - 0.5 * factor.dot(factor))
     at = Components(position, state.velocity, middle, omega, state.rotor_speed, state.memory)
     linear, angular = accelerations(at, MIDDLE, gyroscopic=False)
@@ -65,14 +65,14 @@ def leapfrog(accelerations: Accelerations, state: Components, dt, inertia: Vec) 
 
 
 def _factor(tangent: Vec) -> Vec:
-    """A rotation by its half angle's tangent along the axis, as a quaternion of any length."""
+    """Quaternion, not normalised, of the rotation whose half angle has this tangent along its axis."""
     return Vec(1.0, *tangent)
 
 
 def euler(accelerations: Accelerations, state: Components, dt, inertia: Vec) -> Components:
-    """Velocities from accelerations at the start, positions from the new velocities: MuJoCo's Euler, first order.
+    """Velocities from accelerations at the start, positions from the new velocities (MuJoCo's Euler). First order.
 
-    Its global error in position is about dt/2 x velocity change (docs/accuracy.md has the numbers).
+    The global error in position is about dt/2 x velocity change (docs/accuracy.md has the numbers).
     """
     linear, angular = accelerations(state, START)
     velocity = state.velocity + linear * dt
@@ -97,8 +97,8 @@ class _Rates(eqx.Module):
 def runge_kutta(accelerations: Accelerations, state: Components, dt, inertia: Vec) -> Components:
     """Classical RK4 on (p, v, q, omega) with q' = q (x) [0, omega] / 2, renormalised once per step; fourth order.
 
-    MuJoCo's own RK4 composes rotations without the commutator terms and holds applied forces over the step; this one
-    evaluates rotors and effects at every stage.
+    Rotors and effects are evaluated at every stage. MuJoCo's own RK4 instead composes rotations without the commutator
+    terms and holds applied forces over the step.
     """
 
     def rates(at: Components, stage: int) -> _Rates:

@@ -1,4 +1,4 @@
-"""The body inside MuJoCo XLA: the paper's simulator, with floor contact when asked for."""
+"""The body in MuJoCo XLA: the paper's simulator, optionally with floor contact."""
 
 from __future__ import annotations
 
@@ -38,20 +38,20 @@ class _Prepared(eqx.Module):
     model: mjx.Model
     data: mjx.Data
     mass_diagonal: Float[Array, "6"]
-    """Diagonal of the joint-space inertia. For one free body in its centre-of-gravity frame that matrix is diagonal
-    and the same in every state, so it is computed once instead of at every step."""
+    """Diagonal of the joint-space inertia. For one free body in its centre-of-gravity frame the matrix is diagonal and
+    the same in every state, so it is computed once, not at every step."""
 
 
 class MjxBody:
-    """Accelerations from MJX on an MJCF whose only moving body is a free joint named ``cfb``.
+    """Accelerations from MJX for an MJCF whose only moving body has a free joint and the name ``cfb``.
 
-    ``floor=False`` leaves contacts out (several times faster; same free flight). Contact forces are solved anew at
-    every call from the state alone (no warm start), so that a simulation remains a pure function of the 17 numbers.
-    Reverse-mode derivatives exist without the floor only; the contact solver has none.
+    Contact forces are computed at every call from the state alone (no warm start), so that a simulation remains a pure
+    function of the 17 state variables. Reverse-mode derivatives exist only without the floor, because the contact
+    solver has none. Without contacts the body is several times faster and flies the same.
 
     Args:
-        floor: let the drone touch the floor and other static geometry of the MJCF.
-        mjcf: path of another MJCF; static geometry may be added freely to a copy of ``assets/cfb.xml``.
+        floor: whether the drone can touch the floor and other static geometry of the MJCF.
+        mjcf: path of another MJCF; a copy of ``assets/cfb.xml`` may be given any static geometry.
 
     Raises:
         CfbError: the MJCF cannot be compiled, lacks the free joint, or has other moving bodies.
@@ -72,12 +72,12 @@ class MjxBody:
         mass, inertia = parameters.mass, Vec.unstack(parameters.inertia).stack()
         center = Vec.unstack(parameters.center_of_gravity).stack()
         moving = jnp.asarray(self.mujoco_model.geom_bodyid == body)
-        # Contact softness is scaled with the inverse inertia of the free body: exact, not a fresh mj_setConst.
+        # The softness of contacts scales with the inverse inertia of the free body: exact, without mj_setConst.
         inverse = jnp.stack([1 / mass, jnp.mean(1 / inertia)])
         model = model.replace(
             opt=model.opt.replace(
                 gravity=jnp.stack([jnp.zeros_like(mass), jnp.zeros_like(mass), -parameters.gravity]),
-                # Contacts are kept softer than the step can resolve.
+                # MuJoCo keeps contacts at least as soft as the step can resolve.
                 timestep=jnp.asarray(dt, model.opt.timestep.dtype),
             ),
             body_mass=model.body_mass.at[body].set(mass),
@@ -85,7 +85,7 @@ class MjxBody:
             body_inertia=model.body_inertia.at[body].set(inertia),
             body_ipos=model.body_ipos.at[body].set(0.0),
             body_iquat=model.body_iquat.at[body].set(jnp.array([1.0, 0.0, 0.0, 0.0])),
-            # The body frame sits at the centre of gravity (see Components), so it is the geoms that move.
+            # The body frame is at the centre of gravity (see Components), so the geoms are moved.
             geom_pos=jnp.where(moving[:, None], model.geom_pos - center, model.geom_pos),
             body_invweight0=model.body_invweight0.at[body].set(inverse),
         )
@@ -96,7 +96,7 @@ class MjxBody:
     ) -> tuple[Vec, Vec]:
         model, torque = prepared.model, wrench.torque
         if not gyroscopic:
-            # MuJoCo takes the gyroscopic torque off: given to it before, it cancels.
+            # MuJoCo subtracts the gyroscopic torque; adding it here cancels it.
             inertia = Vec.unstack(prepared.mass_diagonal[3:])
             torque = torque + state.body_rate.cross(inertia * state.body_rate)
         data = prepared.data.replace(
@@ -121,7 +121,7 @@ class MjxBody:
         return f"MjxBody(floor={self.floor}, mjcf={self.mjcf!r})"
 
 
-# Both are traced once, however many stages an integrator has.
+# Jitted, so that they are traced once for all stages of an integrator.
 @jax.jit
 def _with_contact(model: mjx.Model, data: mjx.Data) -> jax.Array:
     return mjx.forward(model, data).qacc
@@ -129,7 +129,7 @@ def _with_contact(model: mjx.Model, data: mjx.Data) -> jax.Array:
 
 @jax.jit
 def _contact_free(model: mjx.Model, data: mjx.Data, mass_diagonal: jax.Array) -> jax.Array:
-    """qacc of `mjx.forward` where nothing touches: its stages without geoms, sites, actuators and constraints."""
+    """Compute qacc of `mjx.forward` without contacts: its stages without geoms, sites, actuators and constraints."""
     data = mjx.kinematics(model, data)
     data = mjx.com_pos(model, data)
     data = mjx.com_vel(model, data)
@@ -152,7 +152,7 @@ def _compile(mjcf: str | None, floor: bool) -> mujoco.MjModel:
         specification.option.disableflags |= int(_NOT_NEEDED)
         if not floor:
             specification.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-            # Geoms cost kinematics even where they cannot touch.
+            # Geoms cost kinematics even if they cannot touch.
             for geom in list(specification.geoms):
                 specification.delete(geom)
         for site in list(specification.sites):
@@ -175,7 +175,7 @@ def _body_index(model: mujoco.MjModel) -> int:
 
 @functools.lru_cache(maxsize=8)
 def _on_device(mjcf: str | None, floor: bool, x64: bool):
-    # Host copies: a cached device array made during one trace must not leak into another.
+    # Host copies: a device array that is cached during one trace must not leak into another.
     with jax.ensure_compile_time_eval():
         model = mjx.put_model(_compile(mjcf, floor), impl="jax")
         data = mjx.make_data(model)

@@ -39,20 +39,20 @@ from cfb_mjx.parameters.parameters import physical_inertia
 
 
 class Quadrotor(eqx.Module):
-    """The 17-state model (paper eqs. 1-10): a pytree of parameters and effects plus static choices.
+    """The 17-state model (paper eqs. 1-10): a pytree of parameters and effects, plus static choices.
 
-    Batch it with ``vmap`` over itself: every array in it may carry batch axes.
+    Use ``jax.vmap`` over the model itself for a batch: every array in it may carry batch axes.
 
     Attributes:
-        parameters: constants.
-        effects: physical effects beyond the paper's model; their order means nothing (`Effect.rank`).
+        parameters: constants of the drone.
+        effects: physical effects beyond the paper's model; their order has no influence (`Effect.rank`).
         body: `RigidBody()` (closed form, no ground, fastest) or `MjxBody()` (MuJoCo XLA, floor contact).
         dt: time between commands, s.
         substeps: integration steps per command.
         integrator: ``"leapfrog"`` (second order, free rotation fourth order), ``"euler"`` (MuJoCo's
             semi-implicit Euler, first order, for parity with MuJoCo) or ``"rk4"`` (fourth order, three times the cost).
         rotor_loads: ``"instant"`` evaluates thrust and torque at the integrator's stages; ``"mean"`` applies their
-            exact impulses over each integration step (``docs/accuracy.md`` says what that buys).
+            exact impulses over each integration step (``docs/accuracy.md`` compares the two).
     """
 
     parameters: Parameters
@@ -75,23 +75,25 @@ class Quadrotor(eqx.Module):
         bound = [type(effect).name for effect in self.effects if type(effect).rank == CONSTRAINT]
         if len(bound) > 1:
             raise CfbError(f"{' and '.join(bound)} each follow from all other forces; a model can have one of them.")
-        # A wind has a conductance of its own.
+        # A wind may have a conductance of its own, which acts without any other effect.
         _require_felt(self.effects, [e.name for e in self.effects if overrides(e, "air") and not overrides(e, "body")])
 
     @classmethod
     def from_file(cls, model: ModelFile | str | Path = "cfb-guards", **choices) -> Quadrotor:
-        """From a preset name, a model YAML or a loaded `ModelFile`, with its effects.
+        """Build the drone, with its effects, from a preset name, a model YAML or a loaded `ModelFile`.
+
+        Further keyword arguments set fields of the class, such as ``body`` and ``dt``.
 
         Raises:
-            CfbError: as `cfb_mjx.parameters.load_model_file`; an unknown effect or an impossible number of one; or
-                effects that together make an impossible drone.
+            CfbError: the file is bad (see `cfb_mjx.parameters.load_model_file`), an effect is unknown or has an
+                impossible value, or the effects together make an impossible drone.
 
         Warns:
-            CfbWarning: unusual numbers, or a drone that cannot hover.
+            CfbWarning: unusual values, or a drone that cannot hover.
         """
         model = model if isinstance(model, ModelFile) else load_model_file(model)
         where = model.path or model.name
-        # What a model file says of the sensors does not change how the drone flies.
+        # Sensor faults do not change how the drone flies.
         physical = (item for item in model.effects if item.get("name") not in SENSOR_FAULTS)
         effects = tuple(effect_from_mapping(item, where, model.parameters()) for item in physical)
         _require_felt(effects, [e.name for e in effects if isinstance(e, Wind) and not np.any(e.conductance)], where)
@@ -100,46 +102,49 @@ class Quadrotor(eqx.Module):
         return found
 
     def changed_parameters(self) -> Parameters:
-        """The parameters with what effects change in them (payload, centre of gravity ...).
+        """Return the parameters with the changes of all effects (payload, centre of gravity ...).
 
         Raises:
-            CfbError: a parameter, or a number of an effect, that is no array or has another shape, named.
+            CfbError: a parameter or a field of an effect is not an array or has a wrong shape.
         """
         self.parameters.require_arrays()
         for effect in self.effects:
             for field in effect.limits:
                 if isinstance(value := getattr(effect, field), int | float):
-                    raise CfbError(f"{effect.name}.{field} = {value!r} is no array; put jnp.asarray(...) there.")
+                    raise CfbError(f"{effect.name}.{field} = {value!r} is not an array; put jnp.asarray(...) there.")
         parameters = self.parameters
         for i in in_order(self.effects):
             parameters = self.effects[i].change(parameters)
         return parameters
 
     def steps_per_command(self, control_dt_s: float) -> int:
-        """Simulation steps from one command of a controller to the next.
+        """Return the number of simulation steps from one command of a controller to the next.
+
+        Args:
+            control_dt_s: time between two commands, s.
 
         Raises:
-            CfbError: its control step is no multiple of the simulation step.
+            CfbError: the control step is not a multiple of the simulation step.
         """
         steps = control_dt_s / self.dt
         if round(steps) < 1 or abs(steps - round(steps)) > 1e-6:
-            raise CfbError(f"control_dt_s = {control_dt_s} is no multiple of the simulation step of {self.dt} s.")
+            raise CfbError(f"control_dt_s = {control_dt_s} is not a multiple of the simulation step of {self.dt} s.")
         return round(steps)
 
     def hover_state(self, position: ArrayLike | Sequence[Any] = (0.0, 0.0, 1.0)) -> State:
-        """Level and motionless at ``position`` [m], rotors carrying the weight (forces of effects not considered)."""
+        """Level state at rest at ``position`` [m] with rotors that carry the weight (forces of effects ignored)."""
         return begin(self, State.at_rest(position, rotors.hover_rotor_speed(self.changed_parameters())))
 
     def hover_command(self) -> Float[Array, "4"]:
-        """Commands that hold `hover_state` (forces of effects not considered)."""
+        """Commands that hold `hover_state` (forces of effects ignored)."""
         return rotors.hover_command(self.changed_parameters())
 
 
 def _require_possible(model: Quadrotor, described: ModelFile, where: str) -> None:
-    """Refuse what effects make of a drone where that cannot be, and warn where it cannot hover.
+    """Refuse effects that together make an impossible drone, and warn if it cannot hover.
 
-    A predictor's inertia is free; and of a fitted one (it comes with its uncertainty) the best estimate may be one that
-    no body has: of that one is warned.
+    The inertia of a predictor is free. The best estimate of a fitted inertia (one with an uncertainty) may be
+    impossible for a rigid body; it only gives a warning.
     """
     changed = model.changed_parameters()
     if concrete(changed.mass) is None:
@@ -149,11 +154,11 @@ def _require_possible(model: Quadrotor, described: ModelFile, where: str) -> Non
         specification.check(getattr(changed, name), f"{where}: with its effects, parameters.{name}", together=False)
     if bodies and not physical_inertia(changed.inertia):
         moments = ", ".join(f"{x:.3g}" for x in changed.inertia.tolist())
-        said = f"{where}: with its effects, parameters.inertia = [{moments}] kg m^2 is that of no rigid body"
+        said = f"{where}: with its effects, parameters.inertia = [{moments}] kg m^2 is impossible for a rigid body"
         said += " (one moment is larger than the sum of the other two)"
         if not any("uncertainty" in item for item in described.effects if item.get("name") == Inertia.name):
             raise CfbError(f"{said}.")
-        warnings.warn(f"{said}; a fit may err so far.", CfbWarning, stacklevel=3)
+        warnings.warn(f"{said}; the error of a fit may be that large.", CfbWarning, stacklevel=3)
     speed = changed.motor_gain + changed.motor_speed_offset
     lift, weight = float(jnp.sum(rotors.thrust(changed, speed))), float(changed.mass * changed.gravity)
     if lift < weight:
@@ -162,7 +167,7 @@ def _require_possible(model: Quadrotor, described: ModelFile, where: str) -> Non
 
 
 def _require_felt(effects: tuple[Effect, ...], blowing: list[str], where: str = "") -> None:
-    """Refuse effects whose only deed is to move the air, in a model where nothing depends on it."""
+    """Refuse effects that only move the air in a model in which no effect depends on the air."""
     if blowing and not any(type(effect).feels_air for effect in effects):
         raise CfbError(
             f"{where and where + ': '}{', '.join(blowing)}: the air moves, but no effect of the model feels it; "
@@ -171,11 +176,11 @@ def _require_felt(effects: tuple[Effect, ...], blowing: list[str], where: str = 
 
 
 def begin(model: Quadrotor, state: State) -> State:
-    """The state with a memory for every effect of the model, if it has none yet: that of a long steady flight."""
+    """Add the memory of a long steady flight to a state without memory; other states are returned unchanged."""
     if len(state.memory) == len(model.effects):
         return state
     if len(state.memory):
-        raise ValueError(f"the state remembers {len(state.memory)} effects, the model has {len(model.effects)}")
+        raise ValueError(f"the state has memories of {len(state.memory)} effects, the model has {len(model.effects)}")
     parameters, speed = _unstacked(model.changed_parameters()), Vec.unstack(jnp.asarray(state.rotor_speed))
     memory = tuple(effect.begin(speed, parameters, model.dt / model.substeps) for effect in model.effects)
     memory = jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec))
@@ -183,24 +188,24 @@ def begin(model: Quadrotor, state: State) -> State:
 
 
 class Prepared(eqx.Module):
-    """A model made ready for steps of one length."""
+    """A model prepared for integration steps of one length."""
 
     model: Quadrotor
     parameters: Parameters
-    """With `Vec` in place of arrays: slicing them anew in every step would cost more than the step."""
+    """Parameters with `Vec` in place of arrays: slicing them in every step would cost more than the step."""
     rotors: rotors.RotorConstants
     body: object
     dt: Array
     wrench_once: bool = eqx.field(static=True, default=True)
-    """Keep XLA from computing the wrench anew for every component of the acceleration; a derivative, which needs more
-    than the wrench again, is faster without."""
+    """Keep XLA from computing the wrench again for every component of the acceleration. Derivatives, which need more
+    intermediate results, are faster without."""
 
 
 def prepare(model: Quadrotor, dt: float | Float[Array, ""] | None = None) -> Prepared:
     """Compute once what every integration step of ``dt`` seconds (default: the model's) needs.
 
     Raises:
-        CfbError: a parameter that is no array, or has batch axes (`jax.vmap` over the model takes them), named.
+        CfbError: a parameter is not an array, or has batch axes (use `jax.vmap` over the model).
     """
     model.parameters.require_arrays(batched=False)
     dt = model.dt / model.substeps if dt is None else dt
@@ -215,27 +220,27 @@ def _unstacked(parameters: Parameters) -> Parameters:
 
 
 def step(model: Quadrotor, state: State, command: Float[Array, "4"]) -> State:
-    """Advance by ``model.dt`` with ``command`` (clipped to [0, 1]) held."""
+    """Advance the state by ``model.dt`` with a constant ``command`` (clipped to [0, 1])."""
     prepared = prepare(model)
     center = prepared.parameters.center_of_gravity
     return stack(advance(prepared, unstack(begin(model, state), center), Vec.unstack(command)), center)
 
 
 def advance(prepared: Prepared, state: Components, command: Vec) -> Components:
-    """`step` on components: ``substeps`` integration steps with the command held."""
+    """`step` on components: ``substeps`` integration steps with a constant command."""
     for _ in range(prepared.model.substeps):
         state = integrate_commanded(prepared, state, command)
     return state
 
 
 def integrate_commanded(prepared: Prepared, state: Components, command: Vec) -> Components:
-    """One integration step of ``prepared.dt`` with the command held."""
+    """One integration step of ``prepared.dt`` with a constant command."""
     path, memory = commanded_path(prepared, state.rotor_speed, state.memory, command)
     return _integrate(prepared, remembering(state, memory), path)
 
 
 def commanded_path(prepared: Prepared, rotor_speed: Vec, memory: tuple, command: Vec) -> tuple[rotors.RotorPath, tuple]:
-    """How the rotors run from ``rotor_speed`` while the command is held for ``prepared.dt``, and the new memory."""
+    """Path of the rotor speeds during ``prepared.dt`` with a constant command, and the new memory."""
     model, parameters, remembered = prepared.model, prepared.parameters, list(memory)
     command = command.map(lambda u: jnp.clip(u, 0.0, 1.0))
     order = in_order(model.effects)
@@ -251,12 +256,12 @@ def commanded_path(prepared: Prepared, rotor_speed: Vec, memory: tuple, command:
 
 
 def remembering(state: Components, memory: tuple) -> Components:
-    """The state with another memory."""
+    """Replace the memory of a state."""
     return Components(state.position, state.velocity, state.quaternion, state.body_rate, state.rotor_speed, memory)
 
 
 def integrate_measured(prepared: Prepared, state: Components, end_speed: Vec) -> Components:
-    """One integration step with rotor speeds going straight from the state's to ``end_speed`` [rad/s]."""
+    """One integration step with rotor speeds that change linearly from the state's to ``end_speed`` [rad/s]."""
     return _integrate(prepared, state, rotors.path_between(prepared.rotors, state.rotor_speed, end_speed))
 
 
@@ -288,7 +293,7 @@ def _integrate(prepared: Prepared, state: Components, path: rotors.RotorPath) ->
 
 
 def specific_force(model: Quadrotor, state: State) -> Float[Array, "3"]:
-    """What an ideal accelerometer at the rotors' centre reads, body axes, m/s^2 (rotor speeds taken as steady)."""
+    """Reading of an ideal accelerometer at the rotors' centre, body axes, m/s^2 (rotor speeds assumed steady)."""
     prepared = prepare(model, 0.0)
     center = prepared.parameters.center_of_gravity
     at = unstack(begin(model, state), center)
@@ -300,19 +305,19 @@ def specific_force(model: Quadrotor, state: State) -> Float[Array, "3"]:
 def at_rotor_center(parameters: Parameters, wrench: Wrench, body_rate: Vec) -> tuple[Vec, Vec]:
     """Angular acceleration [rad/s^2] and specific force [m/s^2] at the rotors' centre under ``wrench`` about it.
 
-    Body axes, free flight: what a gyro's slope and an accelerometer there show.
+    In body axes, in free flight: the derivative of a gyro and the reading of an accelerometer there.
     """
     center, inertia = Vec.unstack(parameters.center_of_gravity), Vec.unstack(parameters.inertia)
     about = wrench.torque - center.cross(wrench.force)
     turning = (about - body_rate.cross(inertia * body_rate)) * inertia.map(lambda x: 1 / x)
     lever = -center
-    # The centre of gravity moves with F / m; a point beside it also turns about it.
+    # The centre of gravity accelerates with F / m; a point beside it also rotates about it.
     force = wrench.force * (1 / parameters.mass) + turning.cross(lever) + body_rate.cross(body_rate.cross(lever))
     return turning, force
 
 
 def conditions(prepared: Prepared, at: Components, speed: Vec) -> tuple[Condition, ...]:
-    """The flight condition as each effect sees it."""
+    """Flight condition for each effect: its own memory, and the air that all effects move."""
     effects = prepared.model.effects
     if not effects:
         return ()
@@ -326,7 +331,7 @@ def conditions(prepared: Prepared, at: Components, speed: Vec) -> tuple[Conditio
 
 
 def in_still_air(prepared: Prepared, at: Components, speed: Vec) -> Condition:
-    """The flight condition without effects."""
+    """Flight condition in still air, without memory."""
     parameters = prepared.parameters
     center = Vec.unstack(parameters.center_of_gravity)
     velocity = rotate_inverse(at.quaternion, at.velocity) - at.body_rate.cross(center)
@@ -340,7 +345,7 @@ def advanced(prepared: Prepared, at: tuple[Condition, ...], acceleration: Vec) -
 
 
 def followed(prepared: Prepared, at: tuple[Condition, ...], acceleration: Vec, missed: Vec) -> tuple:
-    """`advanced` beside a log: measured acceleration, and how much of it the model misses (world, m/s^2)."""
+    """`advanced` along a log: measured acceleration, and the part of it that the model misses (world, m/s^2)."""
     pairs = zip(prepared.model.effects, at, strict=True)
     return tuple(effect.follow(condition, acceleration, missed, prepared.dt) for effect, condition in pairs)
 

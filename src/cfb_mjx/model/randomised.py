@@ -1,7 +1,7 @@
-"""Whole drones drawn from ranges: their parameters and their effects.
+"""Random drones: parameters and effects drawn from ranges.
 
-For instance ``vmap(lambda key: sample_drone(key, Quadrotor.from_file("cfb-fleet"), load_randomisation("cfb-fleet")))``
-draws drones that differ as measured ones do.
+For example ``vmap(lambda key: sample_drone(key, Quadrotor.from_file("cfb-fleet"), load_randomisation("cfb-fleet")))``
+draws drones that differ as much as measured ones do.
 """
 
 from __future__ import annotations
@@ -30,19 +30,23 @@ def sample_drone(
     randomisation: Randomisation,
     magnitude: float | Float[Array, ""] = 1.0,
 ) -> Quadrotor:
-    """Draw one drone. ``vmap`` over ``key`` for many; the same key gives the same drone.
+    """Draw a random drone. Use ``vmap`` over ``key`` for many; the same key gives the same drone.
+
+    If ``nominal`` or ``magnitude`` is traced, impossible draws cannot be refused and become NaN, as in
+    `sample_parameters`.
 
     Args:
         key: PRNG key.
-        nominal: about which to draw (without batch axes).
+        nominal: centre of the ranges (without batch axes).
         randomisation: ranges of parameters and effects.
         magnitude: factor on every range; 0 returns the nominal drone. May be traced.
 
-    Raises:
-        CfbError: ranges of an effect that the drone does not have, or whose draws could lie beyond what can be
-            (`require_possible`).
+    Returns:
+        The drawn drone.
 
-    Where ``nominal`` or ``magnitude`` is traced, a number drawn beyond what can be is NaN, as in `sample_parameters`.
+    Raises:
+        CfbError: a range of an effect that the drone does not have, or ranges that allow impossible values
+            (`require_possible`).
     """
     require_possible(nominal, randomisation, magnitude)
     parameters = sample_parameters(key, nominal.parameters, replace(randomisation, effects=()), magnitude)
@@ -50,7 +54,7 @@ def sample_drone(
     for effect, field, spread in randomisation.effects:
         at, own = _found(nominal, effect, field, spread, randomisation)
         value = jnp.asarray(getattr(own, field))
-        # By its name: adding a range never changes the draws of the others.
+        # Keyed by name: adding a range never changes the draws of the others.
         of_field = jax.random.fold_in(key, crc32(f"{effect}.{field}".encode()))
         unit = jax.random.uniform(of_field, value.shape, value.dtype, -1.0, 1.0)
         reach = spread.width.astype(value.dtype) * (value if spread.relative else 1.0)
@@ -67,17 +71,17 @@ def require_possible(
     magnitude: float | Float[Array, ""] = 1.0,
     what: str = "magnitude",
 ) -> None:
-    """Refuse ranges whose draws could lie beyond what can be. Nothing is said of what is traced.
+    """Refuse ranges that allow impossible values. Traced values are not checked.
 
     Args:
-        nominal: about which to draw.
+        nominal: centre of the ranges.
         randomisation: ranges.
         magnitude: factor on every range.
-        what: the magnitude is called, for messages.
+        what: name of the magnitude in messages.
 
     Raises:
-        CfbError: an effect that the drone does not have, or a number that could be drawn beyond its limits, and the
-            largest magnitude that fits it.
+        CfbError: an effect that the drone does not have, or a range that exceeds the limits of its field. The message
+            gives the largest magnitude that fits.
     """
     require_possible_parameters(nominal.parameters, randomisation, magnitude, what)
     asked = concrete(magnitude)
@@ -91,18 +95,18 @@ def require_possible(
         if np.max(np.abs(asked)) > fitting:
             raise CfbError(
                 f"{what} = {np.max(np.abs(asked)):g}: randomisation '{randomisation.name}' could then draw a "
-                f"{effect}.{field} that does not lie between {limits.hard_low:g} and {limits.hard_high:g} "
-                f"{own.units[field]}; at most {max(np.floor(1e3 * fitting) / 1e3, 0.0):g} fits this drone."
+                f"{effect}.{field} outside {limits.hard_low:g} to {limits.hard_high:g} {own.units[field]}; at most "
+                f"{max(np.floor(1e3 * fitting) / 1e3, 0.0):g} fits this drone."
             )
 
 
 def differences(nominal: Quadrotor, drone: Quadrotor, randomisation: Randomisation) -> Float[Array, " n"]:
-    """How a drawn drone differs from the nominal one, number by number, over the half-widths of the ranges.
+    """Differences between a drawn drone and the nominal one, divided by the half-widths of the ranges.
 
     Args:
-        nominal: about which it was drawn.
-        drone: as `sample_drone` drew it.
-        randomisation: from these ranges.
+        nominal: centre of the ranges.
+        drone: drone drawn by `sample_drone`.
+        randomisation: ranges of the draw.
     """
     found = [jnp.zeros(0)]
     for name, spread in randomisation.ranges:
@@ -120,7 +124,7 @@ def differences(nominal: Quadrotor, drone: Quadrotor, randomisation: Randomisati
 def _found(
     nominal: Quadrotor, effect: str, field: str, spread: Range, randomisation: Randomisation
 ) -> tuple[int, Effect]:
-    """Where a drone has the effect that a range is of."""
+    """Index and effect of the drone that a range belongs to; refuses a range that does not fit."""
     name = f"randomisation '{randomisation.name}'"
     for i, own in enumerate(nominal.effects):
         if type(own).name != effect:
@@ -138,6 +142,6 @@ def _found(
             )
         return i, own
     raise CfbError(
-        f"{name} varies {effect}, which this drone does not have; add it to the model's effects, neutral if you like, "
+        f"{name} varies {effect}, which this drone does not have; add it to the model's effects (it may be neutral), "
         "or take a model that has it."
     )

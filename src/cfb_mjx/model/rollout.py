@@ -1,4 +1,4 @@
-"""Many steps, many drones: rollouts under a command sequence, and chunked execution of a batch too big for memory."""
+"""Rollouts under a sequence of commands, and chunked execution of batches that do not fit into memory."""
 
 from __future__ import annotations
 
@@ -17,35 +17,38 @@ from cfb_mjx.devices import Devices
 from cfb_mjx.engine import gpu, primitive, scalars
 from cfb_mjx.engine.cpu_kernel import HELD
 from cfb_mjx.engine.lanes import System
-from cfb_mjx.model.bodies import RigidBody
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec
 
 _MANY = 10
-"""Steps from which it pays to fly drones in groups (`cfb_mjx.engine.primitive`)."""
+"""Number of steps from which it pays to fly drones in groups (`cfb_mjx.engine.primitive`)."""
 _MOST_NUMBERS = 200
-"""Of a model flown in groups, where each is computed on its own: with the 231 of a `ResidualFormula` that takes twice
-as long to compile, and flies no faster."""
+"""Largest number of values in a model that is flown in groups, where each value is computed separately. With the 231 of
+a `ResidualFormula` groups take twice as long to compile and are no faster."""
 
 
 def rollout(
     model: Quadrotor, state: State, commands: Float[Array, "steps 4"], *, hold: int = 1, every: int = 1
 ) -> State:
-    """Fly ``commands``; return the states after every ``every``-th command.
+    """Fly ``commands`` and return the states after every ``every``-th command.
 
-    Use ``jax.vmap`` over any of model, state and commands; differentiable in all three. A batch of commands is read
-    fastest with the batch axis last: ``jax.vmap(rollout, in_axes=(None, 0, 2))`` on commands (steps, 4, drones).
+    Use ``jax.vmap`` over model, state and commands; the result is differentiable with respect to all three. A batch of
+    commands is read fastest with the batch axis last: ``jax.vmap(rollout, in_axes=(None, 0, 2))`` for commands (steps,
+    4, drones).
 
     Args:
         model: the drone.
         state: initial state, without batch axes.
-        commands: (steps, 4) in [0, 1].
+        commands: (steps, 4), each in [0, 1].
         hold: number of steps of ``model.dt`` for which each command is held.
-        every: keep one state in so many commands; ``steps`` must be a multiple of it.
+        every: number of commands per returned state; must divide ``steps``.
 
     Returns:
-        `State` with leading axis ``steps // every``; the first entry is the state after ``every`` commands.
+        `State` with leading axis ``steps // every``; its first entry is the state after ``every`` commands.
+
+    Raises:
+        ValueError: ``hold`` or ``every`` is below one, or ``every`` does not divide ``steps``.
     """
     steps = commands.shape[0]
     if hold < 1 or every < 1 or steps % every:
@@ -69,7 +72,7 @@ def rollout(
 
 
 def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 4"], *, hold: int = 1) -> State:
-    """As `rollout`, but return the last state only; the trajectory is never stored."""
+    """Fly ``commands`` and return only the last state, without storing the trajectory. Arguments as for `rollout`."""
     prepared = prepare(model)
 
     def plain(prepared, state, commands):
@@ -83,7 +86,7 @@ def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 
 
 
 def _prepared(model: Quadrotor) -> Prepared:
-    # What steps need of the parameters has been prepared; effects bring their own.
+    # The preparation holds what steps need of the parameters; effects have their own arrays.
     return eqx.tree_at(lambda p: p.model.parameters, prepare(model), None)
 
 
@@ -92,33 +95,31 @@ def _stepped(prepared: Prepared, state: Components, row: Array, plain: bool) -> 
 
 
 SYSTEM = System(_prepared, _stepped)
-"""The drone, as `cfb_mjx.engine` advances it."""
+"""The drone as a system of `cfb_mjx.engine`."""
 
 
 def _rows(commands: Float[Array, "rows 4"]) -> Float[Array, "rows 4"]:
-    # Taken apart and put together again, XLA reads each drone's own commands faster: row rollout of cfb bench.
+    # Unstacked and stacked again, XLA reads each drone's own commands faster: row rollout of cfb bench.
     return Vec.unstack(commands).stack()
 
 
 def fits_one_kernel(model: Quadrotor) -> bool:
     """Whether this backend computes many steps of the model in one function (`cfb_mjx.engine.cpu_kernel`)."""
-    if jax.default_backend() != "cpu" or not isinstance(model.body, RigidBody):
+    if jax.default_backend() != "cpu":
         return False
-    if not model.effects:
-        return True
     leaves, structure = jax.tree.flatten(model)
     arrays = [isinstance(x, jax.Array | np.ndarray | np.generic) for x in leaves]
     given = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) if a else x for x, a in zip(leaves, arrays, strict=True))
     try:
         hash((structure, given))
-    except TypeError:  # an effect holds something that can be no part of a program's name
+    except TypeError:  # an effect holds a static value that is not hashable
         return False
     return _fits(structure, given)
 
 
 @functools.lru_cache(maxsize=1024)
 def _fits(structure, given: tuple) -> bool:
-    """Whether steps of such a model consist of numbers and of what one function can hold, whoever wrote its effects."""
+    """Whether steps of such a model consist of scalar operations that one compiled function can hold."""
     examples = [x for x in given if isinstance(x, jax.ShapeDtypeStruct)]
 
     def model_of(arrays) -> Quadrotor:
@@ -143,15 +144,15 @@ def _fits(structure, given: tuple) -> bool:
 
 
 def fly_rows(prepared: Prepared, components: Components, rows: Vec, hold: int) -> Components:
-    """Advance by all ``rows`` of commands, four arrays (n,), each held for ``hold`` steps."""
-    # Reverse mode keeps the state of every step and computes the rest of the step again: what it would keep otherwise
-    # costs more to write and read than to compute, and there is twenty times as much of it.
+    """Advance by all ``rows`` of commands (four arrays (n,)), each held for ``hold`` steps."""
+    # Reverse mode stores the state of every step and computes the rest of the step again: storing the intermediate
+    # results, twenty times as many, costs more than computing them.
     step = jax.checkpoint(lambda components, row: advance(prepared, components, row), prevent_cse=False)
 
     def one(components, row):
         if hold == 1:
             return step(components, row), None
-        # scan, not fori_loop: it has a reverse mode.
+        # scan, not fori_loop, because fori_loop has no reverse mode.
         return jax.lax.scan(lambda c, _: (step(c, row), None), components, length=hold)[0], None
 
     if rows[0].shape[0] == 1:
@@ -160,8 +161,8 @@ def fly_rows(prepared: Prepared, components: Components, rows: Vec, hold: int) -
 
 
 def in_components(prepared: Prepared, state: State, commands: Array) -> Components:
-    """The state in components, ready to be flown."""
-    # One precision throughout, or the scan's carry would change type.
+    """Convert a state to components, with a memory and in one precision."""
+    # Otherwise the type of the scan's carry would change.
     dtype = jnp.result_type(prepared.parameters.mass, state.position, commands)
     components = unstack(begin(prepared.model, state), prepared.parameters.center_of_gravity)
     return jax.tree.map(lambda x: x.astype(dtype), components)
@@ -174,9 +175,9 @@ def in_chunks(
     progress: Callable[[int, int], None] | None = None,
     over: Devices | None = None,
 ) -> Any:
-    """``vmap(function)(*arguments)`` executed ``size`` examples at a time, results gathered in host memory.
+    """Compute ``vmap(function)(*arguments)`` for ``size`` examples at a time; the results are collected in host memory.
 
-    Let ``function`` draw what is large (parameters, commands) from a PRNG key and return what is small: then a million
+    If ``function`` draws large inputs (parameters, commands) from a PRNG key and returns small results, a million
     rollouts need the memory of ``size``.
 
     Args:
@@ -184,11 +185,14 @@ def in_chunks(
         size: examples per compiled call.
         arguments: pytrees with a common leading axis.
         progress: called with (done, total) after each chunk.
-        over: devices that share every chunk, `Devices.take(n)`: of this process, or of several that run as one, which
-            then all call this with the same arguments.
+        over: devices that share every chunk, `Devices.take(n)`: those of this process, or of several processes that
+            run as one. In the latter case all processes must call this with the same arguments.
 
     Returns:
-        The pytree of stacked results as numpy arrays; in every process.
+        The pytree of stacked results as numpy arrays, in every process.
+
+    Raises:
+        ValueError: there are no examples, or ``size`` is below one.
     """
     total = len(jax.tree.leaves(arguments)[0])
     if size < 1 or total < 1:
@@ -199,7 +203,7 @@ def in_chunks(
     pieces = []
     for start in range(0, total, size):
         stop = min(start + size, total)
-        # The last chunk repeats its final example, so that it reuses the compiled program.
+        # The last chunk is padded with its final example, to reuse the compiled program.
         index = np.minimum(np.arange(start, start + width), stop - 1)
         result = over.here(batched(*over.along(jax.tree.map(lambda x, i=index: x[i], arguments))))
         pieces.append(jax.tree.map(lambda x, n=stop - start: x[:n], result))

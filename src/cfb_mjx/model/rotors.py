@@ -1,8 +1,8 @@
 """Motors and rotors: exact first-order speed, cubic thrust and torque, reactive torque (paper eqs. 5-10).
 
-Within one step the command is held, so each rotor speed is an exponential known in closed form. A `RotorPath` holds
-what the body needs of it: speeds and accelerations at the start, middle and end, and the step means of thrust and
-torque. Nothing here depends on the body that carries the rotors.
+The command is constant within a step, so each rotor speed is an exponential in closed form. A `RotorPath` holds what
+the body needs of it: speeds and accelerations at the start, middle and end, and the mean thrust and torque over the
+step. Nothing here depends on the body that carries the rotors.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class RotorLoads(eqx.Module):
     torque: Vec
     """Aerodynamic torque magnitude, N m (the body feels it with `YAW_SIGNS`)."""
     rate: Vec
-    """Rate of rotor speed Omega', rad/s^2; times J_m it is the reactive torque."""
+    """Derivative of the rotor speed, Omega', rad/s^2; times J_m it is the reactive torque."""
 
 
 class RotorPath(eqx.Module):
@@ -49,7 +49,7 @@ class RotorPath(eqx.Module):
 
 
 class RotorConstants(eqx.Module):
-    """What every step of one length needs of the parameters, computed once outside the time loop."""
+    """Constants of all steps of one length, computed once outside the time loop."""
 
     decay: Vec
     decay_half: Vec
@@ -66,7 +66,7 @@ class RotorConstants(eqx.Module):
 
 
 class Polynomial(eqx.Module):
-    """c3 x^3 + c2 x^2 + c1 x of each rotor's speed x [rad/s]; sigma and the rotor's own factor are folded in."""
+    """c3 x^3 + c2 x^2 + c1 x of each rotor's speed x [rad/s]; includes sigma and the rotor's own factor."""
 
     c3: Vec
     c2: Vec
@@ -76,7 +76,7 @@ class Polynomial(eqx.Module):
         return x * (self.c1 + x * (self.c2 + x * self.c3))
 
     def mean(self, a: Vec, b: Vec, constants: RotorConstants) -> Vec:
-        """Mean over the step along x = a + b exp(-t/T): the Taylor series about a ends after three terms."""
+        """Mean over the step along x = a + b exp(-t/T), exact: the Taylor series about a ends after three terms."""
         first = self.c1 + a * (2 * self.c2 + a * (3 * self.c3))
         second = self.c2 + 3 * (a * self.c3)
         return self(a) + b * (
@@ -106,13 +106,13 @@ def prepare(parameters: Parameters, dt: Float[Array, ""] | float) -> RotorConsta
 
 
 def with_time_constant(constants: RotorConstants, time_constant: Vec, dt) -> RotorConstants:
-    """The same rotors with other lags, s."""
+    """Replace the time constants, s."""
     changed = _lag(time_constant, dt)
     return eqx.tree_at(lambda c: tuple(getattr(c, name) for name in changed), constants, tuple(changed.values()))
 
 
 def _lag(time_constant: Vec, dt) -> dict[str, Vec]:
-    """What depends on the lags, per rotor."""
+    """Constants that depend on the time constants, per rotor."""
     x = dt / time_constant.stack()
     safe = jnp.where(x > 0, x, 1.0)
 
@@ -130,7 +130,7 @@ def _lag(time_constant: Vec, dt) -> dict[str, Vec]:
 
 
 def steady_speed(constants: RotorConstants, command: Vec) -> Vec:
-    """Rotor speed that a command held forever leads to, rad/s: K u (plus the offset of an affine map)."""
+    """Rotor speed for a command that is held forever, rad/s: K u plus the offset of an affine map."""
     return constants.gain * command + constants.offset
 
 
@@ -146,7 +146,7 @@ def path_to(constants: RotorConstants, speed: Vec, target: Vec) -> RotorPath:
         rate_start=rate,
         rate_middle=rate * constants.decay_half,
         rate_end=rate * constants.decay,
-        # The clamp acts on the mean; where a rotor crosses 229 rad/s within a step this is off by less than 0.8 mN.
+        # The clamp acts on the mean; in a step in which a rotor crosses 229 rad/s this errs by less than 0.8 mN.
         mean=RotorLoads(
             constants.thrust.mean(target, away, constants).map(_at_least_zero),
             constants.torque.mean(target, away, constants),
@@ -156,12 +156,12 @@ def path_to(constants: RotorConstants, speed: Vec, target: Vec) -> RotorPath:
 
 
 def path_between(constants: RotorConstants, start: Vec, end: Vec) -> RotorPath:
-    """Straight path between two measured rotor speeds, rad/s."""
+    """Linear path between two measured rotor speeds, rad/s."""
     middle = 0.5 * (start + end)
     slope = (end - start) * constants.inverse_dt
 
     def simpson(curve: Polynomial) -> Vec:
-        # Exact: along a straight path the loads are cubic in time.
+        # Exact: along a linear path the loads are cubic in time.
         return (curve(start) + 4 * curve(middle) + curve(end)) / 6
 
     mean = RotorLoads(simpson(constants.thrust).map(_at_least_zero), simpson(constants.torque), slope)
@@ -174,7 +174,7 @@ def loads_at(constants: RotorConstants, speed: Vec, rate: Vec) -> RotorLoads:
 
 
 def thrust(parameters: Parameters, speed: Float[AnyArray, "*batch 4"]) -> Float[Array, "*batch 4"]:
-    """Thrust of each rotor [eq. 8], N. Clamped at zero: the cubic is negative below 229 rad/s, a fit artefact."""
+    """Thrust of each rotor [eq. 8], N, clamped at zero: below 229 rad/s the cubic is negative, a fit artefact."""
     curve = polynomial(parameters.thrust_polynomial, parameters.thrust_scale, parameters.reference_rotor_speed)
     return curve(Vec.unstack(speed)).map(_at_least_zero).stack()
 
@@ -186,15 +186,15 @@ def torque(parameters: Parameters, speed: Float[AnyArray, "*batch 4"]) -> Float[
 
 
 def _at_least_zero(x):
-    # Not maximum: its derivative at a rotor at rest would be half the negative slope of the cubic.
+    # Not maximum: for a rotor at rest its derivative would be half the negative slope of the cubic.
     return jnp.where(x > 0, x, 0.0)
 
 
 def hover_rotor_speed(parameters: Parameters) -> Float[Array, "4"]:
     """Rotor speeds whose thrusts carry the weight without roll or pitch torque, rad/s.
 
-    The centre-of-gravity offset shifts load between the rotors. Newton on the cubic from full speed: the thrust curve
-    is convex where it matters, so it converges without a bracket; differentiable.
+    An offset of the centre of gravity shifts load between the rotors. Solved by Newton's method on the cubic from full
+    speed, which converges without a bracket because the thrust curve is convex where it matters; differentiable.
     """
     half = parameters.rotor_spacing / 2
     cog = jnp.asarray(parameters.center_of_gravity)
@@ -207,7 +207,7 @@ def hover_rotor_speed(parameters: Parameters) -> Float[Array, "4"]:
         return s - (((c3 * s + c2) * s + c1) * s - wanted) / ((3 * c3 * s + 2 * c2) * s + c1)
 
     s = jax.lax.fori_loop(0, 12, newton, jnp.full(4, 0.8, wanted.dtype))
-    # Beyond the cubic's maximum Newton wanders, possibly back into the range: not a hover, and must not look like one.
+    # Beyond the cubic's maximum Newton's method wanders and may return into the range; that is not a hover.
     residual = jnp.abs(((c3 * s + c2) * s + c1) * s - wanted)
     return jnp.where(residual <= 1e-5 * wanted, s, jnp.inf) * parameters.reference_rotor_speed
 
@@ -218,16 +218,22 @@ def hover_command(parameters: Parameters) -> Float[Array, "4"]:
 
 
 def steady_command(parameters: Parameters, speed: Float[AnyArray, "4"]) -> Float[Array, "4"]:
-    """Commands at which the rotors turn at ``speed`` [rad/s] in the end."""
+    """Commands for which the rotors settle at ``speed`` [rad/s]."""
     return (jnp.asarray(speed) - parameters.motor_speed_offset) / parameters.motor_gain
 
 
 def rotor_speed_history(
     parameters: Parameters, times: Float[Array, " n"], commands: Float[Array, "n 4"]
 ) -> Float[Array, "n 4"]:
-    """Rotor speeds at ``times`` [s] from logged commands held between rows, steady at the first row, rad/s.
+    """Rotor speeds at ``times`` [s] from logged commands, rad/s.
 
-    This is how rotor speed is estimated where a log does not hold it (``docs/evaluation.md``).
+    The commands are held between rows, and the rotors are assumed steady at the first row. This estimates the rotor
+    speed of a log that does not contain it (``docs/evaluation.md``).
+
+    Args:
+        parameters: constants of the drone.
+        times: time of each row, s.
+        commands: command of each row, 0 to 1.
     """
     targets = parameters.motor_gain * jnp.clip(commands, 0.0, 1.0) + parameters.motor_speed_offset
 

@@ -1,4 +1,4 @@
-"""The 17 numbers that describe the drone at one instant."""
+"""The state of the drone: 17 numbers, and the memory of effects."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class State(eqx.Module):
     position: Float[AnyArray, "*batch 3"]
     """Centre of the rotors, world, m."""
     velocity: Float[AnyArray, "*batch 3"]
-    """Velocity of that point, world, m/s."""
+    """Velocity of the rotors' centre, world, m/s."""
     quaternion: Float[AnyArray, "*batch 4"]
     """Attitude [w, x, y, z], body to world, unit norm."""
     body_rate: Float[AnyArray, "*batch 3"]
@@ -31,7 +31,7 @@ class State(eqx.Module):
     rotor_speed: Float[AnyArray, "*batch 4"]
     """Rotor speeds, motors M1..M4, rad/s."""
     memory: Any = ()
-    """What effects remember (`cfb_mjx.model.Effect.start`), one entry per effect; empty means long steady flight."""
+    """Memory of the effects (`cfb_mjx.model.Effect.start`), one entry per effect; empty means long steady flight."""
 
     @classmethod
     def at_rest(
@@ -51,17 +51,17 @@ class State(eqx.Module):
 
 
 class Components(eqx.Module):
-    """What the simulator computes in: one array per number, and the centre of gravity as the point that moves.
+    """State in the simulator's form: one array per number, and the centre of gravity in place of the rotors' centre.
 
-    Newton's law holds for the centre of gravity without coupling to the rotation, which makes a step shorter and its
-    first-order errors smaller than integrating the rotors' centre; both bodies do so. `State` speaks of the rotors'
+    Newton's law for the centre of gravity is not coupled to the rotation. This makes a step cheaper, and its
+    first-order errors smaller, than integrating the rotors' centre; both bodies do so. `State` describes the rotors'
     centre, the point that logs report.
     """
 
     position: Vec
-    """Centre of gravity, world, m."""
+    """Position of the centre of gravity, world, m."""
     velocity: Vec
-    """Its velocity, world, m/s."""
+    """Velocity of the centre of gravity, world, m/s."""
     quaternion: Vec
     body_rate: Vec
     rotor_speed: Vec
@@ -69,7 +69,7 @@ class Components(eqx.Module):
 
 
 def unstack(state: State, center_of_gravity: Vec | AnyArray) -> Components:
-    """State to components, given the centre of gravity in body axes [m]."""
+    """Convert a state to components, given the centre of gravity in body axes [m]."""
     center_of_gravity = Vec.unstack(center_of_gravity)
     quaternion, body_rate = Vec.unstack(state.quaternion), Vec.unstack(state.body_rate)
     return Components(
@@ -83,7 +83,7 @@ def unstack(state: State, center_of_gravity: Vec | AnyArray) -> Components:
 
 
 def stack(state: Components, center_of_gravity: Vec | AnyArray) -> State:
-    """Components to state; the inverse of `unstack`."""
+    """Convert components to a state; the inverse of `unstack`."""
     center_of_gravity = Vec.unstack(center_of_gravity)
     lever = rotate(state.quaternion, center_of_gravity)
     lever_velocity = rotate(state.quaternion, state.body_rate.cross(center_of_gravity))

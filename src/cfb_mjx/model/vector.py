@@ -1,8 +1,8 @@
 """Small vectors whose components are separate arrays.
 
-A batch of 3-vectors stored as (N, 3) makes XLA gather strided triples and breaks the fusion of a simulation step; one
-array per component keeps the whole step a single element-wise kernel (3 to 4 times faster on CPU). Code written with
-`Vec` is elementwise, so the same line serves one drone, a ``vmap`` over drones, and ``grad``.
+A batch of 3-vectors stored as (N, 3) makes XLA gather strided triples and breaks the fusion of a simulation step. With
+one array per component the whole step is a single element-wise kernel (3 to 4 times faster on CPU). Code with `Vec` is
+element-wise, so the same line serves one drone, a ``vmap`` over drones, and ``grad``.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 
 def _is_zero(x) -> bool:
-    # Only a Python number is known while tracing. XLA may not drop 0 * x itself, because x could be infinite.
+    # While tracing only Python numbers are known, and XLA may not drop 0 * x itself, because x could be infinite.
     return isinstance(x, int | float) and x == 0
 
 
@@ -34,9 +34,9 @@ def _times(a, b):
 
 @jax.tree_util.register_pytree_node_class
 class Vec:
-    """An immutable tuple of components with element-wise arithmetic; operators also take a scalar.
+    """Immutable tuple of components with element-wise arithmetic; operators also accept a scalar.
 
-    A component that is the Python number 0 is a known zero and costs nothing in products and sums.
+    A component that is the Python number 0 is dropped from products and sums at trace time.
     """
 
     __slots__ = ("components",)
@@ -49,7 +49,7 @@ class Vec:
 
     @classmethod
     def unstack(cls, array: Array | np.ndarray | Vec) -> Vec:
-        """Split the last axis of ``array`` into components; a `Vec` is returned as it is."""
+        """Split the last axis of ``array`` into components; a `Vec` is returned unchanged."""
         if isinstance(array, Vec):
             return array
         return cls(*(array[..., i] for i in range(array.shape[-1])))
@@ -159,8 +159,9 @@ def up_axis(q: Vec) -> Vec:
 def exponential(half_angle: Vec) -> Vec:
     """Unit quaternion of the rotation by 2 |half_angle| about ``half_angle``.
 
-    Power series in |half_angle|^2: no square root, so derivatives at zero rotation exist, and cheaper than sin and
-    cos. Error below 1e-12 for rotations up to pi / 2, below 1e-8 up to pi; one time step turns far less.
+    A power series in |half_angle|^2: it needs no square root, so derivatives at zero rotation exist, and it is cheaper
+    than sin and cos. The error is below 1e-12 for rotations up to pi / 2 and below 1e-8 up to pi; one time step turns
+    far less.
     """
     n = half_angle.dot(half_angle)
     return Vec(_cosine(n), *(half_angle * _sinc(n)))
@@ -174,7 +175,7 @@ def _series(n, *divisors: int):
     return total
 
 
-# Of the square n of an angle. Written out because the derivative of a series is a longer one; -sinc / 2 is exact.
+# Functions of the square n of an angle, with explicit derivatives: that of a series is longer; -sinc / 2 is exact.
 @jax.custom_jvp
 def _cosine(n):
     return _series(n, 2, 12, 30, 56, 90, 132)

@@ -1,7 +1,8 @@
-"""A closed-loop simulator of the drone that shares nothing with the library but `FlightLog`: labelled data.
+"""Independent simulator of the drone with feedback control, for labelled test data.
 
-`fly_campaigns` returns the logs of drones that are nominal or have one or more of `EFFECTS`, flown by a controller of
-its own; `simulation.simulate` flies them with any other, an `other_controller.OtherController`.
+It shares no code with the library but `FlightLog`. `fly_campaigns` returns the logs of drones that are nominal or have
+one or more of `EFFECTS`, flown by the simulator's own controller. `simulation.simulate` flies them with another one, an
+`other_controller.OtherController`.
 """
 
 from cfb_mjx.reference_simulator.campaigns import Campaign, Case, fly_campaigns

@@ -1,4 +1,4 @@
-"""Equations of motion of many drones at once; state rows by lanes, (ROWS, F). SI units, world z up."""
+"""Equations of motion of many drones at once: states of F lanes (drones), (ROWS, F). SI units, world z up."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from cfb_mjx.reference_simulator.rotors import motor_rates, rotor_wrench
 
 P, V, Q, W, SPEED = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13), slice(13, 17)
 PLAIN_ROWS = 17
-# Only simulated when some lane needs them: speed controller, second lag, bob (place from the drone; velocity), flex.
+# Simulated only if a lane needs them: speed controller, second lag, bob (relative position; velocity), flex.
 ESC, LAGGED, BOB, BOB_V, FLEX = slice(17, 21), slice(21, 25), slice(25, 28), slice(28, 31), slice(31, 33)
 ROWS = 33
-STRING_RATE, STRING_DAMPING = 75.0, 0.25  # rad/s and damping ratio of the string's stretch
+STRING_RATE, STRING_DAMPING = 75.0, 0.25  # rad/s, and damping ratio of the stretching string
 WORLD_EFFECTS = frozenset({"wind", "tether", "wall", "bob_mass"})
 
 
 def rotation_of(q: np.ndarray) -> np.ndarray:
-    """(3, 3, F) body-to-world matrices of quaternions (4, F)."""
+    """Body-to-world matrices (3, 3, F) of quaternions (4, F)."""
     s = 2.0 * q[:, None] * q[None]
     r = np.empty((3, 3, q.shape[1]))
     r[0, 0] = 1 - s[2, 2] - s[3, 3]
@@ -32,7 +32,7 @@ def rotation_of(q: np.ndarray) -> np.ndarray:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(3, F) cross products."""
+    """Cross products (3, F)."""
     out = np.empty_like(b)
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
@@ -41,33 +41,34 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def turn(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """(3, 3, F) times (3, F)."""
+    """Rotate vectors (3, F) by matrices (3, 3, F)."""
     return matrix[:, 0] * vector[0] + matrix[:, 1] * vector[1] + matrix[:, 2] * vector[2]
 
 
 def turn_back(matrix: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Transposed (3, 3, F) times (3, F)."""
+    """Rotate vectors (3, F) by the transposes of matrices (3, 3, F)."""
     return matrix[0] * vector[0] + matrix[1] * vector[1] + matrix[2] * vector[2]
 
 
 def derivative(p: SimpleNamespace, x: np.ndarray, command: np.ndarray, held: SimpleNamespace, time: float):
-    """Rate of change of the state and the accelerometer's reading.
+    """Time derivative of the state, and the reading of the accelerometer.
 
     Args:
-        p: physics.
-        x: (R, F) state.
-        command: (4, F) what the motors' electronics receive.
-        held: constant over a tick: ``gain`` (4, F) rad/s; ``push`` (3, F) m/s^2, world, and ``twist`` (3, F) rad/s^2,
-            the unexplained accelerations; ``gust`` (2, F) N; ``phase`` (F,) rad of the rotating load at time 0.
+        p: parameters, as `physics.stack` gives them.
+        x: state, (R, F).
+        command: commands that the speed controllers receive, (4, F).
+        held: inputs that are constant over a tick: ``gain`` (4, F) rad/s; the unexplained accelerations ``push``
+            (3, F) m/s^2, world axes, and ``twist`` (3, F) rad/s^2; ``gust`` (2, F) N; ``phase`` (F,) of the rotating
+            load at time 0, rad.
         time: s.
 
     Returns:
-        (R, F) rates and (3, F) specific force at the rotors' centre, body axes.
+        Derivatives (R, F), and the specific force (3, F) at the rotors' centre, body axes.
     """
     q, w, speed = x[Q], x[W], x[SPEED]
     rotation = rotation_of(q)
     body_velocity = turn_back(rotation, x[V])
-    if "convergence" in p.on:  # what the drone feels is its velocity through the air
+    if "convergence" in p.on:  # the airspeed
         body_velocity = body_velocity + turn_back(rotation, p.convergence * x[P] * np.array([[1.0], [1.0], [0.0]]))
     extra = len(x) > PLAIN_ROWS
     speed_rate, esc_rate, lag_rate = motor_rates(
@@ -123,7 +124,7 @@ def derivative(p: SimpleNamespace, x: np.ndarray, command: np.ndarray, held: Sim
 
 
 def _world_force(p, x, held, rates):
-    """Forces given in world axes, (3, F) N; the bob's own motion goes into ``rates``."""
+    """Forces in world axes (3, F), N; writes the derivatives of the bob into ``rates``."""
     force = np.zeros((3, x.shape[1]))
     if "wind" in p.on:
         profile = np.maximum(x[2], 0.02) ** p.shear  # slower near the floor
@@ -132,7 +133,7 @@ def _world_force(p, x, held, rates):
         away = x[P] - p.tether_point
         force -= p.tether * away / np.sqrt(1 + (away**2).sum(0) / 16.0)
     if "wall" in p.on:
-        # Drawn towards a wall ahead, the more the closer; levels off at the wall itself.
+        # Attraction to a wall in front; grows towards the wall and saturates at it.
         gap = np.logaddexp(0.0, 4.0 * (p.wall_x - x[0])) / 4.0
         force[0] += p.wall * np.exp(-gap / p.wall_depth)
     if "bob_mass" in p.on:
@@ -153,7 +154,7 @@ def _world_force(p, x, held, rates):
 
 
 def advance(p: SimpleNamespace, x: np.ndarray, command: np.ndarray, held: SimpleNamespace, time: float, step: float):
-    """One classical RK4 step; returns the new state and the accelerometer's reading at the step's start."""
+    """Take one classical RK4 step; return the new state and the accelerometer reading at the start of the step."""
     k1, specific = derivative(p, x, command, held, time)
     k2, _ = derivative(p, x + 0.5 * step * k1, command, held, time + 0.5 * step)
     k3, _ = derivative(p, x + 0.5 * step * k2, command, held, time + 0.5 * step)

@@ -1,4 +1,4 @@
-"""Cases and the logs a user would have recorded of them: fit flights and held-out flights."""
+"""Simulated drones (cases) and the logs that a user would record of them: fit flights and held-out flights."""
 
 from __future__ import annotations
 
@@ -17,14 +17,18 @@ from cfb_mjx.reference_simulator.simulation import Flight, Lane, simulate
 FIT = ("lateral", "roll_pitch_excitation", "vertical", "low_altitude", "motor_excitation", "long_hover")
 SECONDS = {"hover": (10.0, 13.0), "long_hover": (24.0, 30.0)}
 TRIES = 6
-MARGIN = 25  # ticks a log starts after the warm-up, so that late columns have a past
+MARGIN = 25  # ticks between warm-up and first row, so that delayed columns have a history
 
 
 @dataclass(frozen=True)
 class Case:
-    """A drone to draw: ``effects`` are (name, strength); none for a nominal drone.
+    """A drone to simulate.
 
-    An effect of strength 0 is not there, and the others are drawn as if it were.
+    Attributes:
+        name: of the drone; unique among cases.
+        seed: of all random draws.
+        effects: (name, strength) of each effect; empty for a nominal drone. An effect of strength 0 is absent, but does
+            not change the random draws of the others.
     """
 
     name: str
@@ -33,13 +37,13 @@ class Case:
 
     @property
     def labels(self) -> list[str]:
-        """Names a perfect diagnosis would give; empty for a nominal drone."""
+        """Names that a perfect diagnosis would report; empty for a nominal drone."""
         return sorted({effects.label(name) for name, strength in self.effects if strength})
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """Logs of one drone; ``truth`` holds the labels and all that was drawn."""
+    """Logs of one drone; ``truth`` has the labels and all random draws."""
 
     case: Case
     fit: list[FlightLog]
@@ -49,7 +53,7 @@ class Campaign:
 
 @dataclass(frozen=True)
 class _Plan:
-    """A flight to make: of which case, which of its logs, and what is common to the case's flights."""
+    """A flight to simulate: its case, its number among the logs, and what the flights of the case share."""
 
     case: Case
     drone: dict[str, np.ndarray]
@@ -61,11 +65,14 @@ class _Plan:
 
 
 def fly_campaigns(cases: list[Case], duration_scale: float = 1.0) -> list[Campaign]:
-    """Fly all logs of all cases in one run. A flight that crashes is drawn anew, gentler each time.
+    """Simulate the logs of all cases in one run. A flight that crashes is drawn again, gentler each time.
 
     Args:
-        cases: whose names should differ; a case's logs do not depend on the others.
-        duration_scale: factor on the logs' lengths.
+        cases: drones with different names. The logs of a case do not depend on the other cases.
+        duration_scale: factor on the duration of the logs.
+
+    Raises:
+        RuntimeError: a flight crashed in every attempt.
     """
     drawn = [_draw(case, duration_scale) for case in cases]
     waiting = [plan for plans, _ in drawn for plan in plans]
@@ -84,7 +91,7 @@ def fly_campaigns(cases: list[Case], duration_scale: float = 1.0) -> list[Campai
         if not waiting:
             break
     if waiting:
-        raise RuntimeError("cannot stay in the air: " + ", ".join(f"{p.case.name}/{p.manoeuvre}" for p in waiting))
+        raise RuntimeError("every attempt crashed: " + ", ".join(f"{p.case.name}/{p.manoeuvre}" for p in waiting))
     campaigns = []
     for i, (plans, truth) in enumerate(drawn):
         own = [(plan.held_out, logs[i, plan.index]) for plan in plans]
@@ -94,7 +101,7 @@ def fly_campaigns(cases: list[Case], duration_scale: float = 1.0) -> list[Campai
 
 
 def draw_drone(case: Case) -> tuple[dict[str, np.ndarray], Instruments, dict]:
-    """The drone of a case, its sensors, and its truth: labels, what was drawn of each effect, the sensors' numbers."""
+    """Draw the drone of a case and its sensors; return them with the truth: labels and all draws."""
     drone = physics.nominal()
     truth: dict = {"labels": case.labels, "effects": {}}
     for order, (name, strength) in enumerate(case.effects):
@@ -106,12 +113,12 @@ def draw_drone(case: Case) -> tuple[dict[str, np.ndarray], Instruments, dict]:
 
 
 def _of_case(case: Case) -> np.random.Generator:
-    """Draws the sensors first, then which flights are made."""
+    """Generator that draws the sensors first, then the choice of flights."""
     return np.random.default_rng([case.seed, 2000])
 
 
 def _draw(case: Case, duration_scale: float) -> tuple[list[_Plan], dict]:
-    """The flights of a case and its truth."""
+    """Draw the flights of a case; return them and the truth of the case."""
     drone, instruments, truth = draw_drone(case)
     rng = _of_case(case)
     draw_instruments(rng)
@@ -128,7 +135,7 @@ def _lane(plan: _Plan, attempt: int) -> Lane:
     seconds = plan.duration_scale * rng.uniform(*SECONDS.get(plan.manoeuvre, (13.0, 17.0)))
     setpoints = MANOEUVRES[plan.manoeuvre](rng, seconds, 0.85**attempt)
     if plan.drone["bob_mass"] > 0:
-        setpoints[:, POSITION.stop - 1] += plan.drone["bob_length"] + 0.1  # nobody drags a load over the floor
+        setpoints[:, POSITION.stop - 1] += plan.drone["bob_length"] + 0.1  # the load must not touch the floor
     rows = row_ticks(rng, len(setpoints) * c.SETPOINT_TICKS - MARGIN, plan.instruments.irregular, rng.random() < 0.4)
     return Lane(
         plan.drone,
@@ -147,7 +154,7 @@ def _log(plan: _Plan, lane: Lane, flight: Flight, attempt: int) -> FlightLog:
 
 
 def recorded(lane: Lane, flight: Flight, rng: np.random.Generator, name: str) -> FlightLog:
-    """A log of a flight, with the noise, drawn from ``rng``, of whatever the controller did not use."""
+    """Return the log of a flight; ``rng`` draws the noise of signals that the controller does not use."""
     instruments, count = lane.instruments, len(lane.rows)
     bias = 0.03 * rng.standard_normal(3)
     speed = None

@@ -1,4 +1,4 @@
-"""Nominal numbers of the drone and of the simulation's clock, typed in afresh (SI units)."""
+"""Nominal constants of the drone and of the clock of the simulation, independent of the library (SI units)."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ HALF = 0.0707 / 2
 BLADE_RADIUS = 0.0275
 AIR_DENSITY = 1.2
 
-# Front-right, back-right, back-left, front-left; (4, 1) so that they broadcast over lanes.
+# Front-right, back-right, back-left, front-left; shape (4, 1) broadcasts over lanes.
 ROTOR_X = HALF * np.array([[1.0], [-1.0], [-1.0], [1.0]])
 ROTOR_Y = HALF * np.array([[-1.0], [-1.0], [1.0], [1.0]])
 YAW = np.array([[-1.0], [1.0], [-1.0], [1.0]])
 
 TICK = 0.002  # s between commands
 SUBSTEPS = 2  # RK4 steps per tick
-ROW_TICKS = 2  # a log's row every 4 ms: every second command is unlogged
+ROW_TICKS = 2  # a row of the log every 4 ms: every second command is not logged
 POSE_TICKS = 4  # pose and velocity are 8 ms late
 SETPOINT_TICKS = 5  # set-points change at 100 Hz
-WARM_UP_TICKS = 1000  # flown before the log starts, so that the controller has found its trim
+WARM_UP_TICKS = 1000  # before the log starts, so that the controller is in trim
 
 
 def thrust_curve(speed: np.ndarray) -> np.ndarray:

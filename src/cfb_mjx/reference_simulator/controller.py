@@ -1,4 +1,4 @@
-"""A cascaded controller of its own: position, velocity, attitude, rate, mixing. Arrays are (k, F), SI units."""
+"""The simulator's cascaded controller: position, velocity, attitude, rate, mixing. Arrays are (k, F), SI units."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ INERTIA = column(*c.INERTIA)
 GYRO_KEEP = np.exp(-2 * np.pi * 80.0 * c.TICK)
 SLOPE_KEEP = np.exp(-2 * np.pi * 25.0 * c.TICK)
 
-# The inverse of the thrust curve over its useful part, as a quadratic in the root of the thrust.
+# Inverse of the thrust curve in the operating range, as a cubic in the root of the thrust.
 _S = np.linspace(0.2, 1.0, 200)
 _ROOT = np.sqrt(c.thrust_curve(_S * c.SPEED_SCALE))
 INVERSE = np.polyfit(_ROOT, _S, 3)
 
 
 class Controller:
-    """State of F controllers."""
+    """Controllers of F drones, with their state."""
 
     def __init__(self, lanes: int):
         self.velocity_store = np.zeros((3, lanes))
@@ -48,7 +48,7 @@ class Controller:
         self.slope = np.zeros((3, lanes))
 
     def __call__(self, goal: np.ndarray, seen: SimpleNamespace, gyro: np.ndarray) -> np.ndarray:
-        """Commands (4, F) for set-points (17, F), late pose ``seen`` (position, velocity, quaternion) and gyro."""
+        """Return commands (4, F) for set-points (17, F), delayed estimates ``seen`` and gyro (3, F)."""
         acceleration = self._position_loop(goal, seen)
         rotation = rotation_of(seen.quaternion)
         collective, wanted = self._attitude_loop(goal, acceleration, rotation)

@@ -1,6 +1,6 @@
-"""What can be wrong with a drone: each effect edits a copy of the nominal physics and returns what it drew.
+"""Effects that a simulated drone can have. Each changes a copy of the nominal parameters and returns its draws.
 
-``strength`` scales an effect: 1 is typical and strong, 0.3 weak. SI units.
+``strength`` scales an effect: 1 is a strong effect of typical size, 0.3 a weak one. SI units.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ OUTSIDE = "outside"
 
 
 def effect(draw: Effect) -> Effect:
-    """Register a drawing function under its own name."""
+    """Register an effect under the name of its function."""
     EFFECTS[draw.__name__] = draw
     return draw
 
 
 def label(name: str) -> str:
-    """What a perfect diagnosis would call an effect."""
+    """Name that a perfect diagnosis would give to an effect."""
     return OUTSIDE if name.startswith(OUTSIDE) else name
 
 
 def apply(name: str, rng: np.random.Generator, drone: Drone, strength: float) -> Drawn:
-    """Put an effect into a drone, in place; ``outside`` alone picks one of the effects without a catalogue entry."""
+    """Add an effect to a drone, in place; the name ``outside`` draws one of the effects outside the catalogue."""
     if name == OUTSIDE:
         name = str(rng.choice([key for key in EFFECTS if key.startswith(OUTSIDE)]))
     return {"kind": name, "strength": strength} | EFFECTS[name](rng, drone, strength)
 
 
 def put(drone: Drone, **values) -> Drawn:
-    """Set parameters; returns them as plain numbers for the record."""
+    """Set parameters of a drone; return them as plain numbers for the truth."""
     for name, value in values.items():
         drone[name] = np.asarray(value, dtype=float)
     return {name: np.asarray(value).tolist() for name, value in values.items()}
@@ -108,7 +108,7 @@ def cog_offset(rng, drone, strength):
 
 @effect
 def thrust_tilt(rng, drone, strength):
-    # All axes lean one way (a bent frame) and each a little sideways (twisted arms: a yaw torque).
+    # All axes tilt one way (bent frame), and each a little sideways (twisted arms, which give a yaw torque).
     lean, angle = np.radians(rng.uniform(0.5, 1.5)), rng.uniform(0, 2 * np.pi)
     twist = np.radians(rng.uniform(0.0, 1.0)) * sign(rng)
     common = lean * np.array([[np.cos(angle)], [np.sin(angle)]])
@@ -138,7 +138,7 @@ def esc_rate_limit(rng, drone, strength):
     rate = rng.uniform(3.0, 6.0) / strength
     if rng.random() < 0.5:
         return put(drone, esc_rate=rate)
-    # Its current is limited, and so the rotor's acceleration; the motor's lag keeps that below what commands ask for.
+    # A current limit bounds the rotor's acceleration, which the motor's lag already keeps below the command's rate.
     return put(drone, spin_limit=0.2 * rate * c.MOTOR_GAIN)
 
 
@@ -223,7 +223,7 @@ def sensor_gyro_lowpass(rng, drone, strength):
 
 @effect
 def outside_wash(rng, drone, strength):
-    """Propeller wash: flying forward while yawing rolls the drone."""
+    """Propeller wash: forward flight with a yaw rate rolls the drone."""
     return put(drone, wash=strength * rng.uniform(4e-5, 8e-5) * sign(rng))
 
 
@@ -235,7 +235,7 @@ def outside_pairs(rng, drone, strength):
 
 @effect
 def outside_flex(rng, drone, strength):
-    """A sprung part of the frame that swings about the pitch axis."""
+    """A part of the frame on a spring that oscillates about the pitch axis."""
     return put(
         drone,
         flex=strength * rng.uniform(0.15, 0.35) * c.INERTIA[1],
@@ -246,7 +246,7 @@ def outside_flex(rng, drone, strength):
 
 @effect
 def outside_tether(rng, drone, strength):
-    """Pulled towards a point in the room, as by an elastic tether."""
+    """Attraction to a point in the room, as by an elastic tether."""
     return put(
         drone,
         tether=strength * rng.uniform(0.01, 0.025),
@@ -256,7 +256,7 @@ def outside_tether(rng, drone, strength):
 
 @effect
 def outside_periodic(rng, drone, strength):
-    """Something turns on board at its own pace."""
+    """A torque that rotates at a fixed frequency."""
     return put(
         drone,
         spin_torque=strength * rng.uniform(1e-4, 2.5e-4),
@@ -266,7 +266,7 @@ def outside_periodic(rng, drone, strength):
 
 @effect
 def outside_wall(rng, drone, strength):
-    """Drawn towards a wall at the edge of the flown space."""
+    """Attraction to a wall at the edge of the flight space."""
     return put(
         drone,
         wall=strength * rng.uniform(0.04, 0.08),
@@ -275,10 +275,10 @@ def outside_wall(rng, drone, strength):
     )
 
 
-# Last: seeds of studies count the effects before.
+# New effects come last, because the seeds of studies depend on the order.
 @effect
 def prop_damage(rng, drone, strength):
-    """A nicked propeller: less thrust, and more torque where the nick is rough, less where much is gone."""
+    """A damaged propeller: less thrust, and more or less torque."""
     motor, blades = int(rng.integers(4)), drone["blades"].copy()
     blades[:, motor] *= 1 + strength * np.array([-rng.uniform(0.04, 0.1), sign(rng) * rng.uniform(0.05, 0.2)])
     return put(drone, blades=blades) | {"motor": motor + 1}
@@ -286,5 +286,5 @@ def prop_damage(rng, drone, strength):
 
 @effect
 def motor_hysteresis(rng, drone, strength):
-    """Speed controllers with play."""
+    """Speed controllers with hysteresis (play)."""
     return put(drone, play=strength * rng.uniform(0.006, 0.015), play_share=rng.uniform(0.6, 1.0))

@@ -1,7 +1,7 @@
 """Set-point generators with random parameters.
 
-Each takes a Generator, a duration (s) and ``vigour`` (1; less after a crash) and returns set-points at 100 Hz, (n, 17):
-columns as in `cfb_mjx.reference_simulator.controller`.
+Each takes a Generator, a duration (s) and ``vigour`` (1, less after a crash) and returns set-points (n, 17) at 100 Hz.
+The columns are those of `cfb_mjx.reference_simulator.controller`.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from cfb_mjx.reference_simulator.controller import (
 )
 
 STEP = SETPOINT_TICKS * TICK
-ROOM = np.array([2.4, 2.4])  # m either side
+ROOM = np.array([2.4, 2.4])  # half the room along x and y, m
 MANOEUVRES: dict[str, Callable[[np.random.Generator, float, float], np.ndarray]] = {}
 
 
 def manoeuvre(generate):
-    """Register a generator under its own name."""
+    """Register a generator under the name of its function."""
     MANOEUVRES[generate.__name__] = generate
     return generate
 
@@ -41,7 +41,7 @@ def _still(seconds: float, place) -> np.ndarray:
 
 
 def _route(seconds: float, rng, points, speed: float, pull: float, pause=(0.1, 0.4)) -> np.ndarray:
-    """Smooth rest-to-rest moves between ``points()`` (an endless draw), at most ``speed`` m/s and ``pull`` m/s^2."""
+    """Smooth rest-to-rest moves between draws of ``points()``, up to ``speed`` m/s and ``pull`` m/s^2."""
     place = points()
     goal = _still(seconds, place)
     start = round(rng.uniform(*pause) / STEP)
@@ -67,13 +67,13 @@ def _box(rng, low: float, high: float, side: float = 1.0):
 
 
 def _envelope(count: int) -> np.ndarray:
-    """0 to 1 over the first second and back over the last."""
+    """Envelope that rises from 0 to 1 in the first second and falls in the last."""
     t = np.arange(count) * STEP
     return np.clip(np.minimum(t, t[-1] - t), 0, 1)
 
 
 def _kicks(goal, rng, size: float, every=(0.5, 1.2)) -> None:
-    """Doublets of roll or pitch rate, ``size`` rad/s."""
+    """Add doublets of roll or pitch rate of up to ``size`` rad/s."""
     start = round(rng.uniform(0.2, 0.6) / STEP)
     while start < len(goal) - 60:
         half = round(rng.uniform(0.06, 0.14) / STEP)
@@ -92,7 +92,7 @@ def _sines(goal, rng, column: int, size: float, low: float, high: float, count: 
 
 
 def _dither(goal, rng, size: float) -> None:
-    """Add to each motor's command a level held for a random while."""
+    """Add random levels to the command of each motor, held for random times."""
     for motor in range(DITHER.start, DITHER.stop):
         holds = rng.integers(1, 12, len(goal))
         levels = np.repeat(size * rng.uniform(-1, 1, len(goal)), holds)[: len(goal)]
@@ -100,7 +100,7 @@ def _dither(goal, rng, size: float) -> None:
 
 
 def _yaw(goal, rng, rate: float, turn: float, pause=(0.5, 2.0)) -> None:
-    """Turn at up to ``rate`` rad/s by up to ``turn`` rad, again and again."""
+    """Add repeated yaw turns of up to ``turn`` rad at up to ``rate`` rad/s."""
     speed = np.zeros(len(goal))
     start = round(rng.uniform(*pause) / STEP)
     while start < len(goal) - 50:
@@ -171,7 +171,7 @@ MANOEUVRES["long_hover"] = hover
 
 
 def _orbit(rng, seconds, width, depth, pace, double) -> np.ndarray:
-    """An ellipse or an eight, entered and left gently: the phase's speed is ramped."""
+    """Ellipse or figure eight; the phase rate is ramped at the start and the end."""
     goal = _still(seconds, [0, 0, rng.uniform(0.8, 1.5)])
     rate = pace * np.clip(_envelope(len(goal)) / 0.9, 0, 1) * rng.choice([-1, 1])
     phase = np.cumsum(rate) * STEP

@@ -1,4 +1,4 @@
-"""Any controller in place of the built-in one: what it sees, and how it is called. Arrays are (k, F), SI units."""
+"""Interface of a controller that replaces the built-in one. Arrays are (k, F), SI units."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from cfb_mjx.reference_simulator.controller import POSITION, VELOCITY, YAW_ANGLE
 
 @dataclass(frozen=True)
 class Seen:
-    """Late, noisy estimates relative to a set-point that moves and turns: at rest on it they are those of hover."""
+    """Delayed, noisy estimates relative to a moving and turning set-point; at the set-point they are those of hover."""
 
     position: np.ndarray
-    """(3, F) minus the set-point's, in axes turned by its heading, m."""
+    """Position minus the set-point's, (3, F), in axes rotated by its heading, m."""
     velocity: np.ndarray
-    """(3, F) minus the set-point's, same axes, m/s."""
+    """Velocity minus the set-point's, (3, F), in the same axes, m/s."""
     quaternion: np.ndarray
-    """(4, F) [w, x, y, z], body to those axes."""
+    """Rotation from body to these axes, (4, F), [w, x, y, z]."""
     body_rate: np.ndarray
-    """(3, F) minus the set-point's yaw rate, rad/s."""
+    """Body rate minus the set-point's yaw rate, (3, F), rad/s."""
 
 
 @dataclass(frozen=True)
 class OtherController:
-    """A controller of F lanes.
+    """A controller of F drones.
 
     Attributes:
-        every: ticks from one command to the next; commands are held in between.
-        fly: memory (None at first) and `Seen` to memory and commands (4, F) in [0, 1]. The set-points' dither is added
-            after it.
+        every: ticks between commands; commands are held in between.
+        fly: function from memory (None at first) and `Seen` to new memory and commands (4, F) in [0, 1]. The dither of
+            the set-points is added to its commands.
     """
 
     every: int
@@ -41,12 +41,12 @@ class OtherController:
 
 
 def relative(goal: np.ndarray, late: np.ndarray, gyro: np.ndarray) -> Seen:
-    """What a controller is shown.
+    """Return the estimates relative to a set-point.
 
     Args:
-        goal: (17, F) set-point.
-        late: (10, F) position, velocity, quaternion.
-        gyro: (3, F) as old as ``late``.
+        goal: set-point, (17, F).
+        late: delayed position, velocity and quaternion, (10, F).
+        gyro: body rate with the same delay, (3, F).
     """
     heading = goal[YAW_ANGLE]
     w, x, y, z = late[Q]
@@ -65,6 +65,6 @@ def relative(goal: np.ndarray, late: np.ndarray, gyro: np.ndarray) -> Seen:
 
 
 def _turned(vector, heading):
-    """World vectors (3, F) in axes turned by ``heading`` (F,) about the vertical."""
+    """World vectors (3, F) in axes rotated by ``heading`` (F,) about the vertical."""
     cos, sin = np.cos(heading), np.sin(heading)
     return np.stack([cos * vector[0] + sin * vector[1], cos * vector[1] - sin * vector[0], vector[2]])

@@ -1,4 +1,4 @@
-"""Forces of the four rotors and the lag of their motors. Arrays are (4, F); body axes; SI units."""
+"""Forces of the four rotors and lag of their motors. Arrays are (4, F), body axes, SI units."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ESC_SETTLING = 0.002  # s: a rate-limited speed controller's lag for small chang
 
 
 def motor_rates(p: SimpleNamespace, gain, command, speed, esc, lagged):
-    """Rates of rotor speed and, where simulated, of the speed controller's and of the second lag's output."""
+    """Derivatives of the rotor speed and, if simulated, of the outputs of speed controller and second lag."""
     esc_rate = lag_rate = None
     if "esc_rate" in p.on:
         limit = np.maximum(p.esc_rate, 1e-6)
@@ -28,7 +28,7 @@ def motor_rates(p: SimpleNamespace, gain, command, speed, esc, lagged):
     missing = gain * command - speed
     lag = p.lag
     if "asymmetry" in p.on:
-        # Braking relies on drag and is slower; geometric mean of both constants is the plain one.
+        # Spin-down is slower; the geometric mean of both time constants is the plain one.
         lag = lag * np.exp(-0.5 * p.asymmetry * np.tanh(missing / p.asymmetry_width))
     rate = missing / lag
     if "spin_limit" in p.on:
@@ -42,12 +42,13 @@ def rotor_wrench(p: SimpleNamespace, height, rotation, body_velocity, w, speed, 
     """Force (3, F) and moment (3, F) of all rotors about their centre.
 
     Args:
-        p: physics.
-        height: (F,) of the rotors' centre, m.
-        rotation: (3, 3, F) body to world.
-        body_velocity: (3, F) m/s, body axes.
-        w: (3, F) rad/s.
-        speed, speed_rate: (4, F) rad/s and rad/s^2.
+        p: parameters.
+        height: height of the rotors' centre, (F,), m.
+        rotation: body to world, (3, 3, F).
+        body_velocity: airspeed, (3, F), m/s, body axes.
+        w: body rate, (3, F), rad/s.
+        speed: rotor speed, (4, F), rad/s.
+        speed_rate: derivative of the rotor speed, (4, F), rad/s^2.
     """
     thrust, drag = c.thrust_curve(speed), c.torque_curve(speed)
     if "thrust_scale" in p.on:
@@ -93,8 +94,8 @@ def rotor_wrench(p: SimpleNamespace, height, rotation, body_velocity, w, speed, 
         force[1] += side_y.sum(0)
         moment[2] += (c.ROTOR_X * side_y - c.ROTOR_Y * side_x).sum(0)
     if "flapping" in p.on:
-        # The disc tips away from the motion: nose up when flying forward. The part at right angles to the motion
-        # turns with each rotor's sense and nearly cancels over the four.
+        # The disc tilts back, away from the motion. The component perpendicular to the motion has the sign of the
+        # rotor's sense of rotation and nearly cancels over the four rotors.
         hub, across2, loading = not_none(hub), not_none(across2), not_none(loading)
         size = 0.25 * p.flapping * loading**2 / np.sqrt(1 + across2 / 49.0)
         size = size * (1 - p.flapping_climb * np.tanh(hub[2] / 2.0))
@@ -102,14 +103,14 @@ def rotor_wrench(p: SimpleNamespace, height, rotation, body_velocity, w, speed, 
         moment[0] += (size * (hub[1] + turn * hub[0])).sum(0)
         moment[1] += (size * (turn * hub[1] - hub[0])).sum(0)
     if "gyro_inertia" in p.on:
-        momentum = -p.gyro_inertia * (c.YAW * speed).sum(0)  # rotors turn against the torque they put on the body
+        momentum = -p.gyro_inertia * (c.YAW * speed).sum(0)  # a rotor turns against its reaction torque on the body
         moment[0] -= w[1] * momentum
         moment[1] += w[0] * momentum
     return force, moment
 
 
 def _inflow(p, thrust, climb, across2, speed):
-    """Thrust ratio for a rotor moving along its axis (momentum theory) and, less, across it."""
+    """Thrust ratio of a rotor that moves along its axis (momentum theory) and, with less effect, across it."""
     hover2 = thrust / (2 * c.AIR_DENSITY * DISC)
     hover = np.sqrt(hover2)
     through = 0.5 * climb + np.sqrt(0.25 * climb**2 + hover2 / np.sqrt(1 + 0.04 * across2 / (hover2 + 1.0)))
@@ -118,7 +119,7 @@ def _inflow(p, thrust, climb, across2, speed):
 
 
 def _ground(p, height, rotation, across2):
-    """Thrust ratio near the floor: an image rotor below, softened close in, weaker when tilted or blown away."""
+    """Thrust ratio near the floor: an image rotor, saturated near the floor, weaker with tilt and lateral speed."""
     level = height + rotation[2, 0] * c.ROTOR_X + rotation[2, 1] * c.ROTOR_Y
     level = np.maximum(level, 0.0)
     image = p.ground / (level**2 + p.ground_core**2)

@@ -1,4 +1,4 @@
-"""When rows are taken and what the sensors add to them. SI units."""
+"""Sampling times, noise and filters of the sensors. SI units."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cfb_mjx.reference_simulator import constants as c
 
 @dataclass(frozen=True)
 class Instruments:
-    """Noise (standard deviation) and habits of one campaign's sensors, and its unexplained accelerations."""
+    """Sensors of one campaign: standard deviations of noise, sampling, and the unexplained accelerations."""
 
     position: float
     velocity: float
@@ -25,14 +25,17 @@ class Instruments:
     irregular: bool
     measures_rotors: bool
     jolt: float = 0.0
-    """By how much velocity wanders in a second beside ``push``, m/s: knocks too short for the accelerometer."""
+    """Random walk of the velocity in addition to ``push``, m/s after one second.
+
+    The steps are too short for the accelerometer.
+    """
 
 
 QUIET = Instruments(*(0.0,) * 9, irregular=False, measures_rotors=True)
 
 
 def draw_instruments(rng: np.random.Generator) -> Instruments:
-    """Sensors of one campaign."""
+    """Draw the sensors of one campaign."""
 
     def about(value: float) -> float:
         return value * rng.uniform(0.85, 1.15)
@@ -49,18 +52,18 @@ def draw_instruments(rng: np.random.Generator) -> Instruments:
         twist=0.15 * 2 ** rng.uniform(-1, 1),
         irregular=bool(rng.random() < 0.4),
         measures_rotors=bool(rng.random() < 0.6),
-        # Draws of its own: all others stay what they are without it.
+        # A separate generator, so that the other draws do not change.
         jolt=_jolt(*rng.spawn(1)),
     )
 
 
 def _jolt(rng: np.random.Generator) -> float:
-    """None in half of the campaigns: still air."""
+    """Draw the jolt; zero in half of the campaigns."""
     return float(rng.uniform(0.02, 0.06)) if rng.random() < 0.5 else 0.0
 
 
 def row_ticks(rng: np.random.Generator, ticks: int, irregular: bool, dropouts: bool) -> np.ndarray:
-    """Ticks, counted from the log's start, at which a log of ``ticks`` has rows."""
+    """Draw the ticks of the rows of a log of ``ticks``, counted from its start."""
     rows = np.arange(0, ticks, c.ROW_TICKS)
     if irregular:
         rows = np.unique(np.clip(rows + np.rint(rng.normal(0, 0.4, len(rows))).astype(int), 0, ticks - 1))
@@ -72,21 +75,21 @@ def row_ticks(rng: np.random.Generator, ticks: int, irregular: bool, dropouts: b
 
 
 class Recorder:
-    """Copies columns of the running simulation at each lane's own ticks."""
+    """Records columns of the running simulation at the ticks of each lane."""
 
     def __init__(self, ticks: list[np.ndarray], width: int):
-        """``ticks``: for each lane the sorted ticks to record."""
+        """Take the sorted ticks to record of each lane, and the number of columns."""
         lengths = np.array([len(t) for t in ticks])
         self.ends = np.cumsum(lengths)
         self.slots = self.ends - lengths
         self.starts = self.slots.copy()
         self.ticks = np.concatenate([*ticks, [-1]])
-        # A lane that is done would otherwise wait for its neighbour's first tick.
+        # -1 marks a lane without rows; it would otherwise use the first tick of the next lane.
         self.next = np.where(lengths > 0, self.ticks[self.slots], -1)
         self.rows = np.zeros((int(lengths.sum()), width))
 
     def __call__(self, tick: int, *columns: np.ndarray) -> None:
-        """Record ``columns``, each (k, F), for the lanes whose turn it is."""
+        """Record ``columns``, each (k, F), of the lanes that have a row at ``tick``."""
         lanes = np.flatnonzero(self.next == tick)
         if not lanes.size:
             return
@@ -98,12 +101,12 @@ class Recorder:
         self.next[lanes] = np.where(slots < self.ends[lanes], self.ticks[slots], -1)
 
     def lane(self, index: int) -> np.ndarray:
-        """(n, width) rows of a lane."""
+        """Return the rows of a lane, (n, width)."""
         return self.rows[self.starts[index] : self.ends[index]]
 
 
 class LowPass:
-    """Second-order Butterworth low-pass of each lane's gyro at its own corner; corner 0 passes everything."""
+    """Second-order Butterworth low-pass of the gyro, with a corner frequency per lane; 0 does not filter."""
 
     def __init__(self, corner: np.ndarray):
         k = np.tan(np.pi * np.minimum(corner, 0.45 / c.TICK) * c.TICK)

@@ -1,4 +1,4 @@
-"""The time loop: many flights at once, each with its own physics, sensors and set-points. SI units."""
+"""The time loop: many flights at once, each with its own drone, sensors and set-points. SI units."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from cfb_mjx.reference_simulator.other_controller import OtherController, relati
 from cfb_mjx.reference_simulator.sensors import Instruments, LowPass, Recorder
 
 CHUNK = 250  # ticks of noise drawn at a time
-# Columns of the noise: position, velocity, quaternion, gyro, then what drives push, twist and gust.
+# Columns of the noise: position, velocity, quaternion, gyro, and the inputs of push, twist and gust.
 NOISES = 21
 PUSH_KEEP = np.exp(-c.TICK / 0.3)
 GUST_KEEP = np.exp(-c.TICK / 1.5)
 HOVER_CURRENT, IDLE_CURRENT, RESISTANCE, DISCHARGE = 4.5, 0.3, 0.045, 6e-4  # A, A, ohm, V/C
 CURRENT_KEEP = np.exp(-c.TICK / 0.03)
-# Beyond these a flight counts as crashed, rad/s and cosine of tilt.
+# Limits beyond which a flight counts as crashed: body rate, rad/s, and cosine of the tilt.
 RATE_LIMIT, TILT_LIMIT = 15.0, np.cos(np.radians(80.0))
 PLAYS = np.array([0.4, 1.0, 1.6])
-"""Widths of the plays of a speed controller over their mean."""
+"""Widths of the play elements of a speed controller, relative to their mean."""
 EXTRA = frozenset({"esc_rate", "second_lag", "bob_mass", "flex"})
 DELAY_RING = 16
 
 
 @dataclass(frozen=True)
 class Lane:
-    """One flight to fly.
+    """One flight to simulate.
 
     Attributes:
-        drone: physics, as `physics.nominal` gives.
-        instruments: noise levels.
-        setpoints: (n, 17) at 100 Hz; flown after a warm-up at the first one.
-        rows: ticks from the start of the log at which it has rows.
-        voltage: of the resting battery at the start, V.
-        gyro_bias: (3,) rad/s.
-        rng: of the noise in the loop.
+        drone: parameters, as `physics.nominal` gives them.
+        instruments: sensors.
+        setpoints: set-points at 100 Hz, (n, 17), flown after a warm-up at the first one.
+        rows: ticks of the rows, from the start of the log.
+        voltage: voltage of the unloaded battery at the start, V.
+        gyro_bias: bias of the gyro, (3,), rad/s.
+        rng: generator of the noise in the control loop.
     """
 
     drone: dict[str, np.ndarray]
@@ -54,7 +54,14 @@ class Lane:
 
 @dataclass(frozen=True)
 class Flight:
-    """What was recorded: ``crashed``; late pose (n, 10); gyro, accelerometer, voltage (n, 7); command, speed (n, 8)."""
+    """Recorded signals of a flight.
+
+    Attributes:
+        crashed: whether the flight crashed.
+        pose: delayed position, velocity and quaternion, (n, 10).
+        inertial: gyro, accelerometer and voltage, (n, 7).
+        motors: commands and rotor speeds, (n, 8).
+    """
 
     crashed: bool
     pose: np.ndarray
@@ -63,11 +70,11 @@ class Flight:
 
 
 def simulate(lanes: list[Lane], other: OtherController | None = None) -> list[Flight]:
-    """Fly all lanes side by side; nothing drawn or computed in one depends on the others.
+    """Simulate all flights at once. A flight does not depend on the others.
 
     Args:
-        lanes: the flights.
-        other: flies them all in place of the built-in controller; it sees what is late, as a policy on board would.
+        lanes: flights to simulate.
+        other: controller of all flights instead of the built-in one. All its estimates are delayed, the gyro too.
     """
     loop = _Loop(lanes, other)
     for tick in range(loop.ticks):
@@ -79,7 +86,7 @@ def simulate(lanes: list[Lane], other: OtherController | None = None) -> list[Fl
 
 
 class _Loop:
-    """State of all lanes."""
+    """State of the simulation of all lanes."""
 
     def __init__(self, lanes: list[Lane], other: OtherController | None):
         count = len(lanes)
@@ -91,7 +98,7 @@ class _Loop:
         rows = [c.WARM_UP_TICKS + lane.rows for lane in lanes]
         self.pose = Recorder([r - e for r, e in zip(rows, extra, strict=True)], 10)
         self.inertial = Recorder(rows, 7)
-        # Motor columns of a row hold what was true `motor_shift` ticks before it.
+        # The motor columns of a row have the values of `motor_shift` ticks earlier.
         self.motors = Recorder([r - s for r, s in zip(rows, shift, strict=True)], 8)
         self.ticks = int(self.ends.max()) + max(0, -int(shift.min())) + 1
         self.x = self.start = _start(p, self.goals[0])
@@ -113,7 +120,7 @@ class _Loop:
         self.crashed = np.zeros(count, dtype=bool)
 
     def step(self, tick: int) -> None:
-        """One tick: measure, decide, record, move on."""
+        """Simulate one tick: measure, control, record, integrate."""
         if tick % CHUNK == 0:
             self.noise = np.stack([lane.rng.standard_normal((CHUNK, NOISES)) for lane in self.lanes], axis=-1)
         noise = self.noise[tick % CHUNK] * self.levels
@@ -138,7 +145,7 @@ class _Loop:
             self._check(tick)
 
     def _decide(self, tick, goal, late, gyro):
-        """Commands (4, F): the built-in controller's, or the other's, who is asked now and then and held in between."""
+        """Return commands (4, F) of the built-in controller, or of the other one, held between its control steps."""
         if self.other is None:
             return self.controller(goal, SimpleNamespace(position=late[P], velocity=late[V], quaternion=late[Q]), gyro)
         self.past_gyro.append(gyro)
@@ -149,7 +156,7 @@ class _Loop:
         return np.rint(np.clip(command + goal[DITHER], 0.0, 1.0) * 65535) / 65535
 
     def _played(self, command):
-        """What a speed controller with play makes of a command: several plays side by side, and the command itself."""
+        """Return the output of speed controllers with play: a mean of play elements, mixed with the command itself."""
         width = PLAYS[:, None, None] * self.p.play
         self.plays = np.clip(self.plays, command - width, command + width)
         return command + self.p.play_share * (self.plays.mean(axis=0) - command)
@@ -162,21 +169,21 @@ class _Loop:
         return x, first
 
     def _arrived(self, tick, sub):
-        """Commands as they reach the motors, each lane's own delay (whole substeps) later."""
+        """Return the commands at the motors, after the delay of each lane (whole substeps)."""
         if "delay_ms" not in self.p.on:
             return self.driven[tick % DELAY_RING]
         past = (c.SUBSTEPS * tick + sub - self.p.delay_ms.astype(int)) // c.SUBSTEPS
         return self.driven[past % DELAY_RING, :, np.arange(len(self.lanes))].T
 
     def _battery(self):
-        """Voltage (F,); drained and pulled down by the rotors' power."""
+        """Return the battery voltage (F,); it falls with the charge drawn and with the current."""
         load = IDLE_CURRENT + (HOVER_CURRENT - IDLE_CURRENT) / 4 * ((self.x[SPEED] / c.HOVER_SPEED) ** 3).sum(0)
         self.current = CURRENT_KEEP * self.current + (1 - CURRENT_KEEP) * load
         self.charge += c.TICK * self.current
         return self.resting - DISCHARGE * self.charge - RESISTANCE * (self.current - HOVER_CURRENT)
 
     def _held(self, noise, voltage):
-        """Whatever stays constant over a tick."""
+        """Return the inputs that are constant over a tick."""
         p = self.p
         keep = PUSH_KEEP
         self.wander[:6] = keep * self.wander[:6] + np.sqrt(1 - keep**2) * noise[13:19]
@@ -196,7 +203,7 @@ class _Loop:
         )
 
     def _check(self, tick):
-        """Mark crashed flights, and set them back to hover so that they cannot overflow."""
+        """Mark crashed flights, and reset them to hover so that they do not overflow."""
         x = self.x
         level = 1 - 2 * (x[7] ** 2 + x[8] ** 2)
         wild = (np.abs(x[W]).max(0) > RATE_LIMIT) | (level < TILT_LIMIT) | (x[2] < 0.0)
@@ -207,7 +214,7 @@ class _Loop:
 
 
 def _levels(instruments: list[Instruments]) -> np.ndarray:
-    """(21, F) standard deviations of the noise columns."""
+    """Standard deviations of the noise columns, (21, F)."""
     return np.array(
         [
             [i.position] * 3 + [i.velocity] * 3 + [i.quaternion] * 4 + [i.gyro] * 3 + [i.push] * 3
@@ -218,12 +225,12 @@ def _levels(instruments: list[Instruments]) -> np.ndarray:
 
 
 def _jolts(instruments: list[Instruments]) -> np.ndarray:
-    """(F,) steps of velocity in a tick over what drives ``push``, whose draws they share."""
+    """Ratio of the velocity step per tick to the input of ``push``, (F,); both use the same draws."""
     return np.array([i.jolt / i.push if i.push else 0.0 for i in instruments]) * np.sqrt(c.TICK)
 
 
 def _padded(setpoints: list[np.ndarray]) -> np.ndarray:
-    """(n, 17, F) set-points; a flight that is over stays where it is."""
+    """Set-points padded to equal length, (n, 17, F); a flight that has ended holds its last position."""
     length = max(map(len, setpoints))
     goals = np.zeros((length, setpoints[0].shape[1], len(setpoints)))
     for lane, own in enumerate(setpoints):
@@ -236,7 +243,7 @@ def _padded(setpoints: list[np.ndarray]) -> np.ndarray:
 
 
 def _start(p: SimpleNamespace, goal: np.ndarray) -> np.ndarray:
-    """Level, at rest at the first set-point, rotors at the nominal hover speed; a bob hangs straight down."""
+    """Initial state: level and at rest at the first set-point, rotors at hover speed, a bob hanging straight down."""
     x = np.zeros((ROWS if p.on & EXTRA else PLAIN_ROWS, goal.shape[1]))
     x[P], x[6] = goal[POSITION], 1.0
     x[SPEED] = c.HOVER_SPEED

@@ -1,9 +1,10 @@
-"""Sweeps: one command with many arguments, on this machine or a cluster, each result landing once.
+"""Parameter sweeps: one command with many combinations of arguments, on this machine or a cluster.
 
-A file names a command of ``cfb`` and what varies (`config`, `tasks`); every combination is a task with a name and a
-command line. Workers run tasks apart and land each with one rename (`attempt`, `folder`); the driver notes what ended
-(`drive`) and writes a table (`summary`). What lies in the folder is all there is to know, so that a sweep goes on after
-anything. Ray is behind `cluster` alone; the commands themselves come from whoever calls, since they stand above this.
+A file names a command of ``cfb`` and the arguments that vary (`config`, `tasks`). Every combination is a task with a
+name and a command line. Workers run the tasks and move each result into place with one rename (`attempt`, `folder`), so
+that it is complete and there is only one. The driver records the outcomes (`drive`) and writes a table (`summary`). All
+state is in the sweep's folder, so an interrupted sweep can always continue. Only `cluster` uses Ray. The caller passes
+the classes of the commands in, because the layer of commands is above this one.
 """
 
 from cfb_mjx.sweep.config import Sweep, load_sweep

@@ -1,4 +1,4 @@
-"""One attempt at a task, as a worker makes it: alone, apart from the results, and landed with one rename."""
+"""One attempt at a task in a worker: it runs in its own folder, which one rename moves to the results."""
 
 from __future__ import annotations
 
@@ -24,33 +24,33 @@ BAD_INPUT, INTERRUPTED = 2, 130
 
 
 class TaskFault(Exception):
-    """The command broke for no fault of its input: worth another attempt."""
+    """The command failed although its input is valid; another attempt may succeed."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of a task: why it failed, None if it is done."""
+    """Outcome of a task: the reason of its failure, or None if it is done."""
 
     failed: str | None = None
 
 
 def attempt(task: Task, folder: Folder, place: str, run: Callable[[list[str]], int]) -> Outcome:
-    """Run a task and land its results.
+    """Run a task and move its results into place.
 
     Args:
-        task: what to run.
-        folder: of the sweep.
-        place: folder that relative paths of the command count from.
-        run: runs ``cfb`` with these arguments; exit status.
+        task: the task.
+        folder: folder of the sweep.
+        place: folder that the relative paths of the command start from.
+        run: runs ``cfb`` with the given arguments and returns its exit status.
 
     Raises:
-        TaskFault: the command ended in another way than done, bad input or interrupted.
-        KeyboardInterrupt: it was interrupted.
+        TaskFault: the command failed for another reason than bad input.
+        KeyboardInterrupt: the command was interrupted.
     """
     os.chdir(place)
     with folder.alone(task.name):
         if folder.done(task.name).is_dir():
-            return Outcome()  # Another attempt was quicker, or its worker died after landing.
+            return Outcome()  # Another attempt was faster, or its worker died after the rename.
         here = folder.running(task.name)
         record = _prepare(task, here)
         started = time.monotonic()
@@ -58,17 +58,17 @@ def attempt(task: Task, folder: Folder, place: str, run: Callable[[list[str]], i
         if status == INTERRUPTED:
             raise KeyboardInterrupt
         if status == BAD_INPUT:
-            return Outcome(_sentence(said) or "bad input; see what it printed.")
+            return Outcome(_sentence(said) or "bad input; see the output of the task.")
         if status != 0 or not (here / KINDS[task.command].result).exists():
             lines = said.strip().splitlines()
-            raise TaskFault(lines[-1] if lines else f"it ended with status {status}.")
+            raise TaskFault(lines[-1] if lines else f"the command ended with exit status {status}.")
         write_json(here / RECORD, record | {"seconds": round(time.monotonic() - started, 3)})
         here.rename(folder.done(task.name))
     return Outcome()
 
 
 def _prepare(task: Task, here: Path) -> dict[str, Any]:
-    """Clear away what an interrupted attempt left, but for what the command goes on from; what to record."""
+    """Delete the files of an earlier attempt, except those that the command resumes from; return the task's record."""
     kind = KINDS[task.command]
     earlier = read_record(here)
     here.mkdir(parents=True, exist_ok=True)
@@ -91,11 +91,11 @@ def _prepare(task: Task, here: Path) -> dict[str, Any]:
 
 
 def _run(task: Task, here: Path, run: Callable[[list[str]], int]) -> tuple[int, str]:
-    """Exit status of the command, and what it printed."""
+    """Run the command; return its exit status and its output."""
     words = [*task.words(here), *KINDS[task.command].more]
     printed = here / OUTPUT
     before = printed.stat().st_size if printed.exists() else 0
-    arguments, sys.argv = sys.argv, ["cfb", *words]  # a fitted model says by which command line it was made
+    arguments, sys.argv = sys.argv, ["cfb", *words]  # a fitted model stores the command line that made it
     try:
         with _captured(printed):
             now = time.strftime("%Y-%m-%d %H:%M:%S")
@@ -114,7 +114,7 @@ def _run(task: Task, here: Path, run: Callable[[list[str]], int]) -> tuple[int, 
 
 @contextmanager
 def _captured(path: Path) -> Iterator[None]:
-    """All that this process prints, also from compiled code, at the end of a file."""
+    """Append everything that this process prints, also from compiled code, to a file."""
     kept = os.dup(1), os.dup(2)
     with open(path, "a", encoding="utf-8", buffering=1) as file:
         try:
@@ -130,6 +130,6 @@ def _captured(path: Path) -> Iterator[None]:
 
 
 def _sentence(said: str) -> str | None:
-    """What the command gave as its reason."""
+    """Return the last error message of the command, if it printed one."""
     reasons = [line.removeprefix("cfb: ") for line in said.splitlines() if line.startswith("cfb: ")]
     return reasons[-1] if reasons else None

@@ -1,4 +1,4 @@
-"""Ray: on this machine for the time of a sweep, or a cluster that is there. The one module that knows it."""
+"""Workers by Ray: started on this machine for one sweep, or those of an existing cluster. No other module uses Ray."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from cfb_mjx.sweep.probe import look, say_hello
 from cfb_mjx.sweep.workers import environment
 
 ANSWER_S = 15.0
-"""A cluster must answer within this."""
+"""Time within which a cluster must answer."""
 LOOK_S = 90.0
-"""And start a worker on every node within this."""
+"""Time within which every node must start a worker."""
 
 
 @dataclass(frozen=True)
 class Needs:
-    """Of every task.
+    """Resources of a task.
 
     Attributes:
-        cpus: processors.
-        gpus: GPUs.
-        retries: more attempts when a worker dies or the command breaks.
-        calls: tasks of one worker process.
+        cpus: processors per task.
+        gpus: GPUs per task.
+        retries: further attempts if a worker dies or the command fails.
+        calls: tasks per worker process.
     """
 
     cpus: float = 1.0
@@ -48,19 +48,19 @@ class Needs:
 
 @dataclass(frozen=True)
 class Pool:
-    """Workers to give tasks to."""
+    """Workers that run tasks."""
 
     ray: Any
     needs: Needs
 
     def submit(self, function: Callable[..., Outcome], *arguments: Any) -> Any:
-        """Hand in a call; a handle for `finished`."""
+        """Submit a call; return a handle for `finished`."""
         options = {"num_cpus": self.needs.cpus, "num_gpus": self.needs.gpus, "max_calls": self.needs.calls}
         options |= {"max_retries": self.needs.retries, "retry_exceptions": [TaskFault]}
         return self.ray.remote(**options)(function).remote(*arguments)
 
     def finished(self, handles: list[Any], seconds: float = 1.0) -> list[tuple[Any, Outcome]]:
-        """Those that ended by now, after waiting up to ``seconds`` for the first."""
+        """Wait up to ``seconds`` for a call to end; return all that have ended, with their outcomes."""
         ready, _ = self.ray.wait(handles, num_returns=1, timeout=seconds)
         if ready:
             ready, _ = self.ray.wait(handles, num_returns=len(handles), timeout=0)
@@ -76,29 +76,30 @@ class Pool:
         except errors.RayError as error:
             tries = self.needs.retries + 1
             return Outcome(
-                f"its worker process died, {tries} times if not more ({type(error).__name__}): it may have run out of "
-                "memory, or a crash of compiled code; what it printed is below."
+                f"its worker process died at least {tries} times ({type(error).__name__}): it may have run out of "
+                "memory, or compiled code may have crashed; its output is below."
             )
 
 
 @contextmanager
 def opened(address: str | None, needs: Needs, folder: Path) -> Iterator[Pool]:
-    """Workers during the block: on this machine, or of the cluster at ``address``.
+    """Provide workers during the block, on this machine or on the cluster at ``address``.
 
     Args:
-        address: ``HOST:PORT`` of a cluster's head, or ``auto`` for the one this machine belongs to; None starts one
-            here and stops it at the end.
-        needs: of every task.
-        folder: of the sweep, which all nodes must see.
+        address: ``HOST:PORT`` of a cluster's head, or ``auto`` for the cluster that this machine belongs to. None
+            starts Ray on this machine and stops it at the end.
+        needs: resources of every task.
+        folder: folder of the sweep, which all nodes must share.
 
     Raises:
-        CfbError: Ray is not installed, no cluster answers, its nodes are of no use, or tasks need more than there is.
+        CfbError: Ray is not installed, no cluster answers, a node cannot run tasks, or a task needs more resources than
+            there are.
     """
-    # Read when Ray is imported or started. Nothing is reported to its makers, and `uv run` does not pack this folder.
+    # Ray reads these when it is imported or started: no usage statistics, and `uv run` does not upload this folder.
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     os.environ.setdefault("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
-    # By itself Ray tries for ever what runs out of memory.
+    # By default Ray retries a task that runs out of memory without a limit.
     os.environ.setdefault("RAY_task_oom_retries", str(needs.retries))
     try:
         import ray
@@ -118,21 +119,21 @@ def opened(address: str | None, needs: Needs, folder: Path) -> Iterator[Pool]:
 
 @contextmanager
 def _embedded(ray: Any, options: dict[str, Any]) -> Iterator[None]:
-    # A folder of its own: Ray leaves its logs behind. Sockets lie there, whose names must be short.
+    # A separate folder, because Ray leaves its logs behind. Its sockets need short paths.
     short = tempfile.gettempdir() if len(tempfile.gettempdir()) < 30 else "/tmp"
     place = tempfile.mkdtemp(prefix="cfb-ray-", dir=short)
     before = {name: os.environ.get(name) for name in ("RAY_AUTH_MODE", "RAY_AUTH_TOKEN")}
-    # Whoever reaches Ray's ports runs what they like. Newer versions ask for a token, and by themselves would leave one
-    # in the home folder, after which every `ray start` wants it.
+    # Anybody who can reach Ray's ports can run code. Newer versions require a token; without this they would store one
+    # in the home folder, and every `ray start` would then ask for it.
     os.environ.pop("RAY_AUTH_MODE", None)
     os.environ["RAY_AUTH_TOKEN"] = _token()
     try:
         try:
             ray.init(
-                address="local",  # not the cluster that RAY_ADDRESS or an earlier `ray start` speaks of
+                address="local",  # not the cluster of RAY_ADDRESS or of an earlier `ray start`
                 num_cpus=_processors(),
                 include_dashboard=False,
-                object_store_memory=100 * 2**20,  # nothing but names passes through it
+                object_store_memory=100 * 2**20,  # only names pass through it
                 _node_ip_address="127.0.0.1",
                 _temp_dir=place,
                 **options,
@@ -151,7 +152,7 @@ def _embedded(ray: Any, options: dict[str, Any]) -> Iterator[None]:
 
 @cache
 def _token() -> str:
-    """The same for all of this process: Ray keeps the first it sees."""
+    """Token of this process, always the same one, because Ray keeps the first."""
     return secrets.token_hex(32)
 
 
@@ -171,7 +172,7 @@ def _joined(ray: Any, address: str, options: dict[str, Any]) -> Iterator[None]:
 
 
 def _require_answer(address: str) -> None:
-    """Ask before Ray is let at it, which would try for minutes."""
+    """Refuse an address where no cluster answers; Ray would try for minutes."""
     if not re.fullmatch(r"[^/]+:\d+", address):
         raise CfbError(
             f"--address {address}: give HOST:PORT of the cluster's head, for instance 10.0.0.1:6379, or auto."
@@ -182,13 +183,13 @@ def _require_answer(address: str) -> None:
         socket.create_connection((host.strip("[]"), int(port)), timeout=ANSWER_S).close()
         asked = subprocess.run(command, capture_output=True, text=True, timeout=ANSWER_S, check=False)
     except subprocess.TimeoutExpired:
-        raise _not_joined(address, "what listens there does not answer as Ray does") from None
+        raise _not_joined(address, "the program that listens there is not Ray") from None
     except (OSError, OverflowError) as error:
         raise _not_joined(address, f"nothing listens there: {getattr(error, 'strerror', None) or error}") from None
     if asked.returncode:
-        lines = [line for line in asked.stderr.splitlines() if line.strip()] or ["it does not say why"]
+        lines = [line for line in asked.stderr.splitlines() if line.strip()] or ["it gives no reason"]
         if "InvalidAuthToken" in asked.stderr:
-            lines = ["it asks for a token: set RAY_AUTH_MODE=token, with the cluster's token in RAY_AUTH_TOKEN"]
+            lines = ["it requires a token: set RAY_AUTH_MODE=token and RAY_AUTH_TOKEN to the token of the cluster"]
         raise _not_joined(address, lines[-1])
 
 
@@ -204,7 +205,7 @@ def _first_line(error: Exception) -> str:
 
 
 def _processors() -> int | None:
-    """What this process may use, where that is less than the machine has (SLURM, taskset); None lets Ray count."""
+    """Processors that this process may use, if fewer than the machine has (SLURM, taskset); None lets Ray count."""
     if not hasattr(os, "sched_getaffinity"):
         return None
     allowed = len(os.sched_getaffinity(0))
@@ -212,7 +213,7 @@ def _processors() -> int | None:
 
 
 def _require_room(ray: Any, needs: Needs, address: str | None) -> None:
-    """Ray would wait for ever for a machine that is large enough."""
+    """Refuse tasks that need more than any machine has; Ray would wait for ever."""
     nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if any(n.get("CPU", 0) >= needs.cpus and n.get("GPU", 0) >= needs.gpus for n in nodes):
         return
@@ -225,7 +226,7 @@ def _require_room(ray: Any, needs: Needs, address: str | None) -> None:
 
 
 def _require_sight(ray: Any, folder: Path) -> None:
-    """Every node must see the folder of the sweep and the current one, and have this version of the library."""
+    """Refuse nodes that do not see the sweep's or the current folder, or have another version of the library."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
     with say_hello(folder) as marker:
@@ -246,10 +247,11 @@ def _require_sight(ray: Any, folder: Path) -> None:
                 ) from None
             if missing:
                 raise CfbError(
-                    f"{host} of the cluster does not see {missing}; the folders of a sweep must lie on a file system "
+                    f"{host} of the cluster does not see {missing}; the folders of a sweep must be on a file system "
                     "that all machines share, under the same path."
                 )
             if version != __version__:
                 raise CfbError(
-                    f"{host} of the cluster has cfb_mjx {version}, here it is {__version__}; install the same."
+                    f"{host} of the cluster has cfb_mjx {version}, this machine has {__version__}; install the same "
+                    "version."
                 )

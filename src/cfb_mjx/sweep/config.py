@@ -1,4 +1,4 @@
-"""The file that describes a sweep, read strictly."""
+"""The file that describes a sweep; unknown keys and wrong types are errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _KEYS = {"format", "description", "command", "arguments", "over", "each", "cpus"
 
 @dataclass(frozen=True)
 class Point:
-    """Some of what varies: values by key, and what to call them (None: after the values)."""
+    """A case of a sweep: values by key, and its label (None: a name from the values)."""
 
     values: dict[str, Any]
     label: str | None = None
@@ -30,16 +30,16 @@ class Point:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep as its file says it.
+    """A sweep, as its file describes it.
 
     Attributes:
-        path: of the file.
-        parameters: of the command that every task runs.
-        arguments: the same for all, by key (``seed``, ``set.mass``).
-        over: lists whose product is taken.
-        each: cases, combined with that product.
-        cpus: of a task; its computations are held to as many threads.
-        gpus: of a task.
+        path: the file.
+        parameters: parameters of the command that every task runs.
+        arguments: arguments of all tasks, by key (``seed``, ``set.mass``).
+        over: lists of values; the sweep takes their product.
+        each: cases; each is combined with that product.
+        cpus: processors per task; its computations are limited to as many threads.
+        gpus: GPUs per task.
     """
 
     path: Path
@@ -52,15 +52,15 @@ class Sweep:
 
 
 def load_sweep(name_or_path: str | Path, load: Callable[[str], type[Command]], files: Sequence[Path] = ()) -> Sweep:
-    """Read a sweep of a YAML file, or a shipped one by its name.
+    """Read a sweep from a YAML file, or a shipped one by its name.
 
     Args:
-        name_or_path: of the sweep; its patterns are looked up from the current folder.
-        load: name of a command to its class, whose fields say what a task may be given.
-        files: plugins for every task, before those the sweep names.
+        name_or_path: file or name of the sweep; its patterns of files start from the current folder.
+        load: function from the name of a command to its class, whose fields are the arguments of a task.
+        files: plugins for every task, in addition to those of the sweep.
 
     Raises:
-        CfbError: one sentence on what is wrong and where.
+        CfbError: the file is missing or invalid; one sentence says where and why.
     """
     path, raw = load_named(name_or_path, "sweep", FORMAT, FOLDER)
     refuse_unknown(raw, _KEYS, path, "")
@@ -98,7 +98,7 @@ def _mapping(raw: Mapping, key: str, path: Path) -> dict:
 
 
 def _flat(mapping: Mapping, parameters: Parameters, where: str) -> dict[str, Any]:
-    """Keys as in Python (``held_out``), changes dotted: ``set: {mass: 0.04}`` is ``set.mass: 0.04``."""
+    """Flatten arguments: keys as in Python (``held_out``), and ``set: {mass: 0.04}`` becomes ``set.mass: 0.04``."""
     flat: dict[str, Any] = {}
     for raw_key, value in mapping.items():
         name, dot, rest = str(raw_key).partition(".")
@@ -116,7 +116,7 @@ def _flat(mapping: Mapping, parameters: Parameters, where: str) -> dict[str, Any
 
 
 def _plain(value: Any) -> Any:
-    """YAML reads 2026-01-31 as a date; here it is the name of something."""
+    """Turn values such as dates, which YAML makes of 2026-01-31, back into text."""
     if isinstance(value, list):
         return [_plain(v) for v in value]
     return value if value is None or isinstance(value, str | bool | int | float | dict) else str(value)
@@ -138,7 +138,7 @@ def _each(raw: Any, parameters: Parameters, path: Path) -> tuple[Point, ...]:
 
 
 def _matches(raw: dict, path: Path) -> tuple[Point, ...]:
-    """One case for every file or folder that matches a pattern."""
+    """Return one case for every file or folder that matches the pattern."""
     if len(raw) != 1 or not all(isinstance(pattern, str) for pattern in raw.values()):
         raise CfbError(f"{path}: 'each' must be a list of mappings, or one NAME: PATTERN of files or folders.")
     ((key, pattern),) = raw.items()
@@ -155,7 +155,7 @@ def _share(raw: Mapping, key: str, default: float, path: Path) -> float:
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not number or not 0 <= value < math.inf or (key == "cpus" and value == 0):
         raise CfbError(f"{path}: '{key}' must be a {least} number, found {told(value)}.")
-    # Ray shares a processor, not several and a half.
+    # Ray can share one processor, but it does not accept several and a fraction.
     if value > 1 and value != int(value):
         raise CfbError(f"{path}: '{key}' above 1 must be a whole number, found {told(value)}.")
     return float(value)

@@ -1,4 +1,4 @@
-"""From tasks to results: what is done is skipped, the rest handed to workers, every ending noted at once."""
+"""Run the tasks of a sweep on workers and record each outcome immediately."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from cfb_mjx.sweep.tasks import Task
 
 
 class Workers(Protocol):
-    """Where attempts are made; see `cfb_mjx.sweep.cluster.Pool`."""
+    """Workers that run attempts; see `cfb_mjx.sweep.cluster.Pool`."""
 
     def submit(self, function: Callable[..., Outcome], *arguments: object) -> object:
-        """Hand in a call."""
+        """Submit a call; return a handle."""
         ...
 
     def finished(self, handles: list) -> list[tuple[object, Outcome]]:
-        """Calls that ended."""
+        """Return the calls that have ended, with their outcomes."""
         ...
 
 
 @dataclass(frozen=True)
 class Ended:
-    """A task that has ended: it, how, and how many did not yet."""
+    """A task that has ended, its outcome, and the number of tasks left."""
 
     task: Task
     outcome: Outcome
@@ -47,16 +47,16 @@ def drive(
     """Run tasks until all have ended.
 
     Args:
-        tasks: to run.
-        folder: of the sweep.
-        summary: refreshed as tasks end.
-        workers: who run them.
-        run: runs ``cfb`` with arguments in a worker; exit status.
-        at_once: most tasks at a time; None leaves it to the workers.
-        ended: told of every task.
+        tasks: tasks to run.
+        folder: folder of the sweep.
+        summary: table that is refreshed as tasks end.
+        workers: workers that run the tasks.
+        run: runs ``cfb`` with the given arguments in a worker and returns its exit status.
+        at_once: largest number of simultaneous tasks; None leaves it to the workers.
+        ended: called for every task that ends.
 
     Returns:
-        Why tasks failed, by name.
+        The reasons of failed tasks, by name.
     """
     waiting, flying, failed = deque(tasks), {}, {}
     place = os.getcwd()

@@ -1,4 +1,4 @@
-"""The folder of a sweep: what lies where, and what it says of every task."""
+"""The folder of a sweep: its layout, and the state of every task."""
 
 from __future__ import annotations
 
@@ -22,46 +22,46 @@ State = Literal["done", "failed", "open"]
 
 @dataclass(frozen=True)
 class Folder:
-    """Of a sweep.
+    """Folder of a sweep.
 
-    ``done/NAME`` holds a task's results and appears at once and whole; ``running/NAME`` is where it is worked on;
-    ``failed/NAME.txt`` says why it did not work.
+    ``done/NAME`` holds the results of a task; it appears in one rename, complete. A task runs in ``running/NAME``.
+    ``failed/NAME.txt`` has the reason of a failure.
     """
 
     path: Path
 
     def done(self, name: str) -> Path:
-        """Results of a task."""
+        """Folder of the results of a task."""
         return self.path / "done" / name
 
     def running(self, name: str) -> Path:
-        """Where a task is worked on."""
+        """Folder in which a task runs."""
         return self.path / "running" / name
 
     def failed(self, name: str) -> Path:
-        """Why a task failed."""
+        """File with the reason of a task's failure."""
         return self.path / "failed" / f"{name}.txt"
 
     def state(self, name: str) -> State:
-        """Of a task."""
+        """State of a task."""
         if self.done(name).is_dir():
             return "done"
         return "failed" if self.failed(name).exists() else "open"
 
     def alone(self, name: str):
-        """A block in which no other process works on the task; waits for one that does."""
+        """Lock a task during a block; wait if another process runs it."""
         return held(self.path / ".locks" / "tasks" / name)
 
     def summing(self):
-        """A block in which no other process writes the table of results."""
+        """Lock the table of results during a block; wait if another process writes it."""
         return held(self.path / ".locks" / "results")
 
     @contextmanager
     def driven(self, part: tuple[int, int] | None = None) -> Iterator[None]:
-        """A block in which no other process drives this sweep, or this part of it.
+        """Lock the sweep, or one part of it, during a block.
 
         Raises:
-            CfbError: one does.
+            CfbError: another process drives it.
         """
         busy = f"{self.path}: another cfb sweep is at work there; wait for it or stop it"
         with ExitStack() as stack:
@@ -71,27 +71,27 @@ class Folder:
             yield
 
     def fail(self, task: Task, why: str) -> None:
-        """Note why a task failed, with the end of what it printed."""
+        """Record the reason of a task's failure, with the end of its output."""
         printed = self.running(task.name) / OUTPUT
         said = printed.read_text(encoding="utf-8", errors="replace") if printed.exists() else ""
         tail = "\n".join(said.splitlines()[-50:])
         write_text(self.failed(task.name), f"{why}\n\n{task.line}\n\n{tail}\n")
 
     def forgive(self, name: str) -> None:
-        """Forget an earlier failure of a task that is done now."""
+        """Delete the record of an earlier failure of a task that is done now."""
         self.failed(name).unlink(missing_ok=True)
 
 
 def open_folder(path: Path, config: str) -> Folder:
-    """Make the folder of a sweep, or take up an earlier one, and keep the sweep's file in it.
+    """Create the folder of a sweep, or open an existing one, and store the sweep's file in it.
 
     Raises:
-        CfbError: something else lies there, or it cannot be written.
+        CfbError: the folder holds other files, or cannot be written.
     """
     path = Path(os.path.abspath(path))
     require_own(path)
     output_folder(path)
-    # First, since it says to other parts of the sweep, which may start at the same moment, whose folder this is.
+    # Written first: other parts of the sweep may start now, and recognise the folder by it.
     write_text(path / CONFIG, config)
     for name in ("done", "running", "failed"):
         output_folder(path / name)
@@ -99,20 +99,20 @@ def open_folder(path: Path, config: str) -> Folder:
 
 
 def require_own(path: Path) -> None:
-    """Refuse a folder with anything but a sweep in it.
+    """Refuse a folder that holds anything but a sweep.
 
     Raises:
-        CfbError: names it.
+        CfbError: it does.
     """
     if path.is_dir() and any(not p.name.startswith(".") for p in path.iterdir()) and not (path / CONFIG).exists():
-        raise CfbError(f"{path}: holds other files; give a folder of the sweep's own with -o.")
+        raise CfbError(f"{path}: holds other files; give another folder, for this sweep alone, with -o.")
 
 
 def require_same(folder: Folder, tasks: tuple[Task, ...]) -> None:
-    """Refuse to mix results of two command lines under one name.
+    """Refuse a folder in which a task of the same name has another command line.
 
     Raises:
-        CfbError: names the first task that was another one when it was done, or when it got as far as it is.
+        CfbError: names the first such task that is done, or has begun and would resume.
     """
     for task in tasks:
         goes_on = KINDS[task.command].goes_on
@@ -124,13 +124,13 @@ def require_same(folder: Folder, tasks: tuple[Task, ...]) -> None:
             if line != task.line:
                 was = f"'{line}'" if line else "something else"
                 raise CfbError(
-                    f"{place}: was made by {was}, this sweep would run '{task.line}'; give another folder with -o, or "
-                    "move that one away."
+                    f"{place}: was made by {was}, but this sweep would run '{task.line}'; give another folder with -o, "
+                    "or move that one away."
                 )
 
 
 def read_record(place: Path) -> dict[str, Any]:
-    """What a task's folder says of the task; nothing if it cannot be read."""
+    """Return the record in a task's folder; empty if it cannot be read."""
     try:
         record = json.loads((place / RECORD).read_text(encoding="utf-8"))
     except (OSError, ValueError):

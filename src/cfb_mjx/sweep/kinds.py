@@ -1,4 +1,4 @@
-"""Which commands a sweep can run, and what it must know of each."""
+"""The commands that a sweep can run, and the properties of each that it needs."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ RESULT = "result.json"
 
 @dataclass(frozen=True)
 class Kind:
-    """A command, as a task of a sweep.
+    """A command as a task of a sweep.
 
     Attributes:
-        positional: the parameter that is given without its name.
-        output: what ``-o`` names inside the task's folder (``.`` for the folder itself), None for commands without it.
-        result: JSON with the numbers of the task; asked for with ``--json`` unless the command always writes it.
-        writes_result: whether it does.
-        goes_on: file in the folder of an interrupted task by which the command goes on where it was.
-        more: arguments that make it go on.
-        calls: tasks of one worker process, so that compiled programs are shared but do not pile up.
+        positional: parameter that is given without its name.
+        output: argument of ``-o`` inside the task's folder (``.`` for the folder itself); None for commands without it.
+        result: JSON file with the numbers of the task, requested with ``--json`` unless the command always writes it.
+        writes_result: whether the command always writes it.
+        goes_on: file in the folder of an interrupted task that the command resumes from.
+        more: arguments that make the command resume.
+        calls: tasks per worker process; they share compiled programs, which must not accumulate.
     """
 
     positional: str | None = None
@@ -30,7 +30,7 @@ class Kind:
     calls: int = 20
 
     def outputs(self) -> tuple[tuple[str, str], ...]:
-        """Options that take a file of the task's folder, with the file."""
+        """Options that name a file in the task's folder, with the file."""
         folder = () if self.output is None else (("--output", self.output),)
         return folder if self.writes_result else (*folder, ("--json", self.result))
 
@@ -45,7 +45,7 @@ KINDS = {
     "fit-rotors": Kind("files", output="model.yaml"),
     "fly": Kind("controller"),
     "refine": Kind("logs", output="model.yaml"),
-    # A training sets XLA up for itself before jax loads (virtual devices, derivatives of the MJX body).
+    # A training configures XLA before jax loads (virtual devices, derivatives of the MJX body), so one per process.
     "train": Kind(
         "task",
         output=".",
@@ -58,8 +58,8 @@ KINDS = {
 }
 
 EXTRA_FILES = frozenset({"figure", "recording", "video", "log", "keep"})
-"""Parameters that name one more file to write: it goes into the task's folder."""
+"""Parameters that name another output file, which is put into the task's folder."""
 REPEATED = frozenset({"plugin"})
-"""Parameters that are named again for each of several values."""
+"""Parameters whose option is repeated for each value."""
 CHOSEN_HERE = frozenset({"output", "json", "resume"})
-"""Parameters that the sweep gives."""
+"""Parameters that the sweep sets itself."""

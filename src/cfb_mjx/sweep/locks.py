@@ -1,4 +1,4 @@
-"""Locks of files: they end with the process that holds them, however it ends, and hold on shared file systems too."""
+"""File locks. They end with the process that holds them, and also work on shared file systems."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def held(path: Path, shared: bool = False, busy: str | None = None) -> Iterator[
     """Hold a lock during the block.
 
     Args:
-        path: of the lock; the file stays.
-        shared: with others who say so.
-        busy: what to say when another holds it; None waits.
+        path: file of the lock; it is not deleted.
+        shared: allow other shared holders.
+        busy: message if another process holds the lock; None waits for it.
 
     Raises:
-        CfbError: ``busy``, with who holds it, or a file system without locks.
+        CfbError: another process holds the lock (``busy``, with that process), or the file system has no locks.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     how = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
@@ -38,12 +38,12 @@ def held(path: Path, shared: bool = False, busy: str | None = None) -> Iterator[
                 if busy is not None:
                     file.seek(0)
                     raise CfbError(f"{busy} ({file.read().strip() or 'elsewhere'}).") from None
-                # Polled, so that Ctrl-C is heard.
+                # Polling lets Ctrl-C through.
                 time.sleep(POLL_S)
             except OSError as error:
                 raise CfbError(
-                    f"{path}: its file system has no locks ({error.strerror or error}), without which two processes "
-                    "could write at once; choose a folder elsewhere."
+                    f"{path}: its file system has no locks ({error.strerror or error}), so two processes could write "
+                    "at the same time; choose a folder on another file system."
                 ) from None
         file.truncate(0)
         file.write(f"{socket.gethostname()}, process {os.getpid()}")

@@ -1,4 +1,4 @@
-"""Names of tasks: readable, safe as folders, and made of nothing but what varies, so that they stay as they are."""
+"""Names of tasks: readable, valid as folder names, and made only of what varies, so that they do not change."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from typing import Any
 from cfb_mjx.commands.command import text
 
 LONGEST = 120
-"""Characters of a name; file systems allow 255, and files are named after it."""
+"""Largest number of characters in a name; file systems allow 255, and names of files are made from it."""
 _UNSAFE = re.compile(r"[^A-Za-z0-9.=+_-]+")
 
 
 def name_of(label: str | None, varied: Mapping[str, Any]) -> str:
-    """Name of a task: its label, if it has one, then ``key=value`` of what varies.
+    """Return the name of a task: its label, if it has one, then ``key=value`` of what varies.
 
-    A key counts by its last part (``set.randomisation.magnitude`` as ``magnitude``) where no other ends alike.
+    A key is shortened to its last part (``set.randomisation.magnitude`` to ``magnitude``) unless another key has the
+    same last part.
     """
     ends = [key.rpartition(".")[2] for key in varied]
     short = {key: end if ends.count(end) == 1 else key for key, end in zip(varied, ends, strict=True)}
@@ -31,7 +32,7 @@ def name_of(label: str | None, varied: Mapping[str, Any]) -> str:
 
 
 def twice(names: Iterable[str]) -> str | None:
-    """A name that is there twice, also where capital letters do not count, as on some file systems."""
+    """Return a name that occurs twice, ignoring case as some file systems do; None if there is none."""
     seen = set()
     for name in names:
         if name.casefold() in seen:
@@ -47,6 +48,6 @@ def _said(value: Any) -> str:
         return "+".join(_said(v) for v in value)
     if isinstance(value, dict):
         return "+".join(f"{key}-{_said(v)}" for key, v in value.items())
-    # Of a path the folders say little; a suffix nothing.
+    # A path is shortened to its file name without suffix.
     said = text(value)
     return PurePath(said).stem if "/" in said or said.endswith((".yaml", ".yml", ".npz", ".mcap")) else said

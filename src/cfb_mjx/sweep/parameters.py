@@ -1,4 +1,4 @@
-"""What a command takes, read off its class, and values written as words of a command line."""
+"""The parameters of a command, from its class, and their values as words of a command line."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _SHAPES: dict[Any, Shape] = {bool: "flag", Path: "file", int: "whole", float: "n
 
 @dataclass(frozen=True)
 class Parameters:
-    """Of a command.
+    """Parameters of a command.
 
     Attributes:
-        command: its name.
-        made: its class.
-        shapes: what every parameter holds.
-        defaults: of all parameters that have one.
+        command: name of the command.
+        made: class of the command.
+        shapes: kind of value of every parameter.
+        defaults: defaults of the parameters that have one.
         kind: the command as a task.
     """
 
@@ -38,9 +38,9 @@ class Parameters:
 
     @classmethod
     def of(cls, command: str, made: type[Command], kind: Kind) -> Parameters:
-        """Those of a command, given its class."""
+        """Return the parameters of a command, given its class."""
         hints = typing.get_type_hints(made, include_extras=True)
-        # Plugins are named last on a line.
+        # Plugins come last on a command line.
         known = sorted(fields(made), key=lambda one: one.name == "plugin")
         defaults = {one.name: default_of(one) for one in known if default_of(one) is not MISSING}
         return cls(command, made, {one.name: _shape(held(hints[one.name])) for one in known}, defaults, kind)
@@ -49,7 +49,7 @@ class Parameters:
         """Refuse values that the command would refuse.
 
         Raises:
-            CfbError: a value of another kind or out of its range, or one that is missing.
+            CfbError: a value has the wrong kind, is out of range or is missing.
         """
         given: dict[str, Any] = {} if self.kind.output is None else {"output": self.kind.output}
         for name, shape in self.shapes.items():
@@ -77,10 +77,10 @@ class Parameters:
         return [name for name in self.shapes if name not in CHOSEN_HERE]
 
     def words(self, values: Mapping[str, Any], where: str) -> list[str]:
-        """Command line of values by key; in the order of the parameters, so that it does not depend on theirs.
+        """Return the command line of values by key, in the order of the parameters.
 
         Raises:
-            CfbError: a value that this parameter cannot hold.
+            CfbError: a parameter cannot take a value.
         """
         first, rest = [], []
         for name, shape in self.shapes.items():
@@ -119,7 +119,7 @@ def _texts(value: Any, where: str) -> list[str]:
 
 
 def _number(value: Any, kind: type, where: str) -> float:
-    # Text too: what stands in braces is text, and YAML takes 1e-3 for one.
+    # Accept text as well: values from braces are text, and so is 1e-3 in YAML.
     try:
         if isinstance(value, bool | list | dict) or (kind is int and isinstance(value, float)):
             raise TypeError

@@ -1,4 +1,4 @@
-"""Whether another machine sees the folders of a sweep."""
+"""Check whether another machine sees the folders of a sweep."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from pathlib import Path
 from cfb_mjx import __version__
 
 PATIENCE_S = 10.0
-"""Network file systems show new files late."""
+"""Time to wait for a new file; network file systems show it with a delay."""
 
 
 @contextmanager
 def say_hello(folder: Path) -> Iterator[Path]:
-    """A file in the folder during the block, for others to look for."""
+    """Create a file in the folder during the block, for other machines to look for."""
     handle, name = tempfile.mkstemp(prefix=".seen-", dir=folder)
     os.close(handle)
     try:
@@ -27,7 +27,7 @@ def say_hello(folder: Path) -> Iterator[Path]:
 
 
 def look(marker: str, place: str, patience_s: float = PATIENCE_S) -> tuple[str, str | None]:
-    """Version of the library here, and which folder is not seen from here: the marker's, ``place``, or None."""
+    """Return the library's version on this machine, and the folder that it does not see (None: it sees both)."""
     end = time.monotonic() + patience_s
     while not Path(marker).exists():
         if time.monotonic() > end:

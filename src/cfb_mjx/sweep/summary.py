@@ -1,4 +1,4 @@
-"""The table of a sweep: a row for every task, with what varied and the numbers of its results."""
+"""The table of a sweep: one row per task, with the varied arguments and the numbers of its results."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ CSV, JSON = "results.csv", "results.json"
 LEAST_INTERVAL_S = 2.0
 DEEPEST = 4
 _LEFT_OUT = ("environment", "logs", "intervals", "correlation")
-"""Of a result: the machine, single logs, and what is no number of its own."""
+"""Keys of a result that are left out: the machine, single logs, intervals and correlations."""
 _OF_TASK = ("name", "state", "attempts", "seconds")
 
 
 def numbers_of(result: Any) -> dict[str, float | bool]:
-    """Numbers and truths of a JSON result under dotted keys.
+    """Return the numbers and booleans of a JSON result under dotted keys.
 
-    Lists of named things (``effects``) count by their names; other lists, texts, and what lies deeper than `DEEPEST` do
-    not count.
+    The items of lists of named things (``effects``) are found by their names. Other lists, texts, and values deeper
+    than `DEEPEST` are left out.
     """
     found: dict[str, float | bool] = {}
     _collect(result, "", 0, found)
@@ -48,7 +48,7 @@ def _collect(value: Any, path: str, depth: int, found: dict[str, float | bool]) 
 
 
 class Summary:
-    """Writes the table again as tasks land; reads every result once."""
+    """Table of a sweep; it is rewritten as tasks end, and every result is read once."""
 
     def __init__(self, folder: Folder, tasks: Iterable[Task]):
         self.folder = folder
@@ -57,14 +57,14 @@ class Summary:
         self._written = -math.inf
 
     def refresh(self, now: bool = False) -> None:
-        """Write the table, not more often than every `LEAST_INTERVAL_S` unless ``now``.
+        """Write the table, at most every `LEAST_INTERVAL_S` unless ``now``.
 
         Raises:
-            CfbError: it cannot be written.
+            CfbError: the table cannot be written.
         """
         if not now and time.monotonic() - self._written < LEAST_INTERVAL_S:
             return
-        # Read and written under one lock: of several drivers the last to write has seen what all of them landed.
+        # Results are read and the table is written under one lock, so that the last of several drivers writes all.
         with self.folder.summing():
             rows = [self._row(task) for task in self.tasks]
             with together():
@@ -100,7 +100,7 @@ def _result(path: Path) -> Any:
 
 def _csv(rows: list[dict[str, Any]]) -> str:
     varied = list(dict.fromkeys(key for row in rows for key in row["varied"]))
-    # A command may repeat what it was told.
+    # Results may repeat arguments.
     said = (*_OF_TASK, *varied)
     results = list(dict.fromkeys(key for row in rows for key in row["results"] if key not in said))
     lines = io.StringIO()

@@ -1,4 +1,4 @@
-"""The tasks of a sweep: every combination of what varies, as a command line with a name."""
+"""The tasks of a sweep: every combination of arguments, as a command line with a name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cfb_mjx.sweep.naming import name_of, twice
 from cfb_mjx.sweep.parameters import Parameters
 
 LOG_SUFFIXES = (".mcap", ".parquet", ".csv")
-"""What counts as a flight log where a folder stands for the logs in it."""
+"""Suffixes of the flight logs in a folder that is given in place of logs."""
 _FILE_SUFFIXES = (".yaml", ".yml", ".npz")
 _HOLE = re.compile(r"\{([A-Za-z_]\w*)\}")
 
@@ -29,11 +29,11 @@ class Task:
     """One command of a sweep.
 
     Attributes:
-        name: of its folder.
-        command: for instance ``fly``.
-        arguments: of the command, without those that name files of the task's folder.
-        files: options that do, with the file.
-        varied: what makes this task another than the rest, by key.
+        name: name of the task and of its folder.
+        command: command, for instance ``fly``.
+        arguments: arguments of the command, without those that name files in the task's folder.
+        files: options that name files in the task's folder, with the file.
+        varied: arguments that distinguish the task from the others, by key.
     """
 
     name: str
@@ -43,30 +43,28 @@ class Task:
     varied: dict[str, Any]
 
     def words(self, folder: Path) -> list[str]:
-        """What to give to ``cfb`` for results in ``folder``."""
+        """Return the arguments of ``cfb`` that write the results to ``folder``."""
         outputs = [word for option, name in self.files for word in (option, str(folder / name))]
         return [self.command, *self.arguments, *outputs]
 
     @property
     def line(self) -> str:
-        """The command line, with results in the current folder: what tells a task from another of its name."""
+        """The command line with results in the current folder; it identifies the task."""
         return shlex.join(["cfb", *self.words(Path("."))])
 
 
 def tasks_of(sweep: Sweep) -> tuple[Task, ...]:
-    """Every combination, in the order of the file.
+    """Return the tasks of every combination, in the order of the file.
 
     Raises:
-        CfbError: a name that is no argument, a value that cannot be one, logs that are not there, or two tasks of one
-            name.
+        CfbError: an unknown argument, an invalid value, missing logs, or two tasks with the same name.
     """
     where = str(sweep.path)
     used = _require_known(sweep, where)
     tasks = tuple(_task(sweep, label, varied, used, where) for label, varied in _points(sweep))
     if (name := twice(task.name for task in tasks)) is not None:
         raise CfbError(
-            f"{where}: two tasks are called '{name}'; take out what is there twice, or give the cases under 'each' a "
-            "'name'."
+            f"{where}: two tasks are called '{name}'; remove the duplicate, or give the cases under 'each' a 'name'."
         )
     return tasks
 
@@ -78,7 +76,7 @@ def _points(sweep: Sweep) -> Iterator[tuple[str | None, dict[str, Any]]]:
 
 
 def _require_known(sweep: Sweep, where: str) -> set[str]:
-    """Names that stand in braces in the arguments; every other one that varies must be an argument."""
+    """Return the names in braces in the arguments; refuse other varied names that are not arguments."""
     groups = {"arguments": sweep.arguments, "over": sweep.over}
     groups |= {"each": {key: None for case in sweep.each for key in case.values}}
     used = {hole for values in (sweep.arguments, sweep.over) for hole in _holes(list(values.values()))}
@@ -89,11 +87,11 @@ def _require_known(sweep: Sweep, where: str) -> set[str]:
             if parameters.has(key) or (group != "arguments" and key in used):
                 continue
             if key in parameters.shapes:
-                raise CfbError(f"{where}: {group}.{key}: the sweep chooses that itself; leave it out.")
+                raise CfbError(f"{where}: {group}.{key}: the sweep sets this itself; leave it out.")
             known = ", ".join(parameters.known)
-            braces = "" if group == "arguments" else f", nor does {{{key}}} stand in any argument"
+            braces = "" if group == "arguments" else f", and no argument contains {{{key}}}"
             raise CfbError(
-                f"{where}: {group}.{key} is no argument of cfb {parameters.command}{braces}; it takes {known}."
+                f"{where}: {group}.{key} is not an argument of cfb {parameters.command}{braces}; it takes {known}."
             )
     for a, b in (("arguments", "over"), ("arguments", "each"), ("over", "each")):
         if both := sorted(set(groups[a]) & set(groups[b])):
@@ -109,7 +107,7 @@ def _holes(value: Any) -> set[str]:
 
 def _task(sweep: Sweep, label: str | None, varied: dict[str, Any], used: set[str], where: str) -> Task:
     parameters, kind = sweep.parameters, sweep.parameters.kind
-    # A label stands for all that its case says.
+    # A label replaces the values of its case in the name.
     named = {key: value for key, value in varied.items() if label is None or key in sweep.over}
     name = name_of(label, named)
     where = f"{where}: task {name}"
@@ -124,31 +122,31 @@ def _task(sweep: Sweep, label: str | None, varied: dict[str, Any], used: set[str
 
 
 def _filled(value: Any, varied: Mapping[str, Any], where: str) -> Any:
-    """``{name}`` in texts becomes what varies under that name."""
+    """Replace ``{name}`` in texts by the varied value of that name."""
     if isinstance(value, list):
         return [_filled(v, varied, where) for v in value]
     if not isinstance(value, str):
         return value
     for hole in _HOLE.findall(value):
         if hole not in varied:
-            raise CfbError(f"{where}: nothing called {hole} varies, for {{{hole}}} in '{value}'.")
+            raise CfbError(
+                f"{where}: {{{hole}}} in '{value}' needs a varied value called {hole}; add it, or correct the name."
+            )
     return _HOLE.sub(lambda match: str(varied[match[1]]), value)
 
 
 def _checked(key: str, value: Any, parameters: Parameters, where: str) -> Any:
-    """Files that are read must be there; patterns and folders become the files they stand for."""
+    """Check a value: input files must exist; patterns and folders are replaced by their files."""
     if key in EXTRA_FILES and value is not None:
         if not isinstance(value, str) or Path(value).name != value or value in _taken(parameters.kind):
-            raise CfbError(
-                f"{where}: {key} must be the name of a file of its own, without a folder, found {told(value)}."
-            )
+            raise CfbError(f"{where}: {key} must be a file name of its own, without a folder, found {told(value)}.")
         return value
     shape = parameters.shapes.get(key)
     if shape == "files" and value is not None:
         listed = value if isinstance(value, list) else [value]
         return [log for one in listed for log in _logs(str(one), f"{where}: {key}")]
     if isinstance(value, str) and (shape == "file" or value.endswith(_FILE_SUFFIXES)) and not Path(value).exists():
-        raise CfbError(f"{where}: {key}: {value}: there is no such file; paths count from the current folder.")
+        raise CfbError(f"{where}: {key}: {value}: there is no such file; paths start from the current folder.")
     return value
 
 
@@ -161,7 +159,7 @@ def _logs(named: str, where: str) -> list[str]:
     if path.is_dir():
         logs = sorted(str(p) for p in path.iterdir() if p.suffix.lower() in LOG_SUFFIXES and not p.name.startswith("."))
         if not logs:
-            raise CfbError(f"{where}: {named}: this folder holds no log ({', '.join(LOG_SUFFIXES)}).")
+            raise CfbError(f"{where}: {named}: this folder has no flight log ({', '.join(LOG_SUFFIXES)}).")
         return logs
     if path.exists():
         return [named]

@@ -1,4 +1,4 @@
-"""Training: configurations, the two algorithms, checkpoints, learning curves and the measuring of controllers."""
+"""Training: configurations, two algorithms, checkpoints, learning curves, and the evaluation of controllers."""
 
 from cfb_mjx.train.config import TrainingConfig, load_config
 from cfb_mjx.train.run import Training, train

@@ -1,4 +1,4 @@
-"""What an algorithm is to the pipeline: a state, and a step of it."""
+"""Interface of a training algorithm: a state, and an update of it."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from cfb_mjx.model.quadrotor import Quadrotor
 
 
 class Algorithm(Protocol):
-    """The pipeline knows no more of it. States are pytrees of arrays: whole, they are a checkpoint."""
+    """Interface of an algorithm. States are pytrees of arrays; a complete state is a checkpoint."""
 
     updates: int
-    """Of a whole training."""
+    """Number of updates in a whole training."""
     steps_per_update: int
-    """Commands flown in one."""
+    """Number of commands flown per update."""
 
     def begin(self, key: PRNGKeyArray, controller: NeuralController) -> Any:
-        """The first state, from an initial controller."""
+        """Return the first state, from an initial controller."""
         ...
 
     def update(self, state: Any) -> tuple[Any, dict]:
-        """One update; metrics are scalars. Compiled."""
+        """Do one compiled update; return the new state and scalar metrics."""
         ...
 
     def controller(self, state: Any) -> NeuralController:
-        """The controller as it stands."""
+        """Return the present controller."""
         ...
 
 
 def in_progress(task: Task, nominal: Quadrotor, drones: int, key: PRNGKeyArray) -> Episode:
-    """Drones at random moments of their episodes, so that they do not all end at once."""
+    """Drones at random times within their episodes, so that the episodes do not all end at once."""
     of_episodes, of_counts = jax.random.split(key)
     begin = eqx.filter_jit(jax.vmap(partial(reset, task, nominal)))
     episodes = begin(jax.random.split(of_episodes, drones))
@@ -45,5 +45,5 @@ def in_progress(task: Task, nominal: Quadrotor, drones: int, key: PRNGKeyArray) 
 
 
 def strong(state: Any) -> Any:
-    """The state without weak types: one would become strong in the first update, and the second compile afresh."""
+    """Remove weak types from a state: they would become strong in the first update, and the second would recompile."""
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype) if eqx.is_array(x) else x, state)

@@ -1,7 +1,8 @@
-"""Back-propagation through the simulator: the gradient of what a flight costs, exact and from every step.
+"""Back-propagation through the simulator: the exact gradient of a flight's cost, from all its steps.
 
-Drones fly on from update to update; only the last ``horizon_s`` is differentiated (truncated back-propagation through
-time). Who has failed stops where it was, costs ``failure`` for the rest of the horizon, and begins anew after it.
+Drones fly on from update to update, and only the last ``horizon_s`` is differentiated (truncated back-propagation
+through time). A drone that has failed stays where it was, costs ``failure`` for the rest of the horizon, and begins a
+new episode after it.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from cfb_mjx.train.config import AnalyticSettings
 
 
 class AnalyticState(eqx.Module):
-    """Everything a training is at one instant."""
+    """Complete state of a training."""
 
     controller: NeuralController
     optimizer: Any
     episodes: Episode
-    """One per drone."""
+    """One episode per drone."""
     key: PRNGKeyArray
     count: Int[Array, ""]
 
@@ -50,14 +51,14 @@ class Analytic:
         self.update = eqx.filter_jit(self._update)
 
     def begin(self, key: PRNGKeyArray, controller: NeuralController) -> AnalyticState:
-        """Drones in flight, and an optimizer that has seen nothing."""
+        """Start the drones in flight, with a fresh optimizer."""
         of_episodes, key = jax.random.split(key)
         episodes = in_progress(self.task, self.nominal, self.settings.drones, of_episodes)
         optimizer = self.optimizer.init(_arrays(controller))
         return strong(AnalyticState(controller, optimizer, episodes, key, jnp.asarray(0)))
 
     def controller(self, state: AnalyticState) -> NeuralController:
-        """The controller as it stands."""
+        """Return the present controller."""
         return state.controller
 
     def _update(self, state: AnalyticState) -> tuple[AnalyticState, dict]:
@@ -89,7 +90,7 @@ class Analytic:
             alive = alive & ~outcome.failed
             last = episode.memory.commands[0] if self.task.layout.past_commands else 2 * command - 1
             paid = cost(after.state, episode.target, episode.setpoint, command, (1 + last) / 2)
-            # A failed drone stays where it was: what comes after must neither count nor overflow.
+            # A failed drone stays where it was: later steps must neither count nor overflow.
             after = choose(alive, after, jax.lax.stop_gradient(episode))
             return (after, alive), jnp.where(alive, paid, cost.failure)
 

@@ -1,6 +1,6 @@
-"""The parts of Brax that are used here, and what keeps its own PPO alive on this jax.
+"""The parts of Brax that are used here, and a fix that makes its own PPO run on this version of JAX.
 
-Everything here stops acting once Brax no longer needs it.
+The fix does nothing once Brax no longer needs it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cfb_mjx.quiet import quietly
 
 
 def parts() -> SimpleNamespace:
-    """``losses``, ``networks``, ``distribution`` and ``types`` of Brax's PPO."""
+    """Return ``losses``, ``networks``, ``distribution`` and ``types`` of Brax's PPO."""
     with quietly():
         from brax.training import distribution, types
         from brax.training.agents.ppo import losses, networks
@@ -26,10 +26,10 @@ def parts() -> SimpleNamespace:
 
 @contextlib.contextmanager
 def brax_ppo() -> Iterator:
-    """Yield ``brax.training.agents.ppo.train.train``, made to work.
+    """Yield ``brax.training.agents.ppo.train.train`` in a working state.
 
-    Brax 0.14.2 calls ``jax.device_put_replicated``, which jax 0.10 has removed (google/brax issue 671). While the block
-    runs, jax has a function of that name again; where jax still has its own, nothing is touched.
+    Brax 0.14.2 calls ``jax.device_put_replicated``, which jax 0.10 has removed (google/brax issue 671). During the
+    block jax has a function of that name again; if jax still has its own, nothing is changed.
     """
     with quietly():
         from brax.training.agents.ppo import train
@@ -54,7 +54,7 @@ def _has_it() -> bool:
 
 
 def _replicated(tree, devices):
-    """A copy of ``tree`` on every device, along a new leading axis that is spread over them."""
+    """Copy ``tree`` to every device, along a new leading axis that is spread over the devices."""
     mesh = jax.sharding.Mesh(devices, ("device",))
     spread = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
     return jax.tree.map(

@@ -1,4 +1,4 @@
-"""A whole training on disk, so that an interrupted one goes on to the result it would have had."""
+"""Files of complete training states, so that an interrupted training continues to the same result."""
 
 from __future__ import annotations
 
@@ -17,7 +17,12 @@ from cfb_mjx.files import read_bytes, replacing
 
 
 def save_checkpoint(path: Path, state: Any, about: dict[str, Any]) -> None:
-    """Write every array of ``state`` and ``about`` (JSON terms), atomically.
+    """Write the arrays of a state, atomically.
+
+    Args:
+        path: file to write.
+        state: pytree; its arrays are stored.
+        about: description of the state, for JSON.
 
     Raises:
         CfbError: the file cannot be written.
@@ -29,24 +34,28 @@ def save_checkpoint(path: Path, state: Any, about: dict[str, Any]) -> None:
 
 
 def read_about(path: Path) -> dict[str, Any]:
-    """What was said of the state.
+    """Return the description of a checkpoint.
 
     Raises:
-        CfbError: there is no checkpoint, or a damaged one.
+        CfbError: the file is not a checkpoint, or is damaged.
     """
     read_bytes(path, 1)
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             return json.loads(archive["about"].tobytes())
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        raise CfbError(f"{path}: is no checkpoint of a training, or a damaged one; train without --resume.") from None
+        raise CfbError(f"{path}: is not a checkpoint of a training, or is damaged; train without --resume.") from None
 
 
 def load_state(path: Path, like: Any) -> Any:
-    """The state, with the structure and the constants of ``like``.
+    """Read the state of a checkpoint.
+
+    Args:
+        path: file to read.
+        like: state whose structure and constants the result has.
 
     Raises:
-        CfbError: it is of another training.
+        CfbError: the file is damaged, or belongs to another training.
     """
     arrays, constants = eqx.partition(like, eqx.is_array)
     leaves, structure = jax.tree.flatten(arrays)

@@ -1,4 +1,4 @@
-"""What a training is made of: one YAML file, read strictly."""
+"""Configuration of a training: one YAML file with strict keys and types."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FORMAT = "cfb_mjx training 1"
 
 @dataclass(frozen=True)
 class NetworkSettings:
-    """The policy: the paper's is fully connected, four layers of 32."""
+    """The policy's network; the paper's is fully connected with four layers of 32."""
 
     hidden: tuple[int, ...] = (32, 32, 32, 32)
     activation: Literal["tanh", "relu", "swish"] = "tanh"
@@ -29,15 +29,15 @@ class NetworkSettings:
 
 @dataclass(frozen=True)
 class RandomisationSettings:
-    """Which drones to train on."""
+    """Drones to train on."""
 
     ranges: str = "paper"
-    """A shipped randomisation or a YAML file."""
+    """Name of a shipped randomisation, or a YAML file."""
     magnitude: float = 1.0
     """Factor on all ranges; 0 trains on the nominal drone alone."""
     graded: float = 0.3
-    """Share of the episodes that draw their own factor between 0 and ``magnitude``: uniform draws of a dozen numbers
-    are never all near their means, and without this the nominal drone itself would never be flown."""
+    """Share of the episodes that draw their own factor between 0 and ``magnitude``. Without it the nominal drone would
+    never be flown, because uniform draws of a dozen numbers are never all near their means."""
 
 
 @dataclass(frozen=True)
@@ -48,15 +48,15 @@ class AnalyticSettings:
     horizon_s: float = 1.0
     updates: int = 600
     learning_rate: float = 2e-3
-    """At the start; it falls to zero along a cosine."""
+    """Initial learning rate; it decays to zero along a cosine."""
     gradient_clip: float = 1.0
     cost: SmoothCost | FlipCost = field(default_factory=SmoothCost)
-    """Flips have `FlipAnalyticSettings`; here, a cost in a file is read as the target's."""
+    """The cost; flips have `FlipAnalyticSettings`, so a cost in a file is read as a target's here."""
 
 
 @dataclass(frozen=True)
 class FlipAnalyticSettings(AnalyticSettings):
-    """The same for flips."""
+    """Back-propagation through the simulator, for flips."""
 
     drones: int = 512
     horizon_s: float = 0.6
@@ -69,60 +69,60 @@ class PpoSettings:
     """Proximal policy optimisation (Schulman et al. 2017)."""
 
     drones: int = 256
-    """Copies included."""
+    """Number of drones, including copies."""
     unroll: int = 128
-    """Commands of every drone between two updates of the policy."""
+    """Commands per drone between two updates of the policy."""
     minibatches: int = 8
     epochs: int = 4
     steps: int = 200_000_000
-    """Commands in total."""
+    """Total number of commands."""
     learning_rate: float = 5e-4
-    """At the start; it falls to ``last_rate`` of that along a line."""
+    """Initial learning rate; it decays linearly to ``last_rate`` of that."""
     value_learning_rate: float = 1e-3
-    """Of the value network, likewise."""
+    """Initial learning rate of the value network, with the same decay."""
     last_rate: float = 0.02
-    """Share of both rates that is left at the end: the smaller, the less the last policy is off by chance."""
+    """Final share of both learning rates: the smaller it is, the smaller the random error of the last policy."""
     discount: float = 0.995
     gae_lambda: float = 0.98
     clipping: float = 0.2
     advantage_limit: float = 20.0
-    """Advantages larger than so many times their mean magnitude count as that: the few drones that fail, by a lot,
-    would otherwise drown what all the others have to learn about their last decimetre."""
+    """Advantages are clipped at this multiple of their mean magnitude. Otherwise the few drones that fail, by a large
+    amount, would dominate what all the others should learn about their last decimetre."""
     copies: int = 4
-    """Drones that fly the same episode with other actions: each one's advantage is counted from the mean of its copies,
-    so that what the value network errs by in all of them cancels. They begin and end together."""
+    """Drones that fly the same episode with different actions. Advantages are taken relative to the mean of the copies,
+    so that errors of the value network that are common to them cancel. Copies begin and end together."""
     smoothness: float = 6.0
-    """Price of |u_(k+1) - u_k|^2 of the policy's means, with commands from -1 to 1 (Mysore et al. 2021, CAPS): what is
-    explored costs nothing. It stands beside advantages that are divided by their spread, which falls as a policy gets
-    better: in units of the reward the price falls with it."""
+    """Penalty on |u_(k+1) - u_k|^2 of the policy's means, with commands from -1 to 1 (Mysore et al. 2021, CAPS);
+    exploration noise costs nothing. It is added to advantages that are divided by their standard deviation, which
+    decreases as the policy improves, so in units of the reward the penalty decreases too."""
     entropy_cost: float = 3e-3
-    """At the start; it falls to ``last_entropy`` of that along a line."""
+    """Initial entropy cost; it decays linearly to ``last_entropy`` of that."""
     last_entropy: float = 0.02
     reward_scaling: float = 0.02
     least_reward: float = -30.0
-    """Lower rewards, the paper's failure of -300, count as this to the learner."""
+    """Lower rewards, such as the paper's -300 for a failure, are clipped to this value for the learner."""
     gradient_clip: float = 1.0
     first_std: float = 0.2
-    """Of the Gaussian before the tanh, at the start."""
+    """Initial standard deviation of the Gaussian before the tanh."""
     largest_kl: float = 0.02
-    """Between the policies before and after an update: the policy's learning rate is lowered to stay below it. 0: it is
-    not. A policy that holds a drone to the centimetre changes a hundred times as much with its weights as a first one.
-    """
+    """Limit of the KL divergence between the policies before and after an update, kept by lowering the policy's
+    learning rate; 0: no limit. A policy that holds a drone to the centimetre changes a hundred times as much with its
+    weights as an untrained one."""
     warm_up: int = 10
-    """Updates at first in which the value network alone learns, where a training starts from a policy (--start)."""
+    """Number of first updates in which only the value network learns, if a training starts from a policy (--start)."""
     warm_std: float = 0.06
-    """In place of ``first_std`` there."""
+    """``first_std`` for a training that starts from a policy."""
     value_hidden: tuple[int, ...] = (64, 64)
 
     @property
     def updates(self) -> int:
-        """Collections of ``unroll`` commands."""
+        """Number of updates, each after ``unroll`` commands."""
         return -(-self.steps // (self.drones * self.unroll))
 
 
 @dataclass(frozen=True)
 class FlipPpoSettings(PpoSettings):
-    """The same for flips: what a command does to a turn is over sooner, and the value network errs little."""
+    """PPO for flips: a command acts on a turn for a shorter time, and the value network errs little."""
 
     drones: int = 512
     copies: int = 1
@@ -139,19 +139,19 @@ class FlipPpoSettings(PpoSettings):
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """One training. The defaults are those of ``configs/target.yaml``."""
+    """Configuration of a training. The defaults are those of ``configs/target.yaml``."""
 
     format: Literal["cfb_mjx training 1"] = FORMAT
     task: Literal["target", "flip"] = "target"
-    """Flips have a `FlipTrainingConfig`; here, rewards and starts in a file are read as the target's."""
+    """The task; flips have `FlipTrainingConfig`, so rewards and starts in a file are read as a target's here."""
     description: str = ""
     model: str = "cfb-guards"
-    """A preset or a model YAML."""
+    """Name of a preset, or a model YAML."""
     body: Literal["rigid", "mjx"] = "rigid"
     algorithm: Literal["ppo", "analytic"] = "ppo"
     seed: int = 0
     checkpoints: int = 20
-    """Over the whole training, evenly spaced; the policy is flown and the learning curve grows at each."""
+    """Number of checkpoints, evenly spaced in the training. At each the policy is evaluated for the learning curve."""
     episode_s: float = 4.0
     lumped_delay: bool = True
     """Whether the gyro is as late as the pose, as in the paper, or only by the model's ``gyro_delay``."""
@@ -165,8 +165,8 @@ class TrainingConfig:
     ppo: PpoSettings = field(default_factory=PpoSettings)
 
     def build_task(self) -> TargetTask | FlipTask:
-        """The task that is trained on."""
-        # Flips have a class of their own.
+        """Return the task to train on."""
+        # `FlipTrainingConfig` overrides this.
         assert isinstance(self.reward, TargetReward)
         assert isinstance(self.starts, Starts)
         return TargetTask(reward=self.reward, starts=self.starts, **self._common())
@@ -184,13 +184,13 @@ class TrainingConfig:
         }
 
     def to_mapping(self) -> dict[str, Any]:
-        """What its YAML file would hold."""
+        """Return the contents of the equivalent YAML file."""
         return plain(self)
 
 
 @dataclass(frozen=True)
 class FlipTrainingConfig(TrainingConfig):
-    """A training to flip. The defaults are those of ``configs/flip.yaml``."""
+    """Configuration of a training to flip. The defaults are those of ``configs/flip.yaml``."""
 
     task: Literal["flip"] = "flip"
     episode_s: float = FlipTask.episode_s
@@ -206,24 +206,30 @@ class FlipTrainingConfig(TrainingConfig):
     ppo: FlipPpoSettings = field(default_factory=FlipPpoSettings)
 
     def build_task(self) -> FlipTask:
-        """The task that is trained on."""
+        """Return the task to train on."""
         return FlipTask(reward=self.reward, starts=self.starts, setpoints=self.setpoints, **self._common())
 
 
 _KINDS = {"target": TrainingConfig, "flip": FlipTrainingConfig}
 _SHOWN = ("observation", "position_scale_m", BEFORE_BENDS)
 _TOGETHER = {"target": (_SHOWN, ("reward", "position", {"near": 0.0})), "flip": (_SHOWN,)}
-"""Per task: a group, a key of it that older trainings wrote out, and what there is beside it since, as it was then."""
+"""Per task: group, a key of it that older configurations contain, and newer keys of the group with the values that
+reproduce the old behaviour."""
 
 
 def load_config(name_or_path: str | Path = "target", changes: tuple[str, ...] = ()) -> TrainingConfig:
-    """Read a shipped training (``target``, ``flip``) or a YAML file, with ``KEY=VALUE`` changes (dotted, YAML values).
+    """Read a shipped training configuration (``target``, ``flip``) or a YAML file.
+
+    Args:
+        name_or_path: name or file.
+        changes: changes, each ``KEY=VALUE`` with a dotted key and a YAML value.
 
     Raises:
-        CfbError: no such file, an unknown key, a value of the wrong type or out of range, named.
+        CfbError: there is no such file, a key is unknown, or a value has the wrong type or is out of range; the message
+            names it.
     """
     path, document = load_named(name_or_path, "training", FORMAT)
-    # Checked before the changes go in, so that a fault of the file is not blamed on the command line.
+    # Check the file before the changes, so that a fault of the file is not blamed on the command line.
     config = _unambiguous(document, str(path))
     if changes:
         for change in changes:
@@ -234,23 +240,27 @@ def load_config(name_or_path: str | Path = "target", changes: tuple[str, ...] = 
 
 
 def config_from(mapping: dict[str, Any], where: str) -> TrainingConfig:
-    """A configuration from what a YAML file holds; what is left out is as by default.
+    """Build a configuration from the contents of a YAML file; missing keys have their defaults.
+
+    Args:
+        mapping: contents of the file.
+        where: name of the file, for messages.
 
     Raises:
-        CfbError: an unknown key or a value of the wrong type, named with ``where``.
+        CfbError: a key is unknown or a value has the wrong type.
     """
     task = mapping.get("task", "target")
     if not isinstance(task, str) or task not in _KINDS:
         raise CfbError(f"{where}: task must be one of {', '.join(_KINDS)}, found {told(task)}.")
     for group, key, since in _TOGETHER[task]:
         if isinstance(given := mapping.get(group), dict):
-            # It may have been written out before these existed.
+            # The file may be older than these keys.
             mapping = mapping | {group: with_former(given, key, since)}
     return build(_KINDS[task], mapping, where)
 
 
 def _unambiguous(mapping: dict[str, Any], where: str) -> TrainingConfig:
-    """As `config_from`, but a group that might mean the defaults of now or of before is refused."""
+    """`config_from` for files of users: refuses groups that may mean either the old or the present defaults."""
     config = config_from(mapping, where)
     usual = plain(type(config)())
     for group, key, since in _TOGETHER[config.task]:
@@ -259,16 +269,17 @@ def _unambiguous(mapping: dict[str, Any], where: str) -> TrainingConfig:
             now = ", ".join(f"{k}: {told(usual[group][k])}" for k in absent)
             before = ", ".join(f"{k}: {told(value)}" for k, value in absent.items())
             raise CfbError(
-                f"{where}: {group} gives {key}, but not {now} (as by default) or {before} (as before they existed)."
+                f"{where}: {group} gives {key}, but neither {now} (the default) nor {before} (the value of older "
+                "versions); add one of the two."
             )
     return config
 
 
 def with_changes(config: TrainingConfig, **values: Any) -> TrainingConfig:
-    """A copy with some top-level settings replaced; None leaves one as it is.
+    """Return a copy with some top-level settings replaced; values of None leave a setting unchanged.
 
     Raises:
-        CfbError: a seed out of range.
+        CfbError: the seed is out of range.
     """
     changed = replace(config, **{key: value for key, value in values.items() if value is not None})
     require_seed(changed.seed, "--seed")
@@ -284,7 +295,7 @@ def _change(document: dict, change: str) -> None:
     for key in path:
         inner = inner.setdefault(key, {})
         if not isinstance(inner, dict):
-            raise CfbError(f"--set {change}: {key} is no group of settings.")
+            raise CfbError(f"--set {change}: {key} is not a group of settings.")
     inner[last] = parse_yaml(text, f"--set {change}")
 
 
@@ -371,7 +382,7 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must lie between 0 and 1.")
     for key in ("network.hidden", "ppo.value_hidden"):
         if not _at(config, key) or min(_at(config, key)) < 1:
-            raise CfbError(f"{where}: {key} must name at least one layer, each of at least one neuron.")
+            raise CfbError(f"{where}: {key} must contain at least one layer, each with at least one neuron.")
     if config.ppo.drones % (config.ppo.minibatches * config.ppo.copies):
         raise CfbError(
             f"{where}: ppo.drones = {config.ppo.drones} must be a multiple of ppo.minibatches times ppo.copies, "

@@ -1,6 +1,6 @@
-"""What back-propagation minimises: the paper's wishes with a slope that does not vanish near their fulfilment.
+"""Costs for back-propagation: the aims of the paper's rewards, with a slope that does not vanish near the optimum.
 
-Everywhere s(x, w) = sqrt(|x|^2 + w^2) - w, a length rounded within w. All costs are per control step.
+In all of them s(x, w) = sqrt(|x|^2 + w^2) - w, a norm rounded within w. All costs are per control step.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from cfb_mjx.model.state import AnyArray, State
 
 @dataclass(frozen=True)
 class SmoothCost:
-    """Of flying to a target.
+    """Cost of flying to a target.
 
     ``position`` s(p, width) + ``velocity`` s(v, width) + ``heading`` (1 - R_xx) + ``body_rate`` |omega|^2 +
-    ``command_change`` |u_k - u_(k-1)|^2; a failed drone costs ``failure`` per step. Summed over a flight s(v, w) is
-    nearly the length of the way: it leaves a fast approach alone and stops swinging about the target.
+    ``command_change`` |u_k - u_(k-1)|^2; a failed drone costs ``failure`` per step. Summed over a flight, s(v, w) is
+    nearly the length of the path: it does not penalise a fast approach, but it does penalise swinging about the target.
     """
 
     position: float = 1.0
@@ -41,7 +41,7 @@ class SmoothCost:
         command: Float[Array, "4"],
         last: Float[Array, "4"],
     ) -> Float[Array, ""]:
-        """Of one control step that ended in ``state`` after ``command``, with ``last`` the command before."""
+        """Cost of a control step that ended in ``state`` after ``command``; ``last`` is the command before it."""
         attitude = rotation_matrix(state.quaternion)
         return (
             self.position * rounded(state.position - target, self.position_width_m)
@@ -54,7 +54,7 @@ class SmoothCost:
 
 @dataclass(frozen=True)
 class FlipCost:
-    """Of turning: the slopes of the paper's reward, tips rounded.
+    """Cost of a flip: the slopes of the paper's reward, with rounded kinks.
 
     ``velocity`` s(R^T v - [0, 0, v_target], width) + ``axis`` s(R e_x - e_x, width) + ``body_rate`` s(omega -
     [rate_target, 0, 0], width) + ``command_change`` |u_k - u_(k-1)|^2; a failed drone costs ``failure`` per step.
@@ -77,7 +77,7 @@ class FlipCost:
         command: Float[Array, "4"],
         last: Float[Array, "4"],
     ) -> Float[Array, ""]:
-        """Of one control step that ended in ``state`` after ``command``, with ``last`` the command before."""
+        """Cost of a control step that ended in ``state`` after ``command``; ``last`` is the command before it."""
         velocity, axis, body_rate = deviations(state, setpoint)
         return (
             self.velocity * rounded(velocity, self.velocity_width_mps)
@@ -88,5 +88,5 @@ class FlipCost:
 
 
 def rounded(x: Float[AnyArray, "3"], width: float) -> Float[Array, ""]:
-    """s(x, width)."""
+    """s(x, width): a norm rounded within ``width``."""
     return jnp.sqrt(jnp.sum(x**2) + width**2) - width

@@ -1,4 +1,4 @@
-"""Simulated flights as flight logs: for `cfb evaluate`, `cfb fit`, `cfb view`, as if they had been recorded."""
+"""Write simulated flights as flight logs, for `cfb evaluate`, `cfb fit` and `cfb view`."""
 
 from __future__ import annotations
 
@@ -11,30 +11,30 @@ from cfb_mjx.train.flying import Flight, steps_flown
 
 
 def flight_log(flown: Flight, dt: float, name: str, gravity: float = 9.81, drone: int = 0) -> FlightLog:
-    """One flight as a log: true states, without delay or sensor noise, a row for each command.
+    """Convert one flight to a log: true states, without delay or sensor noise, one row per command.
 
-    The specific force is the mean over the control step before a row, as an accelerometer that is filtered shows it, in
-    the axes of the body in the middle of that step: in a flip it turns by a tenth of a radian until its end.
+    The specific force is the mean over the control step before a row, as from a filtered accelerometer, in the body
+    axes at the middle of that step: in a flip the body turns by a tenth of a radian from there to the end of the step.
 
     Args:
         flown: flights, axes (drones, steps).
         dt: time between two commands, s.
-        name: of the log.
-        gravity: m/s^2.
-        drone: which.
+        name: name of the log.
+        gravity: gravitational acceleration, m/s^2.
+        drone: index of the drone.
 
     Raises:
-        CfbError: the drone was lost so early that nothing is left of its flight.
+        CfbError: the drone failed so early that its flight has no rows.
     """
     flight = {key: np.asarray(getattr(flown, key), float)[drone] for key in _FIELDS}
-    # A row holds the command that follows it.
+    # A row holds the command after it.
     rows = steps_flown(flown, drone) - 1
     if rows < 2:
-        raise CfbError(f"{name}: the drone was lost at once; there is no flight to log.")
+        raise CfbError(f"{name}: the drone failed at once; there is no flight to log.")
     velocity, quaternion = flight["velocity"], flight["quaternion"][:rows]
     change = np.diff(velocity[:rows], axis=0, prepend=velocity[:1]) / dt
     change[0] = change[1]
-    # Signs as each row's: a quaternion and its negative are the same attitude.
+    # Same sign as the row before: a quaternion and its negative are the same attitude.
     along = quaternion * np.sign(np.sum(quaternion * np.roll(quaternion, 1, axis=0), axis=1, keepdims=True))
     middle = along + np.roll(quaternion, 1, axis=0)
     middle[0] = quaternion[0]

@@ -1,6 +1,6 @@
-"""Find the knobs of a flip in simulation: the cross-entropy method over many flights at once.
+"""Search the knobs of a flip in simulation: the cross-entropy method over many flights at once.
 
-Each round draws candidates from a Gaussian, flies them all, and moves the Gaussian to the best (Rubinstein 1999).
+Each round draws candidates from a Gaussian, flies them all, and fits the Gaussian to the best (Rubinstein 1999).
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from cfb_mjx.train.flying import nominal_task
 
 @dataclass(frozen=True)
 class Goal:
-    """What is looked for.
+    """Goal of a search.
 
-    ``height``: the least vertical extent on the nominal drone. ``margin``: the most drones of the task's randomisation
-    that complete the flip, and those as far above the floor as they can, while the nominal one keeps within
-    ``extent_m``. ``within``: the most drones of the randomisation that complete it within ``extent_m`` themselves. All:
-    turned ``rotations`` times, stopped and back within the limits below on the nominal drone.
+    ``aim`` is one of: ``height``, the smallest vertical extent on the nominal drone; ``margin``, the largest share of
+    the task's randomised drones that complete the flip, as far above the floor as possible, while the nominal drone
+    stays within ``extent_m``; ``within``, the largest share of randomised drones that complete it within ``extent_m``
+    themselves. In all cases the nominal drone must turn ``rotations`` times, stop, and return within the limits below.
     """
 
     rotations: int = 2
@@ -40,31 +40,31 @@ class Goal:
     vertical_stop_s: float = 0.6
     return_m: float = 0.1
     fall_mps: float = 0.0
-    """How fast the nominal drone has to fall at least: the paper's does 3.5 m/s, and falling less is easy."""
+    """Lowest required peak falling speed of the nominal drone: 3.5 m/s in the paper; falling less is easy."""
     floor_m: float = FLOOR_M
-    """How far below the start the floor is."""
+    """Distance of the floor below the start."""
 
 
 _OF_SEARCH = 2**32 - 1
-"""Derives the key of a search: the flights that judge what it finds have the keys 0, 1, 2 ... of the same seed."""
+"""Derives the key of a search; the flights that evaluate its result use the keys 0, 1, 2 ... of the same seed."""
 
 
 class Bounds(NamedTuple):
-    """Where knobs are looked for: least and largest of each; equal ones stay as they are."""
+    """Search range of each knob; knobs with equal bounds are fixed."""
 
     low: Knobs
     high: Knobs
 
 
 def bounds(rotations: int = 2, **fixed: float) -> Bounds:
-    """The usual ones for so many turns; keyword arguments fix knobs."""
+    """Return the default bounds for so many rotations; keyword arguments fix knobs."""
     low = Knobs(0.5, 0.1, 0.2 * rotations, -3.0, 12.0, 1.0, 2 * jnp.pi * (rotations - 0.6))
     high = Knobs(6.0, 1.2, 0.55 * rotations + 0.2, 5.0, 21.0, 6.0, 2 * jnp.pi * (rotations + 0.1))
     return Bounds(low._replace(**fixed), high._replace(**fixed))
 
 
 class Found(NamedTuple):
-    """What a search came to."""
+    """Result of a search."""
 
     knobs: Knobs
     cost: Float[Array, ""]
@@ -73,10 +73,10 @@ class Found(NamedTuple):
 
 
 def shortfall(goal: Goal, measured: Flips) -> Float[Array, "*drones"]:
-    """How far nominal flights are from what every goal asks for; zero where it is all met."""
+    """Cost of what nominal flights miss of the requirements of every goal; zero if all are met."""
 
     def over(value: Array, limit: float, scale: float) -> Array:
-        # A little less than the limit, so that another seed's noise does not cross it.
+        # A margin of 3 %, so that the noise of another seed does not exceed the limit.
         return jnp.minimum(1.0, jnp.maximum(0.0, jnp.nan_to_num(value, nan=1e3) - 0.97 * limit) / scale)
 
     return (
@@ -101,30 +101,33 @@ def search(
     plants: int = 160,
     report: Callable[[int, float], None] = lambda round, cost: None,
 ) -> Found:
-    """The knobs that serve ``goal`` best.
+    """Search the knobs that meet ``goal`` best.
 
     Args:
-        manoeuvre: what to improve: what is found serves no less than its knobs, where these lie within the bounds.
-        task: with the randomisation that ``margin`` and ``within`` are about.
+        manoeuvre: manoeuvre to improve. If its knobs are within the bounds, the result is at least as good.
+        task: task whose randomisation the aims ``margin`` and ``within`` use.
         nominal: the drone.
-        goal: what to look for.
-        key: decides candidates, drones and noise.
-        within: where to look; `bounds` of the goal's rotations by default.
-        rounds: of the search.
-        candidates: per round.
+        goal: goal of the search.
+        key: determines candidates, drones and noise.
+        within: bounds of the knobs; default: `bounds` of the goal's rotations.
+        rounds: number of rounds.
+        candidates: candidates per round.
         plants: randomised drones per candidate, for ``margin`` and ``within``.
         report: called after every round with its number and the cost of its best candidate.
 
+    Returns:
+        The best knobs, their cost, and the history of the search.
+
     Raises:
-        CfbError: ``margin`` or ``within`` is looked for where nothing is randomised.
+        CfbError: the aim is ``margin`` or ``within``, but the task has no randomisation.
     """
     if goal.aim != "height" and task.randomisation is None:
-        raise CfbError(f"A flip's {goal.aim} is looked for on randomised drones; give the task a randomisation.")
+        raise CfbError(f"The aim '{goal.aim}' of a flip needs randomised drones; give the task a randomisation.")
     within = bounds(goal.rotations) if within is None else within
     task = with_room(task, nominal)
     low, high = (jnp.stack([jnp.asarray(x, float) for x in side]) for side in within)
     of_nominal, of_plants, of_draws = jax.random.split(key, 3)
-    # A flight in sixteen that stops late is enough to be noticed.
+    # With 16 flights, one that stops late is noticed.
     few = jax.random.split(of_nominal, 16)
     many = jax.random.split(of_plants, plants)
     mean, std = jnp.full(len(low), 0.5), jnp.full(len(low), 0.35)
@@ -133,7 +136,7 @@ def search(
     least, history = jnp.asarray(jnp.inf), []
     for i in range(rounds):
         drawn = mean + std * jax.random.normal(jax.random.fold_in(of_draws, i), (candidates, len(low)))
-        # The best so far flies again beside the others.
+        # The best candidate so far flies again beside the others.
         units = jnp.clip(drawn, 0.0, 1.0).at[0].set(best)
         found = _costs(units, low, high, manoeuvre, task, nominal, goal, few, many)
         order = jnp.argsort(found)[: max(4, candidates // 8)]
@@ -154,17 +157,17 @@ def improved(
     rounds: int = 20,
     report: Callable[[int, float], None] = lambda round, cost: None,
 ) -> Manoeuvre:
-    """The manoeuvre with the knobs that serve ``goal`` best, to four decimals as a file has them.
+    """Return the manoeuvre with the knobs that meet ``goal`` best, rounded to four decimals as in a file.
 
     Args:
-        manoeuvre: as for `search`, and so are task, nominal, goal, rounds and report.
-        task: see there.
-        nominal: see there.
-        goal: see there.
-        seed: of the search; flights of the same seed have other keys.
-        fixed: names of knobs that stay as they are.
-        rounds: see there.
-        report: see there.
+        manoeuvre: as for `search`.
+        task: as for `search`.
+        nominal: as for `search`.
+        goal: as for `search`.
+        seed: seed of the search; flights with the same seed have other keys.
+        fixed: names of knobs that stay unchanged.
+        rounds: as for `search`.
+        report: as for `search`.
     """
     key = jax.random.fold_in(jax.random.PRNGKey(seed), _OF_SEARCH)
     within = bounds(goal.rotations, **{name: getattr(manoeuvre.knobs, name) for name in fixed})
@@ -193,7 +196,7 @@ def _cost(manoeuvre, task, nominal, goal, few, many) -> Float[Array, ""]:
     if goal.aim == "within":
         completed &= high <= goal.extent_m
     lost = 1 - jnp.mean(completed)
-    # Where nearly all of them complete it, what tells candidates apart is how much they have left.
+    # If nearly all drones complete the flip, candidates differ by their remaining margin.
     deep = jnp.nan_to_num(-away.lowest_m, nan=9.0) / goal.floor_m
     near = jnp.mean(jnp.clip(deep - 0.5, 0.0, 0.5))
     if goal.aim == "within":

@@ -1,4 +1,4 @@
-"""Fly flips and measure them: how often round, how high, how fast the turn and the fall are stopped, how far off."""
+"""Fly flips and measure them: rotations, height, times to stop the rotation and the fall, and the error of return."""
 
 from __future__ import annotations
 
@@ -21,39 +21,44 @@ from cfb_mjx.model.rotors import thrust
 from cfb_mjx.train.flying import CAUGHT_M, Flight, fly
 
 FLIPS = {"flip": 1, "double-flip": 2, "triple-flip": 3}
-"""Manoeuvres and their turns."""
+"""Number of rotations of each manoeuvre."""
 FLIP_S, COUNTED_S = 6.0, 1.0
-"""How long a flip is watched, and the end of it over which the way back is measured."""
+"""Duration of a flip's flight, and of its end over which the return is measured, s."""
 STOPPED_RADPS = np.radians(100.0)
-"""Slower is not turning any more (paper section VI)."""
+"""Rate below which a drone has stopped turning (paper section VI)."""
 FLOOR_M = 2.0
-"""Flips begin this far above the floor."""
+"""Height of the start of a flip above the floor, m."""
 
 
 class Flips(NamedTuple):
-    """Of flips, per drone."""
+    """Measurements of flips, per drone."""
 
     rotations: Float[Array, "*drones"]
-    """About the x axis, whole flight."""
+    """Rotations about the x axis in the whole flight."""
     vertical_extent_m: Float[Array, "*drones"]
-    """Highest minus lowest point."""
+    """Height of the highest point above the lowest."""
     lowest_m: Float[Array, "*drones"]
-    """Relative to the start."""
+    """Lowest point relative to the start."""
     peak_rate_radps: Float[Array, "*drones"]
     """Largest body rate about x."""
     rate_stop_s: Float[Array, "*drones"]
-    """From the switch to the target policy until the body rate is below `STOPPED_RADPS`; infinite if never."""
+    """Time from the switch to the target policy until the body rate is below `STOPPED_RADPS`; infinite if never."""
     vertical_stop_s: Float[Array, "*drones"]
-    """From that switch until the drone does not fall any more; infinite if never."""
+    """Time from that switch until the drone no longer falls; infinite if never."""
     fall_mps: Float[Array, "*drones"]
     """Largest downward speed."""
     return_error_m: Float[Array, "*drones"]
     """Mean distance from the start over the last `COUNTED_S`."""
     failed: Bool[Array, "*drones"]
-    """Limits of speed or rate passed."""
+    """Whether a limit of speed or rate was exceeded."""
 
     def completed(self, rotations: int, floor_m: float = FLOOR_M) -> Bool[Array, "*drones"]:
-        """Turned so many times, caught within `CAUGHT_M`, not failed, never as low as a floor ``floor_m`` below."""
+        """Whether a flip has the right rotations, is caught within `CAUGHT_M`, did not fail and stayed above the floor.
+
+        Args:
+            rotations: required number of rotations.
+            floor_m: distance of the floor below the start, m.
+        """
         right = jnp.abs(self.rotations - rotations) < 0.25
         return right & ~self.failed & (self.return_error_m < CAUGHT_M) & (self.lowest_m > -floor_m)
 
@@ -61,14 +66,17 @@ class Flips(NamedTuple):
 def flips(
     manoeuvre: Manoeuvre, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray, seconds: float = FLIP_S
 ) -> tuple[Flips, Flight]:
-    """Hover at the start, flip, return; one flight per key, measured, and the flights.
+    """Hover at the start, flip and return; one flight per key.
 
     Args:
-        manoeuvre: what is flown.
-        task: says which drones and how much noise.
-        nominal: the drone.
-        keys: one per flight.
-        seconds: watched; no shorter than the manoeuvre and `COUNTED_S`.
+        manoeuvre: manoeuvre to fly.
+        task: determines the drones and the noise.
+        nominal: the nominal drone.
+        keys: one key per flight.
+        seconds: duration of a flight; at least that of the manoeuvre plus `COUNTED_S`.
+
+    Returns:
+        The measurements and the flights.
     """
     return _flips(manoeuvre, with_room(task, nominal), nominal, keys, seconds)
 
@@ -81,8 +89,8 @@ def _flips(manoeuvre, task, nominal, keys, seconds):
 
 
 def measure(flown: Flight, dt: float) -> Flips:
-    """Of flights of manoeuvres with their phases watched, axes (drones, steps), a command every ``dt`` [s]."""
-    # A command that belongs to the catch has been flown for dt when its row is written.
+    """Measure flights of manoeuvres, axes (drones, steps), with their phases watched and a command every ``dt`` [s]."""
+    # A command of the catch phase has been flown for dt when its row is written.
     since = dt * jnp.cumsum(flown.watched == CATCH, axis=-1)
 
     def first(condition: Array) -> Array:
@@ -104,22 +112,29 @@ def measure(flown: Flight, dt: float) -> Flips:
 
 
 class Turning(NamedTuple):
-    """Of a flip policy alone, per drone; means from `SPUN_UP_S` on."""
+    """Measurements of a flip policy alone, per drone; means from `SPUN_UP_S` on."""
 
     rate_error_radps: Float[Array, "*drones"]
     axis_error: Float[Array, "*drones"]
-    """Distance of the body's x axis from where it was asked to be."""
+    """Distance of the body's x axis from its wanted direction."""
     command_change: Float[Array, "*drones"]
-    """Root mean square from one command to the next."""
+    """Root mean square change from one command to the next."""
     failed: Bool[Array, "*drones"]
 
 
 TURNING_S, SPUN_UP_S, RISING_MPS = 1.0, 0.3, 3.5
-"""How long a policy turns on its own, from when on that counts, and how fast it rises at first."""
+"""Duration of a policy's turn, start of the counted part, and initial upward speed."""
 
 
 def turning(controller: NeuralController, task: FlipTask, nominal: Quadrotor, keys: PRNGKeyArray) -> Turning:
-    """Turn `TURNING_S` at the middle of the task's set-points, from rising level at `RISING_MPS`; a flight per key."""
+    """Turn for `TURNING_S` at the middle of the task's set-points, from level flight at `RISING_MPS` upwards.
+
+    Args:
+        controller: flip policy.
+        task: determines the set-points, the drones and the noise.
+        nominal: the nominal drone.
+        keys: one key per flight.
+    """
     return _turning(controller, with_room(task, nominal), nominal, keys)
 
 
@@ -150,18 +165,18 @@ def _turning(controller, task, nominal, keys):
 
 
 class Replay(NamedTuple):
-    """A flip without noise on the nominal drone, and its commands flown again without a controller."""
+    """A flip without noise on the nominal drone, and its commands flown again in open loop."""
 
     apart_m: Float[Array, ""]
     """Largest distance between the two flights."""
     largest_thrust_n: Float[Array, ""]
-    """Largest force that the flight shows beside gravity: mass times change of velocity over a control step."""
+    """Largest force other than gravity in the flight: mass times the velocity change over a control step, per time."""
     model_thrust_n: Float[Array, ""]
-    """What the motor model gives at full command."""
+    """Thrust of the motor model at full command."""
 
 
 def replay(manoeuvre: Manoeuvre, nominal: Quadrotor) -> Replay:
-    """Fly, and fly the commands again open loop: nothing but the commands moves the drone."""
+    """Fly a manoeuvre without noise, and fly its commands again in open loop."""
     return _replay(manoeuvre, with_room(TargetTask(noise=QUIET), nominal), nominal)
 
 

@@ -1,4 +1,4 @@
-"""Fly controllers and measure how: hover, a step of six metres, recovery."""
+"""Fly controllers and measure them: hover, a step of six metres, recovery."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
 
 HOVER_S, SETTLING_S = 6.0, 1.0
-"""The paper's hover test: so long, of which the first second is not counted."""
+"""The paper's hover test: its duration, and the initial time that is not counted."""
 STEP_DISTANCE_M, ARRIVED_M, STEP_S = 6.0, 0.10, 4.0
-"""The paper's back-and-forth: how far, what counts as there, and how long it is watched."""
+"""The paper's back-and-forth test: distance, radius of arrival, and duration."""
 
 
 class Flight(NamedTuple):
-    """After every command; positions relative to the target."""
+    """States and commands after every command; positions are relative to the target."""
 
     position: Float[Array, "*drones steps 3"]
     velocity: Float[Array, "*drones steps 3"]
@@ -34,19 +34,19 @@ class Flight(NamedTuple):
     body_rate: Float[Array, "*drones steps 3"]
     command: Float[Array, "*drones steps 4"]
     failed: Bool[Array, "*drones steps"]
-    """Whether limits of speed or rate have been passed up to here."""
+    """Whether a limit of speed or rate has been exceeded so far."""
     watched: Any = None
-    """What was asked to be seen of the controller's memory."""
+    """Watched part of the controller's memory."""
     rotor_speed: Any = None
     """(*drones, steps, 4), rad/s."""
 
 
 def steps_flown(flown: Flight, drone: int = 0) -> int:
-    """How many steps one drone of several flew before it was lost; all of them if it never was.
+    """Number of steps that a drone flew before it failed; all steps if it never did.
 
     Args:
         flown: flights, axes (drones, steps).
-        drone: which.
+        drone: index of the drone.
     """
     numbers = [np.asarray(x)[drone] for x in (*flown[:5], flown.rotor_speed)]
     well = np.isfinite(np.concatenate(numbers, axis=1)).all(axis=1) & ~np.asarray(flown.failed)[drone]
@@ -63,16 +63,24 @@ def fly(
     watch: Callable[[Any], Any] = lambda memory: None,
     targets: Float[Array, "steps 3"] | None = None,
 ) -> Flight:
-    """One flight to the origin on a drone drawn as the task says; ``vmap`` over ``key`` (and ``state``) for many.
+    """Fly to the origin once, on a drone drawn by the task. Use ``vmap`` over ``key`` (and ``state``) for many flights.
 
-    The simulation takes steps of the controller's control step where that is shorter than the model's. ``watch`` says
-    what of the controller's memory to keep. With ``targets``, the target of every command, positions are the world's
-    and the targets are what is watched.
+    If the controller's control step is shorter than the model's step, the simulation uses the control step.
+
+    Args:
+        controller: the controller.
+        task: determines the drone and the noise.
+        nominal: the nominal drone.
+        key: determines drone, start and noise.
+        seconds: duration, s.
+        state: initial state; drawn by the task by default.
+        watch: function of the controller's memory; its result is kept in ``watched``.
+        targets: target of every command. With it, positions are in the world, and ``watched`` is the target.
     """
     dt = controller.control_dt_s
     if dt < nominal.dt:
         nominal = replace(nominal, dt=dt)
-    # What the episode remembers for a network is of no use to other controllers; keep it small.
+    # Other controllers do not need the history that the episode keeps for a network, so keep it small.
     task = replace(task, layout=Layout(control_dt_s=dt, past_estimates=0, past_commands=0))
     episode = reset(task, nominal, key, state)
     memory = controller.start(episode.estimate, settled_command(episode.model, episode.state))
@@ -80,7 +88,7 @@ def fly(
     def one(carry, target):
         episode, memory, failed = carry
         if target is not None:
-            # What was estimated for the last target is told for this one.
+            # The estimate was relative to the last target; make it relative to this one.
             seen = replace(episode.estimate, position=episode.estimate.position + episode.target - target)
             episode = replace(episode, target=target, estimate=seen)
         memory, command = controller.command(memory, episode.estimate)
@@ -98,26 +106,29 @@ def fly(
 
 
 class Hover(NamedTuple):
-    """Of the paper's hover test, per drone."""
+    """Measurements of the paper's hover test, per drone."""
 
     mean_distance_m: Float[Array, "*drones"]
     horizontal_m: Float[Array, "*drones"]
-    """Mean distance from the vertical through the target."""
+    """Mean distance from the vertical line through the target."""
     vertical_m: Float[Array, "*drones"]
-    """Mean difference in height, above or below."""
+    """Mean absolute height difference to the target."""
     command_std: Float[Array, "*drones"]
-    """Standard deviation over time, mean of the four motors."""
+    """Standard deviation of the command over time, mean of the four motors."""
     failed: Bool[Array, "*drones"]
 
 
 def hover(controller: Controller, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray) -> tuple[Hover, Flight]:
-    """Start level at the target, hold it `HOVER_S` seconds, count all but the first `SETTLING_S` (paper section VI).
+    """Hold the target for `HOVER_S` from a level start there, and measure after `SETTLING_S` (paper section VI).
 
     Args:
-        controller: what flies.
-        task: says which drones and how much noise.
-        nominal: the drone.
-        keys: one per flight.
+        controller: the controller.
+        task: determines the drones and the noise.
+        nominal: the nominal drone.
+        keys: one key per flight.
+
+    Returns:
+        The measurements and the flights.
     """
     return _hover(controller, with_room(task, nominal), nominal, keys)
 
@@ -135,18 +146,18 @@ def _hover(controller, task, nominal, keys):
 
 
 class Step(NamedTuple):
-    """Of a flight to a target `STEP_DISTANCE_M` away, per drone."""
+    """Measurements of a flight to a target at `STEP_DISTANCE_M`, per drone."""
 
     arrival_s: Float[Array, "*drones"]
-    """First time nearer than `ARRIVED_M`; infinite if never."""
+    """First time within `ARRIVED_M` of the target; infinite if never."""
     peak_speed_mps: Float[Array, "*drones"]
     overshoot_m: Float[Array, "*drones"]
-    """How far beyond the target, along the way."""
+    """Largest distance beyond the target, along the path."""
     failed: Bool[Array, "*drones"]
 
 
 def six_metres(controller: Controller, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray) -> tuple[Step, Flight]:
-    """From hover, `STEP_DISTANCE_M` away along x; the flights too."""
+    """Fly from hover to a target at a distance of `STEP_DISTANCE_M` along x; arguments as for `hover`."""
     return _six_metres(controller, with_room(task, nominal), nominal, keys)
 
 
@@ -164,18 +175,18 @@ def _six_metres(controller, task, nominal, keys):
 def back_and_forth(
     controller: Controller, task: TargetTask, nominal: Quadrotor, key: PRNGKeyArray, legs: int = 4, leg_s: float = 3.0
 ) -> Flight:
-    """From hover at the origin, to a target that jumps between `STEP_DISTANCE_M` along x and the origin.
+    """Fly from hover at the origin to a target that jumps between `STEP_DISTANCE_M` along x and the origin.
 
     Args:
-        controller: what flies.
-        task: says which drone and how much noise.
-        nominal: the drone.
-        key: of drone and noise.
-        legs: how often the target jumps, at once and then every ``leg_s`` [s].
-        leg_s: see there.
+        controller: the controller.
+        task: determines the drone and the noise.
+        nominal: the nominal drone.
+        key: determines drone and noise.
+        legs: number of jumps of the target; the first is at once.
+        leg_s: time between two jumps, s.
 
     Returns:
-        One flight, its ``position`` in the world; ``watched`` is the target (steps, 3).
+        One flight with its ``position`` in the world; ``watched`` is the target (steps, 3).
     """
     return _back_and_forth(controller, with_room(task, nominal), nominal, key, legs, leg_s)
 
@@ -190,18 +201,18 @@ def _back_and_forth(controller, task, nominal, key, legs, leg_s):
 
 
 class Recovery(NamedTuple):
-    """Of a throw, per drone."""
+    """Measurements of a throw, per drone."""
 
     recovered: Bool[Array, "*drones"]
-    """No limit passed, and slow, level and within `CAUGHT_M` at the end."""
+    """No limit exceeded, and slow, level and within `CAUGHT_M` at the end."""
     lost_height_m: Float[Array, "*drones"]
     final_distance_m: Float[Array, "*drones"]
     failed: Bool[Array, "*drones"]
 
 
 RECOVERY_S, CAUGHT_M = 6.0, 0.75
-"""As long as the hover test: the weakest drones of the paper's randomisation lift hardly more than their weight, and
-need that long to climb back."""
+"""Duration of the recovery test and radius of a catch. The duration is that of the hover test: the weakest drones of
+the paper's randomisation lift hardly more than their weight, and need that long to climb back."""
 
 
 def recovery(
@@ -212,10 +223,21 @@ def recovery(
     tilt_deg: float = 60.0,
     speed: float = 3.0,
 ) -> tuple[Recovery, Flight]:
-    """Thrown at ``speed`` [m/s] in a random direction with ``tilt_deg`` of tilt about a random level axis.
+    """Throw drones at ``speed`` in a random direction, tilted about a random horizontal axis.
 
-    Recovered is who is below 0.5 m/s, tilted less than 30 deg and within `CAUGHT_M` after `RECOVERY_S` without having
-    passed a limit on the way.
+    A drone has recovered if after `RECOVERY_S` it is slower than 0.5 m/s, tilted by less than 30 deg and within
+    `CAUGHT_M`, and has exceeded no limit on the way.
+
+    Args:
+        controller: the controller.
+        task: determines the drones and the noise.
+        nominal: the nominal drone.
+        keys: one key per flight.
+        tilt_deg: initial tilt, deg.
+        speed: initial speed, m/s.
+
+    Returns:
+        The measurements and the flights.
     """
     return _recovery(controller, with_room(task, nominal), nominal, keys, jnp.asarray(tilt_deg), jnp.asarray(speed))
 
@@ -256,9 +278,9 @@ _AnyTask = TypeVar("_AnyTask", bound=Task)
 
 
 def nominal_task(task: _AnyTask) -> _AnyTask:
-    """The same task on the nominal drone."""
+    """Return the task without randomisation."""
     return replace(task, randomisation=None)
 
 
 TESTS: dict[str, Callable[..., tuple[Any, Flight]]] = {"hover": hover, "step": six_metres, "recover": recovery}
-"""Each takes controller, task, nominal drone and keys, and returns what it measured and the flights."""
+"""Tests by name; each takes controller, task, nominal drone and keys, and returns measurements and flights."""

@@ -1,4 +1,4 @@
-"""How a position controller is judged: on the nominal drone, on randomised ones, on a set of others."""
+"""Evaluate a position controller: on the nominal drone, on randomised drones, and on a set of drones with effects."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ SENSORS = {
         {"position_m": 0.0005, "attitude_rad": math.radians(0.5), "rate_radps": 0.05},
     ),
 }
-"""Changed parameters of the nominal drone, whether the gyro is as late as the pose (None: as the controller has it),
-and changed noise of the estimates."""
+"""Variants of the sensors: changed parameters of the nominal drone, whether the gyro is as late as the pose (None: as
+the controller was trained), and changed noise of the estimates."""
 
 
 class Judge:
-    """Flies controllers in the paper's hover test.
+    """Evaluates controllers in the paper's hover test.
 
     Args:
-        plants: set of drones with effects, of `load_plants`; None: without them.
-        random_drones: of the paper's full randomisation.
+        plants: name of a set of drones with effects (`load_plants`); None: no such drones.
+        random_drones: number of drones from the paper's full randomisation.
     """
 
     def __init__(self, plants: str | None = "off-nominal", random_drones: int = RANDOM_DRONES):
@@ -48,7 +48,7 @@ class Judge:
         self.many = jax.random.split(jax.random.PRNGKey(1), random_drones)
 
     def __call__(self, controller: Controller) -> dict:
-        """Hover error and command std, JSON-like; over randomised drones medians of those that did not fail."""
+        """Hover error and command std, for JSON; over randomised drones the median of those that did not fail."""
 
         def measure(task, drone, keys, middle):
             return summary(hover(controller, task, drone, keys)[0], middle)
@@ -61,11 +61,11 @@ class Judge:
         }
 
     def with_sensors(self, controller: Controller, lumped_delay: bool = True) -> dict[str, dict]:
-        """The hover test on the nominal drone, its sensors later and noisier than the model says: `SENSORS`.
+        """Hover test on the nominal drone with sensors that are later and noisier than the model's (`SENSORS`).
 
         Args:
             controller: the controller.
-            lumped_delay: whether it is meant for a gyro as late as the pose.
+            lumped_delay: whether the controller was trained with a gyro as late as the pose.
         """
         found = {}
         for name, (changes, lumped, noise) in SENSORS.items():
@@ -78,8 +78,12 @@ class Judge:
 
 
 def summary(measured: Hover, middle: Callable[[np.ndarray], float]) -> dict:
-    """Hover error and command std of many flights, JSON-like: the ``middle`` of those that did not fail, None where all
-    did; and which share failed."""
+    """Summary of many hover flights, for JSON: error, command std and share of failures.
+
+    Args:
+        measured: measurements of the flights.
+        middle: mean or median; applied to the flights that did not fail. The result is None if all failed.
+    """
     well = ~np.asarray(measured.failed)
     numbers = {
         "hover_mm": 1e3 * np.asarray(measured.mean_distance_m),
@@ -92,7 +96,7 @@ def summary(measured: Hover, middle: Callable[[np.ndarray], float]) -> dict:
 
 
 def away(score: dict, key: str) -> float | None:
-    """Mean over the set of drones with effects; None where one of them was lost."""
+    """Mean over the set of drones with effects; None if one of them failed."""
     values = [plant[key] for plant in score["plants"].values()]
     lost = any(plant["failed"] > 0 or plant[key] is None for plant in score["plants"].values())
     return None if lost else sum(values) / len(values)

@@ -1,4 +1,4 @@
-"""A test flown on one drone or many, and what was measured in JSON terms: what ``cfb fly`` says."""
+"""Fly a test on one drone or many, and summarise the measurements for JSON: the results of ``cfb fly``."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 def measured(
     test: str, controller: Controller, task: TargetTask, keys: PRNGKeyArray, over: Devices
 ) -> Callable[[Quadrotor], tuple[dict[str, Any], Flight]]:
-    """What flies a test on a drone.
+    """Return a function that flies a test on a drone.
 
     Args:
-        test: of `TESTS`, or a flip of `FLIPS`.
-        controller: who flies; a manoeuvre for a flip.
-        task: says which drones and how much noise; with room for its delays (`cfb_mjx.envs.episode.with_room`).
-        keys: one per flight.
+        test: name in `TESTS` or `FLIPS`.
+        controller: the controller; a manoeuvre for a flip.
+        task: determines the drones and the noise; with room for its delays (`cfb_mjx.envs.episode.with_room`).
+        keys: one key per flight.
         over: devices that share the flights.
 
     Returns:
-        A function of the drone that gives the `summary`, and the flights, axes (drones, steps).
+        A function of the nominal drone that returns the `summary` and the flights, axes (drones, steps).
     """
     flown_by = _flown_by(test)
     divided = over.divided(lambda controller, drone, keys: flown_by(controller, task, drone, keys), (None, None, 0), 0)
@@ -62,15 +62,15 @@ def summary(
     completed: np.ndarray | None = None,
     diverged: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """JSON of a test: means over the flights, and over many also quantiles and the rate of success.
+    """Summary of a test, for JSON: means over the flights, and for many flights also quantiles and the success rate.
 
-    Flights that diverged failed; they are counted, and no mean is taken of them.
+    Flights that diverged count as failed and are left out of the means.
 
     Args:
-        test: what was flown.
-        numbers: what was measured, one number per flight.
-        completed: for flips, who completed them.
-        diverged: whose state is no number at the end; nobody's by default.
+        test: name of the test.
+        numbers: measurements, one number per flight.
+        completed: for flips, whether each flight completed it.
+        diverged: whether the state of each flight is not finite at the end; by default none is.
     """
     diverged = np.zeros_like(numbers["failed"]) if diverged is None else diverged
     failed = numbers["failed"] | diverged
@@ -86,7 +86,7 @@ def summary(
     else:
         values = {key: value for key, value in numbers.items() if key != "failed"}
         good = completed & ~diverged
-    # A lost flip's numbers say nothing, and some are infinite.
+    # The numbers of a failed flip are meaningless, and some are infinite.
     counted = good if completed is not None and good.any() else ~diverged
     result: dict[str, Any] = {
         key: _finite(np.mean(value[counted])) if counted.any() else None for key, value in values.items()

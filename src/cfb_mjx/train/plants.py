@@ -1,4 +1,4 @@
-"""Named sets of drones to judge controllers on."""
+"""Named sets of drones for the evaluation of controllers."""
 
 from __future__ import annotations
 
@@ -14,10 +14,14 @@ FORMAT = "cfb_mjx plants 1"
 
 
 def load_plants(base: ModelFile, name_or_path: str | Path = "off-nominal") -> dict[str, Quadrotor]:
-    """Drones of a shipped set, or of a YAML file: ``base`` with the effects that each adds.
+    """Read the drones of a shipped set or a YAML file: ``base`` with the effects that each entry adds.
+
+    Args:
+        base: model without these effects.
+        name_or_path: name of a set, or file.
 
     Raises:
-        CfbError: no such set, an entry without a name, unknown effects, or numbers of them that cannot be.
+        CfbError: there is no such set, an entry has no name, an effect is unknown, or a value is impossible.
     """
     path, document = load_named(name_or_path, "set of plants", FORMAT, "plants")
     plants = {}
@@ -31,10 +35,10 @@ def load_plants(base: ModelFile, name_or_path: str | Path = "off-nominal") -> di
             raise CfbError(f"{path}: every plant needs a name and a list of effects, found {told(item)}.")
         refuse_unknown(item, {"name", "why", "effects"}, path, "plants.")
         if str(item["name"]) in plants:
-            raise CfbError(f"{path}: two plants are called {item['name']}; give each a name of its own.")
+            raise CfbError(f"{path}: two plants have the name {item['name']}; give each its own name.")
         where = f"{path}: plant {item['name']}"
         described = replace(base, name=str(item["name"]), effects=(*base.effects, *effects), path=where)
         plants[described.name] = Quadrotor.from_file(described)
     if not plants:
-        raise CfbError(f"{path}: names no plants.")
+        raise CfbError(f"{path}: contains no plants.")
     return plants

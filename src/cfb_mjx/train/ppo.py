@@ -1,10 +1,10 @@
-"""Proximal policy optimisation (Schulman et al. 2017) on Brax's action distribution and advantages.
+"""Proximal policy optimisation (Schulman et al. 2017) with Brax's action distribution and advantages.
 
-Brax's own ``train`` hands out neither its optimizer nor its environments, so a run of it cannot go on where it was
-interrupted; this one is a page long, and its whole state is one pytree. Brax's loss divides advantages by a spread that
-a few failures decide; here they are limited first, and counted from those of copies that differ by their actions
-alone, without which they are mostly what the value network errs by. Episodes are drawn anew at every reset, drone
-included. The value network sees what the drone itself cannot: the true state, rotor speeds and the drawn drone.
+Brax's own ``train`` returns neither its optimizer nor its environments, so an interrupted run cannot continue. This one
+is a page long, and its complete state is one pytree. Brax's loss divides advantages by a standard deviation that a few
+failures determine. Here advantages are clipped first and taken relative to copies of the same episode that differ only
+in their actions; without this they are mostly errors of the value network. Every reset draws a new episode and a new
+drone. The value network sees what the drone cannot: the true state, the rotor speeds and the drawn drone.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from cfb_mjx.train.brax_compat import parts
 from cfb_mjx.train.config import PpoSettings
 
 LEAST_RATE = 1e-3
-"""Of the policy's learning rate that is left where the policy changes too much with its weights."""
+"""Lowest factor on the policy's learning rate, for policies that change too much with their weights."""
 
 
 class Actor(eqx.Module):
-    """The policy: Gaussian about the network's output, then tanh."""
+    """The policy: a Gaussian about the network's output, followed by tanh."""
 
     network: Network
     raw_std: Float[Array, "4"]
-    """Its softplus is the standard deviation."""
+    """Standard deviation before a softplus."""
 
 
 class PpoState(eqx.Module):
-    """Everything a training is at one instant."""
+    """Complete state of a training."""
 
     actor: Actor
     critic: Network
@@ -48,7 +48,7 @@ class PpoState(eqx.Module):
     rate: Float[Array, ""]
     """Factor on the policy's learning rate that keeps the KL divergence of an update small."""
     episodes: tuple[Episode, Bool[Array, " drones"]]
-    """One per drone, and who is lost and waits for its copies."""
+    """One episode per drone, and which drones have failed and wait for their copies."""
     key: PRNGKeyArray
     count: Int[Array, ""]
 
@@ -56,7 +56,7 @@ class PpoState(eqx.Module):
 class Ppo:
     """The algorithm; see `cfb_mjx.train.algorithm.Algorithm`.
 
-    ``trained`` says that the policy it begins with can fly: its value network has to learn first what that is worth.
+    ``trained`` says that the initial policy can already fly. The value network then learns that policy's value first.
     """
 
     def __init__(
@@ -82,17 +82,17 @@ class Ppo:
             schedule = optax.linear_schedule(rate, settings.last_rate * rate, gradient_steps)
             return optax.chain(optax.clip_by_global_norm(settings.gradient_clip), optax.adam(schedule, eps=1e-5))
 
-        # Clipped apart: the value's gradient is far larger at first and would leave nothing of the policy's.
+        # Separate clipping: the value network's gradient is far larger at first and would suppress the policy's.
         self.optimizer = optax.multi_transform(
             {"actor": adam(settings.learning_rate), "critic": adam(settings.value_learning_rate)}, ("actor", "critic")
         )
-        # The value of the best step for ever: what the network has to learn is how much worse it is elsewhere.
+        # Value of the best reward forever; the network learns how much lower the value is.
         self.ideal = settings.reward_scaling * task.largest_reward / max(1e-3, 1 - settings.discount)
         self._reset = jax.vmap(partial(reset, task, nominal))
         self.update = eqx.filter_jit(self._update)
 
     def begin(self, key: PRNGKeyArray, controller: NeuralController) -> PpoState:
-        """Drones in flight, and a value network that knows nothing."""
+        """Start the drones in flight, with an untrained value network."""
         of_episodes, of_critic, key = jax.random.split(key, 3)
         episodes = in_progress(self.task, self.nominal, self.settings.drones // self.settings.copies, of_episodes)
         episodes = self._copied(episodes)
@@ -101,18 +101,18 @@ class Ppo:
         critic = Network.random(of_critic, (inputs, *self.settings.value_hidden, 1), "swish")
         raw = jnp.log(jnp.expm1(jnp.full(4, self.first_std)))
         actor = Actor(controller.network, raw)
-        # Optax's annotation knows no modules of equinox.
+        # Optax's type annotation does not include modules of equinox.
         optimizer = self.optimizer.init(cast(Any, (actor, critic)))
         rate = jnp.asarray(self.first_rate, raw.dtype)
         episodes = episodes, jnp.zeros(self.settings.drones, bool)
         return strong(PpoState(actor, critic, optimizer, rate, episodes, key, jnp.asarray(0)))
 
     def controller(self, state: PpoState) -> NeuralController:
-        """The mean of the policy."""
+        """Return the mean of the policy as a controller."""
         return NeuralController(state.actor.network, self.task.layout)
 
     def _copied(self, one_of_each):
-        """Every drone ``copies`` times."""
+        """Repeat every drone ``copies`` times."""
         return jax.tree.map(lambda x: jnp.repeat(x, self.settings.copies, axis=0), one_of_each)
 
     def _show(self, episode: Episode) -> dict[str, Array]:
@@ -122,7 +122,7 @@ class Ppo:
         of_flight, of_learning, key = jax.random.split(state.key, 3)
         episodes, data, outcome = self._collect(state.actor, state.episodes, of_flight)
         show = self.devices.divided(jax.vmap(self._show), (0,), 0)
-        # Every device needs what all drones saw: a batch is drawn from all of them.
+        # Every device needs the data of all drones, because batches are drawn from all of them.
         data, last = self.devices.whole((data, show(episodes[0])["hidden"]))
         learning = jnp.where(state.count < self.warm_up, 0.0, 1.0)
         left = 1 - (1 - self.settings.last_entropy) * state.count / self.updates
@@ -133,7 +133,7 @@ class Ppo:
             jax.random.split(of_learning, self.settings.epochs),
         )
         losses = jax.tree.map(jnp.mean, losses)
-        # It falls within an update, and rises from one to the next: the first batches of each have no divergence yet.
+        # The rate falls within an update and rises between updates: the first batches have no divergence yet.
         calm = (learning > 0) & (losses["kl"] < self.settings.largest_kl / 4)
         rate = jnp.minimum(jnp.where(calm, 1.5 * rate, rate), 1.0)
         metrics = {
@@ -146,9 +146,9 @@ class Ppo:
         return PpoState(actor, critic, optimizer, rate, episodes, key, state.count + 1), metrics
 
     def _collect(self, actor: Actor, episodes: tuple[Episode, Array], key: PRNGKeyArray):
-        """Fly ``unroll`` commands with every drone; data has axes (unroll, drones)."""
-        # Drawing drones and starts costs as much as flying: once per few commands is enough, as no drone fails twice
-        # within them.
+        """Fly ``unroll`` commands with every drone; the data has axes (unroll, drones)."""
+        # Drawing drones and starts costs as much as flying, so draw once per few commands; no drone fails twice within
+        # them.
         each = math.gcd(self.settings.unroll, 8)
 
         def drawn(key):
@@ -157,7 +157,7 @@ class Ppo:
             of_reset = jax.random.split(of_reset, self.settings.drones // self.settings.copies)
             return self._copied(of_reset), noise(jax.random.split(of_flight, each))
 
-        # For all drones at once, so that what a drone is given does not depend on which device flies it.
+        # Drawn for all drones at once, so that the draws do not depend on which device flies a drone.
         of_reset, noise = jax.vmap(drawn)(jax.random.split(key, self.settings.unroll // each))
         fly = self.devices.divided(self._fly, (None, 0, 1, 2), (0, 2))
         episodes, flown = fly(actor, episodes, of_reset, noise)
@@ -171,10 +171,10 @@ class Ppo:
         of_reset: PRNGKeyArray,
         noise: Float[Array, "n each drones 4"],
     ):
-        """Fly so many drones. Who fails waits until its copies have failed too, or their time is over; then another
-        begins, drawn anew once per ``each`` commands.
+        """Fly a block of drones. A failed drone waits until all its copies have failed or their time is up. Then a new
+        episode begins, drawn once per ``each`` commands.
 
-        Were all copies ended by the first that fails, the others, a moment from failing, would not learn of it.
+        If the first failure ended all copies, the others, which may be about to fail, would not learn from it.
         """
         copies = self.settings.copies
 
@@ -209,7 +209,7 @@ class Ppo:
     def _epoch(self, weights, data: dict[str, Array], last: Array, learnt: tuple, key: PRNGKeyArray):
         of_order, of_entropy = jax.random.split(key)
         count = self.settings.minibatches
-        # Whole flights of some of the drones make a batch, of which every device takes its share.
+        # A batch consists of the whole flights of some drones; every device takes its share of it.
         copies = self.settings.copies
         order = jax.random.permutation(of_order, self.settings.drones // copies)
         order = (copies * order[:, None] + jnp.arange(copies)).reshape(count, -1)
@@ -223,10 +223,10 @@ class Ppo:
             changes, optimizer = self.optimizer.update(gradient, optimizer)
             changes = cast(tuple[Actor, Network], changes)
             if most := self.settings.largest_kl:
-                # How far the steps before this one have led.
+                # Divergence that the previous steps of this update have caused.
                 kl = metrics["kl"]
                 step = jnp.where(kl > 2 * most, 0.0, rate)
-                # A policy from a file may be of another precision than its spread and this factor.
+                # A policy from a file may have another precision than its standard deviation and this factor.
                 changes = jax.tree.map(lambda x: step.astype(x.dtype) * x, changes[0]), changes[1]
                 rate = jnp.maximum(jnp.where(kl > most, rate / 1.5, rate), LEAST_RATE)
             actor, critic = eqx.apply_updates((actor, critic), changes)
@@ -239,7 +239,7 @@ class Ppo:
     ) -> tuple[Array, dict]:
         logits = _logits(both[0], data["seen"])
         values = self._value(both[1], data["hidden"])
-        # Anew for every batch: the value network learns from the very same flights.
+        # Computed again for every batch, because the value network learns from the same flights.
         returns, advantage = self.brax.losses.compute_gae(
             truncation=data["cut"],
             termination=data["failed"],
@@ -265,7 +265,7 @@ class Ppo:
         gain = mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - near, 1 + near) * advantage))
         value_loss = mean((returns - values) ** 2) / 4
         entropy = mean(self.distribution.entropy(logits, key))
-        # From one command to the next of the same flight.
+        # Change from one command to the next of the same flight.
         follows = (flown * (1 - data["failed"]) * (1 - data["cut"]))[:-1] * flown[1:]
         change = jnp.sum(jnp.diff(jnp.tanh(logits[..., :4]), axis=0) ** 2, axis=-1)
         change = jnp.sum(follows * change) / jnp.maximum(jnp.sum(follows), 1.0)
@@ -276,7 +276,7 @@ class Ppo:
             "value_explained": 1 - 4 * value_loss / mean((returns - mean(returns)) ** 2),
             "entropy": entropy,
             "change": change,
-            # The estimate of least variance (Schulman, Approximating KL divergence, 2020).
+            # The low-variance estimator (Schulman, Approximating KL divergence, 2020).
             "kl": mean(ratio - 1 - log_ratio),
             "clipped": mean(jnp.abs(ratio - 1) > near),
         }
@@ -288,16 +288,16 @@ class Ppo:
 def beside_copies(
     advantage: Float[Array, "n drones"], flown: Float[Array, "n drones"], copies: int
 ) -> Float[Array, "n drones"]:
-    """Advantages less the mean of the drone's copies at the same command.
+    """Advantages minus the mean over the drone's copies at the same command.
 
-    Copies began alike and see the same noise, so what the value network errs by is nearly the same in all of them; what
-    is left is what their own actions made of it. A copy's command does not depend on the others' advantages, so the
-    gradient stays unbiased, but for the factor (copies - 1) / copies.
+    Copies start alike and see the same noise, so the error of the value network is nearly the same in all of them; the
+    difference is due to their own actions. A copy's command does not depend on the advantages of the others, so the
+    gradient stays unbiased up to the factor (copies - 1) / copies.
 
     Args:
-        advantage: generalised advantages (Schulman et al. 2016); copies beside each other.
-        flown: one for commands that were flown, zero for those of a copy that is lost.
-        copies: of every drone; 1: nothing is changed.
+        advantage: generalised advantages (Schulman et al. 2016); copies are adjacent.
+        flown: one for commands that were flown, zero for those of a copy that has failed.
+        copies: number of copies of every drone; with 1 the advantages are unchanged.
     """
     if copies == 1:
         return advantage

@@ -1,4 +1,4 @@
-"""The pipeline of a training: segments between checkpoints, learning curve, policy; what is interrupted goes on."""
+"""The pipeline of a training: segments between checkpoints, learning curve, policy files, and resuming."""
 
 from __future__ import annotations
 
@@ -39,32 +39,32 @@ from cfb_mjx.train.flying import hover, nominal_task
 CHECKPOINT, POLICY, CURVE, CONFIG = "checkpoint.npz", "policy.npz", "curve.csv", "config.yaml"
 BEST, UPDATES = "best.npz", "updates.csv"
 _JUDGED_ON, _JUDGED_ON_RANDOM = 64, 256
-"""Hover flights at each point of the curve, with the noise of the task: on the nominal drone, on drones of its own."""
+"""Hover flights per point of the learning curve, with the task's noise: on the nominal drone, and on random drones."""
 _BEST_BY = ("random_mm", "hover_mm", "rate_error_radps")
-"""What the best policy has least of: the first of these that the curve has."""
+"""Columns of the curve that select the best policy (lowest value): the first of these that the curve has."""
 
 Row = dict[str, float]
 
 
 class Stream(IntEnum):
-    """What a training draws with its seed; each has a key of its own."""
+    """Independent random streams of a training, each with its own key."""
 
     NETWORK, LEARNING, JUDGING, JUDGING_RANDOM = range(4)
 
     def key(self, seed: int) -> PRNGKeyArray:
-        """Of a training with this seed."""
+        """Return the key of this stream for a seed."""
         return jax.random.fold_in(jax.random.PRNGKey(seed), int(self))
 
 
 @dataclass(frozen=True)
 class Training:
-    """What a training starts from.
+    """Inputs of a training.
 
     Attributes:
-        config: the configuration.
-        described: the model file it names.
-        start: a policy to start from, instead of a random one.
-        versions: of the software, for the policy file.
+        config: configuration.
+        described: model file that the configuration names.
+        start: policy to start from; None: a random one.
+        versions: versions of the software, for the policy file.
     """
 
     config: TrainingConfig
@@ -76,11 +76,17 @@ class Training:
     def prepare(
         cls, config: TrainingConfig, versions: dict[str, str], start: str | Path | None = None, force: bool = False
     ) -> Training:
-        """Read what the configuration names.
+        """Read the model and the policy that a training needs.
+
+        Args:
+            config: configuration.
+            versions: versions of the software, for the policy file.
+            start: policy to start from.
+            force: accept a predictor as model.
 
         Raises:
-            CfbError: a bad model or policy, a predictor that is not insisted on, ranges that allow impossible drones,
-                or a policy of another shape.
+            CfbError: the model or policy is invalid, the model is a predictor without ``force``, the ranges allow
+                impossible drones, or the policy's observation or network differs from the configuration's.
         """
         described = load_model_file(config.model)
         ranges = load_randomisation(config.randomisation.ranges)
@@ -94,13 +100,13 @@ class Training:
             controller, wanted = policy.controller, config.network
             hidden = tuple(len(b) for b in controller.network.biases[:-1])
             if controller.layout != config.observation or hidden != wanted.hidden:
-                raise CfbError(f"{start}: this policy has another observation or network than the configuration.")
+                raise CfbError(f"{start}: the policy's observation or network differs from the configuration's.")
             if controller.network.activation != wanted.activation:
                 raise CfbError(f"{start}: this policy's activation is {controller.network.activation}.")
         return cls(config, described, policy, versions)
 
     def identity(self) -> dict[str, Any]:
-        """What a checkpoint must agree with to be gone on from."""
+        """Everything that a checkpoint must agree with to be resumed."""
         names = [item["name"] for item in self.described.effects]
         own = {name: written(name) for name in names if name in KNOWN and outside(name)}
         return {
@@ -110,7 +116,7 @@ class Training:
         } | ({"effects": own} if own else {})
 
     def nominal(self) -> Quadrotor:
-        """The drone about which the others are drawn."""
+        """Return the nominal drone."""
         if self.config.body == "mjx":
             from cfb_mjx.model import MjxBody
 
@@ -118,7 +124,7 @@ class Training:
         return Quadrotor.from_file(self.described)
 
     def first_controller(self, nominal: Quadrotor) -> NeuralController:
-        """The policy it starts with."""
+        """Return the initial controller."""
         if self.start is not None:
             return self.start.controller
         network = self.config.network
@@ -131,7 +137,7 @@ class Training:
         )
 
     def policy(self, controller: NeuralController) -> PolicyFile:
-        """The policy as a file, with what made it."""
+        """Return the policy as a file, with the inputs of its training."""
         return PolicyFile(controller, self.config.task, {**self.identity(), "versions": self.versions})
 
 
@@ -145,28 +151,28 @@ def train(
     devices: int = 1,
     log: Callable[[int, Row], None] = lambda commands, metrics: None,
 ) -> list[Row]:
-    """Train, writing ``policy.npz``, ``best.npz``, ``curve.csv``, ``updates.csv``, ``config.yaml`` and
-    ``checkpoint.npz`` into ``output``.
+    """Train, and write the results into a folder.
 
-    What is interrupted (KeyboardInterrupt) keeps the state of the last update, and goes on from there.
+    The files are ``policy.npz``, ``best.npz``, ``curve.csv``, ``updates.csv``, ``config.yaml`` and ``checkpoint.npz``.
+    An interrupted training (KeyboardInterrupt) stores the state of the last update and can be resumed from it.
 
     Args:
-        training: what to do.
-        output: folder; made if need be.
-        resume: go on from the checkpoint there, if there is one.
-        progress: called after every update with updates done, all updates, commands flown per second, seconds left.
+        training: inputs.
+        output: folder; created if it does not exist.
+        resume: resume from the checkpoint in ``output``, if there is one.
+        progress: called after every update with updates done, total updates, commands per second, seconds left.
         report: called with every new row of the learning curve.
         evaluate: fly the hover test at every checkpoint.
-        devices: of this process over which the drones are spread; where several processes run as one
-            (`cfb_mjx.hosts`), of each of them. Then the first alone reads and writes files, and reports.
-        log: called after every update with the commands flown so far and its metrics.
+        devices: number of devices of this process over which the drones are spread; if several processes run as one
+            (`cfb_mjx.hosts`), of each process. In that case only the first process reads and writes files, and reports.
+        log: called after every update with the commands flown so far and the metrics.
 
     Returns:
         The learning curve, one row per checkpoint.
 
     Raises:
-        CfbError: an earlier training is in the way, the checkpoint is of another training, there are fewer devices, or
-            the weights are no numbers any more (what was written before stays).
+        CfbError: the folder holds another training, the checkpoint belongs to another training, there are too few
+            devices, or the weights are no longer finite (files written before are kept).
     """
     output = Path(output)
     checkpoint = output / CHECKPOINT
@@ -206,7 +212,7 @@ def train(
                 pace = spent / (done - begun)
                 progress(done, algorithm.updates, algorithm.steps_per_update / pace, pace * (algorithm.updates - done))
         except KeyboardInterrupt:
-            # Of several processes others may be in the middle of an update: there the last checkpoint counts.
+            # With several processes, others may be in the middle of an update; then the last checkpoint is used.
             if jax.process_count() == 1 and done > begun:
                 seconds += spent
                 with together():
@@ -225,7 +231,7 @@ def train(
         if first():
             policy = training.policy(controller)
             with together():
-                # The first is never missing: from it an interrupted training goes on.
+                # The checkpoint is written first, so that an interrupted training can always be resumed.
                 save_checkpoint(checkpoint, whole, kept())
                 save_policy(policy, output / POLICY)
                 if _is_best(rows):
@@ -237,13 +243,13 @@ def train(
 
 
 def _is_best(rows: list[Row]) -> bool:
-    """Whether no earlier policy was judged as good as the last one."""
+    """Whether the last policy is better than all earlier ones."""
     by = next((name for name in _BEST_BY if name in rows[-1]), None)
     return by is None or all(not rows[-1][by] >= row[by] for row in rows[:-1])
 
 
 def _logged(path: Path, done: int) -> list[dict]:
-    """What the file holds of the first ``done`` updates."""
+    """Rows of the file for the first ``done`` updates."""
     rows = list(csv.DictReader(path.read_text().splitlines())) if done and path.is_file() else []
     return [row for row in rows if int(row["update"]) <= done]
 
@@ -251,16 +257,22 @@ def _logged(path: Path, done: int) -> list[dict]:
 def _diverged(output: Path, done: int, rows: list[dict]) -> str:
     kept = f"the policy of update {rows[-1]['update']} is kept" if rows else "no policy was written"
     return (
-        f"{output}: by update {done} the policy's weights are no numbers; {kept}. Train anew with a lower learning "
-        "rate, and look for a drone that the ranges make too wild with cfb fly."
+        f"{output}: by update {done} the policy's weights are not finite any more; {kept}. Train again with a lower "
+        "learning rate, and use cfb fly to look for drones that the ranges make too extreme."
     )
 
 
 def build(
     config: TrainingConfig, task, nominal: Quadrotor, over: Devices | None = None, trained: bool = False
 ) -> Algorithm:
-    """The algorithm of a configuration, over these devices (one by default); ``trained``: it begins with a policy that
-    can fly."""
+    """Build the algorithm of a configuration.
+
+    Args:
+        config: configuration.
+        nominal: nominal drone.
+        over: devices; one by default.
+        trained: whether the initial policy can already fly.
+    """
     if config.algorithm == "ppo":
         from cfb_mjx.train.ppo import Ppo
 
@@ -271,19 +283,19 @@ def build(
 
 
 def segments(updates: int, count: int) -> list[int]:
-    """After which updates checkpoints are written; the last is ``updates``."""
+    """Updates after which checkpoints are written; the last one is ``updates``."""
     count = min(count, updates)
     return sorted({round(updates * (i + 1) / count) for i in range(count)})
 
 
 def spread(state: Any, over: Devices) -> Any:
-    """Drones over the devices, everything else on each."""
+    """Spread the drones over the devices, and copy everything else to each."""
     episodes = over.along(state.episodes)
     return eqx.tree_at(lambda s: s.episodes, over.whole(state), episodes)
 
 
 def _loaded(checkpoint: Path, like: Any) -> Any:
-    """In the first process the state of the checkpoint, elsewhere ``like`` it; all fail where it is damaged."""
+    """State of the checkpoint in the first process, ``like`` elsewhere; all processes fail if the file is damaged."""
     found = [like]
 
     def load() -> None:
@@ -305,13 +317,13 @@ def _found(checkpoint: Path, output: Path, training: Training, resume: bool) -> 
         before, now = _comparable(about.get(part)), _comparable(_json(now))
         if before != now:
             what = ", ".join(_differences(before, now, part)) or part
-            raise CfbError(f"{checkpoint}: the training there had another {what}; give what it had, or another folder.")
+            raise CfbError(f"{checkpoint}: that training had another {what}; give the same, or another folder.")
     return about
 
 
 def _comparable(part: Any) -> Any:
-    """Without what a training does not depend on: its description, and the name of the model's file, since what that
-    holds is compared and folders move."""
+    """Remove what a training does not depend on: the description, and the name of the model's file, because the
+    contents of the file are compared and folders may move."""
     if not isinstance(part, dict):
         return part
     named = str(part.get("model", "")).endswith((".yaml", ".yml"))
@@ -343,7 +355,7 @@ def _judged(controller: NeuralController, training: Training, task, nominal: Qua
     }
     if task.randomisation is None:
         return row
-    # All of the ranges, however mild some of the drones are that it learns on.
+    # All of the ranges, also if the training uses milder drones in part.
     keys = jax.random.split(Stream.JUDGING_RANDOM.key(training.config.seed), _JUDGED_ON_RANDOM)
     measured, _ = hover(controller, replace(task, graded=0.0), nominal, keys)
     distance = jnp.where(measured.failed, jnp.inf, measured.mean_distance_m)

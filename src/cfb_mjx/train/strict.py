@@ -1,4 +1,4 @@
-"""Dataclasses from mappings, every key known and every value of its type, or a sentence that names the key."""
+"""Build dataclasses from mappings with strict keys and types; errors name the key."""
 
 from __future__ import annotations
 
@@ -19,10 +19,16 @@ T = TypeVar("T", bound="DataclassInstance")
 
 
 def build(kind: type[T], raw: Mapping[str, Any], where: str, prefix: str = "") -> T:
-    """A ``kind`` (a dataclass, nested ones too) from a mapping; what is left out keeps its default.
+    """Build a dataclass, with nested ones, from a mapping; missing keys have their defaults.
+
+    Args:
+        kind: class to build.
+        raw: the mapping.
+        where: name of the file, for messages.
+        prefix: dotted path of ``raw`` within the file, for messages.
 
     Raises:
-        CfbError: an unknown key, or a value of the wrong type, named with ``where`` and its dotted path.
+        CfbError: a key is unknown, or a value has the wrong type; the message gives ``where`` and the dotted path.
     """
     if not isinstance(raw, Mapping):
         raise CfbError(f"{where}: {prefix.rstrip('.') or 'the file'} must be a mapping, found {told(raw)}.")
@@ -35,7 +41,7 @@ def build(kind: type[T], raw: Mapping[str, Any], where: str, prefix: str = "") -
 
 
 def plain(value: Any) -> Any:
-    """The mapping that `build` would read back."""
+    """Return the mapping that `build` would read back."""
     if dataclasses.is_dataclass(value):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
     return [plain(x) for x in value] if isinstance(value, tuple) else value
@@ -56,11 +62,11 @@ def _value(kind: Any, raw: Any, where: str, key: str) -> Any:
         return tuple(_value(arguments[0], x, where, key) for x in raw)
     number = isinstance(raw, int | float) and not isinstance(raw, bool)
     if kind is float:
-        # Compared, not math.isfinite: that overflows on a huge int.
+        # Compared, because math.isfinite overflows on a huge int.
         finite = number and abs(raw) <= sys.float_info.max
         return float(_checked(finite, raw, "a finite number", where, key))
     if kind is int:
-        # 2e7 is a float to Python, and a count to whoever writes it.
+        # 2e7 is a float in Python, but a count to the user.
         whole = number and (isinstance(raw, int) or raw.is_integer()) and abs(raw) <= LARGEST_INT
         return int(_checked(whole, raw, "a whole number of at most 64 bits", where, key))
     return _checked(isinstance(raw, kind), raw, {bool: "true or false", str: "text"}[kind], where, key)

@@ -114,7 +114,7 @@ def _rows(verdict: Verdict) -> list[list[str]]:
             f"{r.lag * 1e3:.0f}",
             f"{r.correlation:.3f}",
             f"{r.unexplained:.3f}",
-            "contradicts" if r.contradicts else "agrees" if r.moves else "too gentle to tell",
+            "contradicts" if r.contradicts else "agrees" if r.moves else "too little motion to compare",
         ]
         for r in verdict.relations
     ]

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfb_mjx.files import FIGURES, replacing, require_ending
+from cfb_mjx.files import FIGURES, VectorFormat, replacing, require_ending
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
+
+_COPIES: ContextVar[tuple[VectorFormat, Path | None] | None] = ContextVar("copies", default=None)
 
 MEASURED = "#222222"
 # Okabe and Ito's palette.
@@ -68,12 +73,37 @@ def check_path(path: str | os.PathLike) -> Path:
     return require_ending(path, FIGURES, f"a figure must end in {', '.join(FIGURES)}")
 
 
+@contextmanager
+def with_vector_copies(form: VectorFormat | None, folder: Path | None = None) -> Iterator[None]:
+    """Inside the block, `save` also writes each figure as a vector graphic.
+
+    Args:
+        form: format of the copies; None writes none.
+        folder: where to write the copies; None: beside the figure.
+    """
+    token = _COPIES.set(None if form is None else (form, folder))
+    try:
+        yield
+    finally:
+        _COPIES.reset(token)
+
+
 def save(figure, path: Path) -> None:
-    """Write the figure atomically, in the format of the path's ending.
+    """Write the figure atomically, in the format of the path's ending, and its copy (`with_vector_copies`).
 
     Raises:
         CfbError: the folder is missing or the file cannot be written.
     """
+    _write(figure, path)
+    copies = _COPIES.get()
+    if copies is not None:
+        form, folder = copies
+        copy = (path.parent if folder is None else folder) / f"{path.stem}.{form}"
+        if copy != path:
+            _write(figure, copy)
+
+
+def _write(figure, path: Path) -> None:
     suffix = path.suffix.lower()
     # Without a date, equal figures are equal files.
     metadata = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)

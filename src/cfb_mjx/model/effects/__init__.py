@@ -1,4 +1,4 @@
-"""Physical effects the basic model leaves out, one module each, and the catalogue that names them."""
+"""Physical effects that the basic model leaves out, one module each, and the catalogue of their names."""
 
 from cfb_mjx.model.effects.base import Condition, Effect, Memory, Motors, Reading, Wrench, overrides
 from cfb_mjx.model.effects.battery_sag import BatterySag

@@ -1,4 +1,4 @@
-"""What an effect is: parameters plus pure functions that may change the drone, its motors, the loads or the wrench."""
+"""Interface of an effect: parameters with pure functions that may change the drone, motors, rotor loads or wrench."""
 
 from __future__ import annotations
 
@@ -14,78 +14,81 @@ from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 INERTIAL, CONSTRAINT, EXPECTATION = 9, 10, 11
-"""Ranks of how the body takes the torque of all forces, of a force that follows from all others (a string's tension),
-and of what is no physics but an expectation."""
+"""Values of `Effect.rank` for effects that act on the body after all others: effects that use the torque of all forces
+(`INERTIAL`), forces that follow from all other forces, such as the tension of a string (`CONSTRAINT`), and statistical
+corrections that are not physics (`EXPECTATION`)."""
 
 Memory = tuple[Vec, ...]
-"""What one effect remembers from step to step: hidden states such as a delay line or a swinging load."""
+"""Hidden state of one effect, carried from step to step, such as a delay line or a swinging load."""
 
 
 class Condition(eqx.Module):
-    """Flight condition an effect sees, at one integration stage. All `Vec`, SI."""
+    """Flight condition that an effect sees at one stage of the integrator. Vectors are `Vec`; SI units."""
 
     position: Vec
-    """Centre of gravity, world."""
+    """Position of the centre of gravity, world."""
     velocity: Vec
-    """Of the centre of gravity, world."""
+    """Velocity of the centre of gravity, world."""
     velocity_body: Vec
-    """Of the rotors' centre, body axes."""
+    """Velocity of the rotors' centre, body axes."""
     airspeed_body: Vec
-    """Of the rotors' centre through the air, body axes: `velocity_body` less the air's own velocity there."""
+    """Velocity of the rotors' centre through the air, body axes: `velocity_body` minus that of the air there."""
     quaternion: Vec
     body_rate: Vec
     rotor_speed: Vec
     parameters: Parameters
-    """With what effects change in them; `Vec` in place of arrays."""
+    """Parameters after the changes of all effects, with `Vec` in place of arrays."""
     memory: Memory = ()
-    """Of the effect that is asked."""
+    """Memory of the effect that receives this condition."""
     loads: RotorLoads | None = None
-    """Of the rotors, all effects on them included; only `Effect.body` is told."""
+    """Loads of the rotors, including all effects on them; only `Effect.body` receives them."""
 
 
 class Wrench(eqx.Module):
-    """Force and torque on the body, body axes, about the centre of the rotors: N and N m."""
+    """Force [N] and torque about the rotors' centre [N m] on the body, body axes."""
 
     force: Vec
     torque: Vec
 
 
 class Motors(eqx.Module):
-    """What each motor does during one step."""
+    """Response of each motor during one step."""
 
     target: Vec
-    """Steady rotor speed the command leads to, rad/s."""
+    """Steady rotor speed for the current command, rad/s."""
     time_constant: Vec
-    """Lag towards it, s."""
+    """Time constant of the lag towards `target`, s."""
 
 
 class Reading(eqx.Module):
-    """What a log says about hidden conditions at one row, beside the state."""
+    """Measurements in one row of a log that concern hidden states, beside the state of the drone."""
 
     voltage: Array
-    """Of the battery under load, V; NaN where unknown."""
+    """Battery voltage under load, V; NaN if unknown."""
     time: Array
-    """Since the log began, s."""
+    """Time since the log began, s."""
 
 
 class Effect(eqx.Module):
-    """One physical effect. Subclasses hold their parameters as fields and override what they change.
+    """One physical effect. Subclasses hold its parameters as fields and override the functions of what it changes.
 
-    Every subclass sets ``name`` (DESIGN names), ``units`` (per field), ``source``, ``prior`` (per field, the plausible
-    range as low and high: where a search looks), ``limits`` (per field, what can be at all and what is usual) and has a
-    ``neutral()`` at which it vanishes. For tracing it says which fields measure its
-    strength (``strengths``; the others describe its shape), at which values it is looked for first (``probes``) and
-    whether a search looks for it at all or only who names it gets it fitted (``searched``).
+    Every subclass defines ``name``, ``units`` (per field), ``source``, ``prior`` (per field, the plausible range (low,
+    high) in which a search looks), ``limits`` (per field, the possible and the usual range) and ``neutral()``, the
+    values at which the effect vanishes.
+
+    For the search it also defines ``strengths``, the fields that measure how strong the effect is (all other fields
+    describe its shape), ``probes``, the values of the shape at which the search first looks for the effect, and
+    ``searched``: if False, the effect is fitted only where the user names it.
     """
 
     name: ClassVar[str]
     meaning: ClassVar[str] = ""
-    """What it is, half a sentence for reports; by default the docstring's first paragraph, which documents it there."""
+    """The effect in half a sentence, for reports; default: the first paragraph of the docstring."""
     experiment: ClassVar[str] = ""
-    """Flights that tell about it, for reports; by default those that excite it."""
+    """Flights that reveal the effect, for reports; default: flights that excite it."""
     coarse: ClassVar[dict[int, float]] = {}
-    """Probes, by their number, at which the slope at zero says little of the strength: each with the share of the prior
-    range at which the effect is looked for there."""
+    """Probes, by index, at which the derivative at zero strength says little about the strength. The value is the
+    finite-difference step that the search uses there, as a share of the prior range."""
     units: ClassVar[dict[str, str]]
     source: ClassVar[str] = "not given"
     prior: ClassVar[dict[str, tuple[float, float]]]
@@ -94,16 +97,18 @@ class Effect(eqx.Module):
     probes: ClassVar[tuple[dict[str, float], ...]] = ({},)
     searched: ClassVar[bool] = True
     assumed: ClassVar[tuple[str, ...]] = ()
-    """Fields that no flight tells: whoever fits leaves them as they are given."""
+    """Fields that no flight determines; fits leave them as given."""
     said_by: ClassVar[dict[str, str]] = {}
-    """Fields that say what another effect says, with its name: beside that one whoever fits leaves them as given."""
+    """Fields that do the same as another effect, with the name of that effect. Together with it, fits leave them as
+    given."""
     rank: ClassVar[int] = 0
-    """Which of two effects acts first where the second sees what the first leaves; by their names where it is equal.
+    """Order in which effects act, if one uses the result of another: lower ranks first, equal ranks sorted by name.
 
-    The order of a model's list means nothing. Below `INERTIAL`, effects on the body only add to the wrench.
+    The order of a model's list of effects has no influence. On the body, effects below `INERTIAL` only add to the
+    wrench.
     """
     feels_air: ClassVar[bool] = False
-    """Whether it depends on `Condition.airspeed_body`."""
+    """Whether the effect depends on `Condition.airspeed_body`."""
 
     def __check_init__(self):
         for field, limits in self.limits.items():
@@ -111,32 +116,36 @@ class Effect(eqx.Module):
 
     @classmethod
     def neutral(cls) -> Effect:
-        """The effect at the values where it vanishes."""
-        raise TypeError(f"{cls.__name__} must say at which values it vanishes")
+        """Return the effect at the values where it vanishes."""
+        raise TypeError(f"{cls.__name__} must define neutral(), which returns the effect at values where it vanishes")
 
     @classmethod
     def migrated(cls, values: Mapping[str, Any], parameters: Parameters | None) -> Mapping[str, Any]:
-        """What a model file of an earlier version says, in today's fields; ``parameters`` are the file's own.
+        """Translate the fields of an earlier version's model file into the present fields.
+
+        Args:
+            values: fields as the file gives them.
+            parameters: parameters of the same file.
 
         Raises:
-            CfbError: it cannot be said; what to write instead.
+            CfbError: a field cannot be translated; the message says what to write instead.
         """
         return values
 
     def change(self, parameters: Parameters) -> Parameters:
-        """Change the drone itself, once per rollout."""
+        """Change the parameters of the drone, once per rollout."""
         return parameters
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
-        """Memory after a long steady flight at ``rotor_speed``."""
+        """Return the memory after a long steady flight at ``rotor_speed`` [rad/s]."""
         return ()
 
     def begin(self, rotor_speed: Vec, parameters: Parameters, dt: float) -> Memory:
-        """`start` of a flight in steps of ``dt`` seconds, where those decide how much there is to remember."""
+        """`start` for a flight in steps of ``dt`` seconds, for memories whose size depends on the step."""
         return self.start(rotor_speed, parameters)
 
     def sense(self, memory: Memory, reading: Reading) -> Memory:
-        """Take over what a log measured of the hidden state."""
+        """Update the memory with what a log measured of the hidden state."""
         return memory
 
     def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
@@ -146,18 +155,18 @@ class Effect(eqx.Module):
     def motors(
         self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
     ) -> tuple[Motors, Memory]:
-        """Change how the motors answer, from ``rotor_speed`` on."""
+        """Change the response of the motors in a step that begins at ``rotor_speed`` [rad/s]."""
         return motors, memory
 
     def air(self, condition: Condition) -> Vec:
-        """Velocity of the air at the drone, world, that this effect brings about; the air of all effects adds up.
+        """Velocity of the air that this effect causes at the drone, world, m/s. The velocities of all effects add up.
 
-        In ``condition`` the air is taken to be still.
+        ``condition`` is computed in still air.
         """
         return Vec(0.0, 0.0, 0.0)
 
     def rotors(self, loads: RotorLoads, condition: Condition) -> RotorLoads:
-        """Change thrust and torque rotor by rotor."""
+        """Change thrust and torque of each rotor."""
         return loads
 
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
@@ -165,22 +174,22 @@ class Effect(eqx.Module):
         return wrench
 
     def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
-        """Memory after ``dt`` seconds that began in ``condition`` with this acceleration (world, m/s^2)."""
+        """Memory after a step of ``dt`` seconds that began in ``condition`` with this acceleration (world, m/s^2)."""
         return condition.memory
 
     def follow(self, condition: Condition, acceleration: Vec, missed: Vec, dt: Any) -> Memory:
-        """`advance` beside a log, where ``acceleration`` was measured.
+        """`advance` along a log, where ``acceleration`` was measured.
 
-        ``missed`` is how much of it the model does not say: it tells how far off the memory is.
+        ``missed`` is the part of it that the model does not explain; an effect may correct its memory with it.
         """
         return self.advance(condition, acceleration, dt)
 
 
 def in_order(effects: Sequence[Effect]) -> list[int]:
-    """Positions of effects in the order in which they act, whatever the order they are listed in."""
+    """Indices of effects in the order in which they act, whatever their order in the list."""
     return sorted(range(len(effects)), key=lambda i: (type(effects[i]).rank, type(effects[i]).name))
 
 
 def overrides(effect: Effect, hook: str) -> bool:
-    """Whether the effect does anything in one of the functions above."""
+    """Whether an effect overrides one of the functions of `Effect`."""
     return getattr(type(effect), hook) is not getattr(Effect, hook)

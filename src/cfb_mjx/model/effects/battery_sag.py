@@ -1,22 +1,23 @@
-"""Battery sag: the same command turns the rotors slower on a weaker battery.
+"""Battery sag: at the same command the rotors turn slower on a weaker battery.
 
     steady rotor speed *= 1 + level + slope (V - 3.7 V) / 3.7 V
 
-Slope 1 is a motor whose speed is proportional to the voltage, 0 one whose controller makes up for it. V is the
-battery's voltage through a first-order filter of time constant ``lag``: with a short one the rotors feel every dip
-under load, with a long one they answer to how empty the battery is.
+Slope 1 describes a motor whose speed is proportional to the voltage, slope 0 a controller that compensates for it. V is
+the battery's voltage behind a first-order filter with time constant ``lag``. With a short lag the rotors follow every
+dip under load, with a long one only the state of charge.
 
-In simulation the voltage is that of a cell with a state of charge s, an open-circuit voltage E and a resistance R:
+In simulation V is the voltage of a cell with state of charge s, open-circuit voltage E and resistance R:
 
     E(s) = 3.685 + 0.2156 s - 0.1178 s^2 + 0.3201 s^3 - 1.031 exp(-35 s)
     E - R i = P / i,   P = power mean_j((Omega_j / 1594 rad/s)^3),   capacity s' = -i
 
-with the current i and the power P the rotors take, which grows with the cube of their speed. A cell gives E^2 / (4 R)
-at most; asked for more it stays at E / 2. An empty one (s = 0) has 2.65 V and stays empty.
+where i is the current and P the power of the rotors, which grows with the cube of their speed. A cell gives at most
+E^2 / (4 R); if more power is asked for, it stays at E / 2. An empty cell (s = 0) has 2.65 V and stays empty.
 
-Beside a log V is what was read there: the first reading is taken as it is, unknown ones are passed over, and between
-readings V stays, in predictions that start from the log too. Where a log reads no voltage V is 3.7 V: nobody knows how
-full that battery was. Remembered are V, when it was last read, s, and whether no log has been asked yet.
+Along a log V follows the readings of the log. The first reading is taken unfiltered, unknown readings are skipped, and
+V is constant between readings, also in predictions that start from the log. If a log has no voltage, V is 3.7 V,
+because the charge of that battery is unknown. The memory holds V, the time of the last reading, s, and whether the
+flight is a simulation (no log has been read yet).
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 NOMINAL_VOLTAGE = 3.7
-"""Of one lithium-polymer cell, V: half full, under the load of hover."""
+"""Voltage of one lithium-polymer cell that is half full, at the load of hover, V."""
 _LONG_AGO = 1000.0  # s
 
 
@@ -77,9 +78,9 @@ class BatterySag(Effect):
         "power": Limits(0.0, 1000.0, 1.0, 30.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("level", "slope")
-    # Beside a log the voltage is what was read.
+    # Along a log the readings take the place of the cell.
     assumed: ClassVar[tuple[str, ...]] = ("charge", "capacity", "resistance", "power")
-    # All gains of the motors times the same number.
+    # The level scales the gains of all motors by one factor.
     said_by: ClassVar[dict[str, str]] = {"level": "motor_gain_mismatch"}
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"lag": 0.02}, {"lag": 0.5})
 
@@ -88,16 +89,16 @@ class BatterySag(Effect):
     slope: Float[Array, "*batch"] = eqx.field(converter=number)
     """Relative change of speed per relative change of voltage."""
     lag: Float[Array, "*batch"] = eqx.field(converter=number, default=0.02)
-    """Of what the rotors feel behind the battery's voltage, s."""
+    """Time constant of the filter on the battery's voltage, s."""
     charge: Float[Array, "*batch"] = eqx.field(converter=number, default=0.5)
-    """State of charge where a simulation begins: 1 full, 0 empty."""
+    """State of charge at the start of a simulation: 1 full, 0 empty."""
     capacity: Float[Array, "*batch"] = eqx.field(converter=number, default=1260.0)
-    """Charge of a full cell: 350 mAh, the drone's own battery."""
+    """Charge of a full cell, A s; default: 350 mAh, the drone's own battery."""
     resistance: Float[Array, "*batch"] = eqx.field(converter=number, default=0.05)
-    """Of cell, plug and wires: a drone of the IDSIA nano-drone benchmark shows 0.1 V of dip at the power of hover."""
+    """Resistance of cell, plug and wires, ohm: a drone of the IDSIA nano-drone benchmark dips by 0.1 V in hover."""
     power: Float[Array, "*batch"] = eqx.field(converter=number, default=7.0)
-    """Of the four rotors at 1594 rad/s: 0.43 N at a torque of 5.7 mm times the thrust (firmware, platform CF21BL) are
-    3.9 W at the shafts, of motors and controllers with an efficiency of 55 %."""
+    """Power of the four rotors at 1594 rad/s, W. The default is 3.9 W at the shafts (0.43 N at a torque of 5.7 mm times
+    the thrust: firmware, platform CF21BL) at an efficiency of motors and controllers of 55 %."""
 
     @classmethod
     def neutral(cls) -> BatterySag:
@@ -110,7 +111,7 @@ class BatterySag(Effect):
         return Vec(voltage), Vec(jnp.full_like(one, -_LONG_AGO)), Vec(full), Vec(jnp.ones_like(one))
 
     def loaded(self, charge: Any, rotor_speed: Vec) -> tuple[Any, Any]:
-        """Voltage [V] and current [A] of a cell that drives the rotors at these speeds."""
+        """Voltage [V] and current [A] of a cell that drives the rotors at the given speeds."""
         open_ = 3.685 + charge * (0.2156 + charge * (-0.1178 + charge * 0.3201)) - 1.031 * jnp.exp(-35 * charge)
         power = 0.25 * self.power * (rotor_speed * (1 / HOVER_SPEED)).map(lambda x: x * x * x).sum()
         left = open_ * open_ - 4 * self.resistance * power
@@ -123,7 +124,7 @@ class BatterySag(Effect):
         voltage = jnp.where(alone > 0, NOMINAL_VOLTAGE, voltage).astype(voltage.dtype)
         now = jnp.asarray(reading.time, time.dtype)
         known = jnp.isfinite(reading.voltage)
-        # Not multiplied by the unknown: NaN would come through any weight, and through the derivative.
+        # Selected, not weighted: NaN passes through any weight, and through the derivative.
         measured = jnp.where(known, reading.voltage, voltage).astype(voltage.dtype)
         kept = jnp.exp(-jnp.maximum(now - time, 0.0) / self.lag)
         felt = measured + (voltage - measured) * kept

@@ -1,17 +1,18 @@
-"""Hub moments of rotors moved along their discs: the advancing blade lifts more than the retreating one.
+"""Hub moments of rotors that move along their discs: the advancing blade lifts more than the retreating one.
 
-The disc tilts or, on stiff blades, the hub is twisted:
+The disc tilts or, if the blades are stiff, the hub is twisted:
 
     tau_x = c (-(1 - anisotropy) exp(climb_y v_z) v_y + cross v_x)
     tau_y = c ((1 + anisotropy) exp(climb_x v_z) v_x + cross v_y)
     c = coefficient (Omega / 1594 rad/s)^power exp(fading |v_xy|)
 
-with v the velocity through the air, in body axes, and the mean rotor speed. The sign is free, because stiffness and the
-height of the discs over the rotors' centre pull in opposite directions. ``climb`` lets the moments depend on the flow
-through the discs, without ever turning them round. With ``anisotropy`` flow along the body twists it more than flow
-from the side, for what sits between the rotors (battery, decks) is longer than wide. A disc flaps late, and so its
-moment is turned, the way it spins: over four rotors that cancels but for what makes them unequal, and is ``cross``.
-Where the wake is blown away the moment grows less than in proportion: ``fading`` is below zero.
+where v is the velocity through the air in body axes and Omega the mean rotor speed. The sign is free, because stiffness
+and the height of the discs above the rotors' centre have opposite effects. ``climb`` makes the moments depend on the
+flow through the discs, without ever changing their sign. ``anisotropy`` makes the moment of flow along the body larger
+than that of flow from the side, because the parts between the rotors (battery, decks) are longer than wide. A disc
+responds late, which turns its moment in its direction of rotation. Over four rotors this cancels up to the differences
+between them; ``cross`` is what remains. ``fading`` is negative where the wake is blown away and the moment grows less
+than in proportion to the speed.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.limits import Limits
 
 STILL = 0.01
-"""m/s: a drone at rest in the air moves so fast along its discs, that its speed there has a slope."""
+"""Speed that is added to the speed along the discs (root of the sum of squares), so that it is differentiable at rest,
+m/s."""
 
 
 class BladeFlapping(Effect):
@@ -70,21 +72,21 @@ class BladeFlapping(Effect):
     }
     strengths: ClassVar[tuple[str, ...]] = ("coefficient",)
     feels_air: ClassVar[bool] = True
-    # All are looked for at zero, the power at theory's, and fitted once the moment is there.
+    # The search starts at zero, with the power of blade theory, and fits all of them once the moment is found.
     probes: ClassVar[tuple[dict[str, float], ...]] = (
         {"climb": 0.0, "anisotropy": 0.0, "power": 1.0, "cross": 0.0, "fading": 0.0},
     )
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of the four rotors together at hover speed."""
+    """Moment per velocity of the four rotors together at hover speed."""
     climb: Float[Array, "*batch 2"] = eqx.field(converter=vector(2))
-    """Relative change per velocity along body z of the moments that motion along body x and y brings about."""
+    """Relative change, per velocity along body z, of the moments due to motion along body x and y."""
     anisotropy: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
-    """By which share pitching moments exceed, and rolling moments fall short of, their mean."""
+    """Share by which pitching moments exceed, and rolling moments fall short of, their mean."""
     power: Float[Array, "*batch"] = eqx.field(converter=number, default=1.0)
-    """Of the mean rotor speed: 1 as blade theory has it at a fixed pitch, 2 in proportion to thrust."""
+    """Exponent of the mean rotor speed: 1 in blade theory at fixed pitch, 2 if proportional to thrust."""
     cross: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
-    """Moment about the direction of motion over the moment across it."""
+    """Ratio of the moment about the direction of motion to the moment across it."""
     fading: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
     """Relative change of the moments per airspeed along the discs."""
 

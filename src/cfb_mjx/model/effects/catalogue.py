@@ -1,4 +1,4 @@
-"""Every effect by name: shipped ones, one line each here, and those from outside (`register`, `cfb_mjx.plugins`)."""
+"""All effects by name: those of the library, one line each, and those of users (`register`, `cfb_mjx.plugins`)."""
 
 from __future__ import annotations
 
@@ -96,11 +96,11 @@ _PHYSICS: dict[str, type[Effect]] = {
 
 _SHIPPED = _PHYSICS | {kind.name: kind for kind in (ResidualFormula, RegressionDilution)}
 COMMAND_LEAD = "command_lead"
-"""What a search calls a nuisance of logs: no effect's name."""
+"""Name that the search gives to a nuisance parameter of logs; no effect may have it."""
 
 
 class Kinds(Mapping[str, type[Effect]]):
-    """Effects by name, as they are now: shipped ones first, then those from outside. To add one: `register`."""
+    """All effects by name at the moment of the call: the library's first, then those added with `register`."""
 
     def __init__(self, shipped: Mapping[str, type[Effect]]):
         self._shipped = shipped
@@ -120,15 +120,15 @@ class Kinds(Mapping[str, type[Effect]]):
 
 CATALOGUE = Kinds(_PHYSICS)
 KNOWN = Kinds(_SHIPPED)
-"""What a model file may name: the catalogue; formulas, which a search turns to only when it fails; and what predictors
-do instead of physics."""
+"""Effects that a model file may name: the catalogue, formulas (which a search tries only after it has found no effect),
+and the statistical correction of predictors."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SensorFault:
-    """One thing that can be wrong with a recording.
+    """A fault of a recording: its parameter in a model file, the unit and the value of a healthy sensor.
 
-    Its parameter in a model file, unit and value when healthy; what it is, and flights that tell about it.
+    ``meaning`` and ``experiment`` say what it is and which flights reveal it.
     """
 
     parameter: str
@@ -163,29 +163,29 @@ SENSOR_FAULTS: dict[str, SensorFault] = {
         "sharp command steps with rotor speed logged",
     ),
 }
-"""What a model file may name beside physics: it changes what is recorded, not how the drone flies."""
+"""Faults that a model file may name beside effects: they change the recording, not the flight."""
 
 
 def effect_from_mapping(item: Mapping[str, Any], where: str, parameters: Parameters | None = None) -> Effect:
-    """Build an effect from ``{name, parameters}`` as written in a model YAML; what is left out is neutral.
+    """Build an effect from ``{name, parameters}`` as in a model YAML; missing parameters are neutral.
 
     Args:
         item: the mapping.
-        where: the file, for errors.
-        parameters: of the same file, where there are any: fields of earlier versions may need them.
+        where: the file, for messages.
+        parameters: parameters of the same file, needed to translate fields of some earlier versions.
 
     Raises:
-        CfbError: unknown effect, unknown parameter or a value that is no number or cannot be, named; ``where`` is the
-            file.
+        CfbError: an unknown effect or parameter, or a value that is not a number or outside its limits. The message
+            names it and ``where``.
 
     Warns:
-        CfbWarning: values that are possible but unusual, named alike.
+        CfbWarning: a value that is possible but unusual.
     """
     name = item.get("name")
     if not isinstance(name, str) or name not in KNOWN:
         known = ", ".join(sorted([*KNOWN, *SENSOR_FAULTS]))
         said = f"{where}: unknown effect {told(name)}; known are {known}"
-        raise CfbError(f"{said}; one of your own needs --plugin FILE.py.")
+        raise CfbError(f"{said}; load an effect of your own with --plugin FILE.py.")
     kind = KNOWN[name]
     fields = {field.name for field in dataclasses.fields(kind)}
     values = item.get("parameters") or {}
@@ -219,7 +219,7 @@ def effect_from_mapping(item: Mapping[str, Any], where: str, parameters: Paramet
 
 
 def _numbers(raw: Any, shape: tuple[int, ...]) -> np.ndarray | None:
-    """What is written of a field, one number or all of ``shape`` (null: NaN); None if it is neither."""
+    """The value of a field, one number or ``shape`` numbers (null becomes NaN); None if it is neither."""
     try:
         value = np.asarray(raw, dtype=np.float64)
     except (TypeError, ValueError):
@@ -228,9 +228,9 @@ def _numbers(raw: Any, shape: tuple[int, ...]) -> np.ndarray | None:
 
 
 def _check_widths(item: Mapping[str, Any], what: str, neutral: Effect, where: str) -> None:
-    """Refuse standard deviations of an effect's fields that are none; null where one is not known.
+    """Refuse standard deviations that do not fit the fields of an effect. null means unknown.
 
-    An ``uncertainty`` may be of a field of an earlier version, for nothing is drawn from it.
+    An ``uncertainty`` may belong to a field of an earlier version, because nothing is drawn from it.
     """
     widths, at = item.get(what), f"effects.{neutral.name}.{what}"
     if widths is None:
@@ -251,28 +251,28 @@ def _check_widths(item: Mapping[str, Any], what: str, neutral: Effect, where: st
 
 
 def effect_to_mapping(effect: Effect) -> dict[str, Any]:
-    """The inverse of `effect_from_mapping`."""
+    """Write an effect as ``{name, parameters, source}``; the inverse of `effect_from_mapping`."""
     values = {field.name: np.asarray(getattr(effect, field.name)).tolist() for field in dataclasses.fields(effect)}
     return {"name": effect.name, "parameters": values, "source": effect.source}
 
 
 def register(kind: Any) -> Any:
-    """Make an effect of your own known: to model files, fits, the search, reports and trainings. Also a decorator.
+    """Register an effect of your own for model files, fits, the search, reports and training. Also a decorator.
 
-    Known until the process ends, or the block of `cfb_mjx.plugins.plugged` around it. A class defined anew, as by a
-    notebook's cell that runs again, replaces itself.
+    It stays registered until the process ends, or until the surrounding block of `cfb_mjx.plugins.plugged` ends. A
+    class that is defined again, as in a notebook cell that runs twice, replaces itself.
 
     Args:
-        kind: the class.
+        kind: the class, derived from `Effect`.
 
     Returns:
         The class.
 
     Raises:
-        CfbError: it lacks something, said in a sentence, or its name is taken.
+        CfbError: the class is incomplete, or its name is taken.
     """
     if not (isinstance(kind, type) and issubclass(kind, Effect)):
-        raise CfbError(f"{kind!r} is no effect; register a class derived from cfb_mjx.model.Effect.")
+        raise CfbError(f"{kind!r} is not an effect; register a class derived from cfb_mjx.model.Effect.")
     if (complaint := _complaint(kind)) is not None:
         raise CfbError(f"effect {kind.__qualname__}: {complaint}.")
     plugins.add(kind.name, kind)
@@ -280,48 +280,48 @@ def register(kind: Any) -> Any:
 
 
 def written(name: str) -> str:
-    """Hash of the text that defines an effect: what was begun with another one must not be gone on with."""
+    """Hash of the source that defines an effect; a run that was begun with another source must not be resumed."""
     kind = KNOWN[name]
     try:
         text = inspect.getsource(sys.modules[kind.__module__])
-    except (OSError, TypeError, KeyError):  # typed into a shell
+    except (OSError, TypeError, KeyError):  # defined in an interactive shell
         text = kind.__qualname__
     return sha256(text.encode()).hexdigest()
 
 
 def outside(name: str) -> bool:
-    """Whether an effect is not the library's own."""
+    """Whether an effect is not part of the library."""
     return name not in _SHIPPED
 
 
 def _take(found: object) -> None:
-    """Register what an entry point names or a file holds."""
+    """Register the effect of an entry point, or all effects of a module."""
     if not isinstance(found, ModuleType):
         register(found)
         return
     shipped = {Effect, *_SHIPPED.values()}
     kinds = [v for v in vars(found).values() if isinstance(v, type) and issubclass(v, Effect) and v not in shipped]
-    # Others derive from it: what they share, and no effect itself.
+    # Base classes that others derive from are not effects themselves.
     kinds = [kind for kind in kinds if "name" in vars(kind) or not kind.__subclasses__()]
     if not kinds:
-        raise CfbError("defines no effect, a class derived from cfb_mjx.model.Effect.")
+        raise CfbError("defines no effect (a class derived from cfb_mjx.model.Effect).")
     for kind in kinds:
         register(kind)
 
 
 def _complaint(kind: type[Effect]) -> str | None:
-    """What is missing or wrong about an effect from outside."""
+    """What is missing or wrong in a user's effect; None if nothing is."""
     name = getattr(kind, "name", None)
     if not isinstance(name, str) or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
-        return f"'name' must be a word of small letters, digits and underscores, found {name!r}"
+        return f"'name' must consist of lower-case letters, digits and underscores, found {name!r}"
     shipped = {key: each.__name__ for key, each in _SHIPPED.items()} | {COMMAND_LEAD: "the search"}
     if (owner := (shipped | dict.fromkeys(SENSOR_FAULTS, "a sensor fault")).get(name)) is not None:
-        return f"{owner} has the name {name!r} already"
+        return f"the name {name!r} is taken by {owner}; choose another"
     fields = [item.name for item in dataclasses.fields(kind)]
     for attribute in ("units", "prior"):
         given = getattr(kind, attribute, None)
         if not isinstance(given, Mapping) or set(given) != set(fields):
-            return f"'{attribute}' must say something of each field ({', '.join(fields)}), found {given!r}"
+            return f"'{attribute}' must have an entry for each field ({', '.join(fields)}), found {given!r}"
     for field, span in kind.prior.items():
         if not (np.shape(span) == (2,) and np.all(np.isfinite(span)) and span[0] < span[1]):
             return f"'prior' of {field} must be two numbers, low and high, found {span!r}"
@@ -330,9 +330,9 @@ def _complaint(kind: type[Effect]) -> str | None:
         return f"'strengths' must be a tuple of the fields that are zero at neutral, found {strengths!r}"
     shape = set(fields) - set(strengths)
     if not kind.probes or not all(isinstance(p, Mapping) and set(p) <= shape for p in kind.probes):
-        return f"'probes' must be a tuple of mappings that give values to fields of the shape, found {kind.probes!r}"
+        return f"'probes' must be a tuple of mappings that set fields other than strengths, found {kind.probes!r}"
     if not set(kind.coarse) <= set(range(len(kind.probes))):
-        return f"'coarse' must number probes, from 0, found {kind.coarse!r}"
+        return f"the keys of 'coarse' must be indices of probes, from 0, found {kind.coarse!r}"
     return _complaint_about_neutral(kind)
 
 
@@ -342,7 +342,7 @@ def _complaint_about_neutral(kind: type[Effect]) -> str | None:
     if not any(getattr(kind, hook) is not getattr(Effect, hook) for hook in changing):
         return f"it changes nothing; override one of {', '.join(changing)}"
     if kind.neutral.__func__ is Effect.neutral.__func__:
-        return "'neutral' is missing, a classmethod that returns the effect at the values where it vanishes"
+        return "'neutral' is missing: a classmethod that returns the effect at the values where it vanishes"
     neutral = kind.neutral()
     if type(neutral) is not kind:
         return f"'neutral' must return a {kind.__name__}, found {neutral!r}"
@@ -354,5 +354,5 @@ def _complaint_about_neutral(kind: type[Effect]) -> str | None:
                 f"'vector' of cfb_mjx.model.effects.fields make it, found {value!r}"
             )
         if field in kind.strengths and (np.any(np.asarray(value) != 0) or not low <= 0 <= high):
-            return f"strength {field} must be zero at neutral, and its prior hold zero, found {value}, {low} to {high}"
+            return f"strength {field} must be zero at neutral, and its prior contain 0, found {value}, {low} to {high}"
     return None

@@ -1,4 +1,4 @@
-"""Centre of gravity beside the rotors' centre: shifted by the offset along body x and y, on top of the model's own."""
+"""Centre of gravity shifted against the rotors' centre along body x and y, in addition to the model's own offset."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class CogOffset(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("offset",)
 
     offset: Float[Array, "*batch 2"] = eqx.field(converter=vector(2))
-    """Along body x and y."""
+    """Shift along body x and y."""
 
     @classmethod
     def neutral(cls) -> CogOffset:

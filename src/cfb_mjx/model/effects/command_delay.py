@@ -1,13 +1,12 @@
 """Commands act late, by a constant dead time: u(t) -> u(t - delay).
 
-Commands are held between rows, so the delayed command of one step is piecewise constant; what the motors receive is its
-exact mean over the step. Each command's weight is the overlap of the interval in which it was held with [t - delay,
-t - delay + dt], divided by dt: any fraction of a step is possible, and the derivative by the delay exists.
+Commands are held between rows, so the delayed command is piecewise constant within a step. The motors receive its exact
+mean over the step: the weight of each command is the overlap of the interval in which it was held with [t - delay,
+t - delay + dt], divided by dt. The delay may be any fraction of a step, and the derivative with respect to it exists.
 
-Remembered are the last commands and how long ago each began. There are as many as the longest delay of the effect's
-range needs at the model's integration step, and no fewer than eight. Where steps are shorter than that, as between the
-rows of a log, commands that together lasted less than the seventh (or what that number is) part of the delay are
-remembered as their mean: whatever the steps, the delay is what it says.
+The memory holds the last commands and their ages. Their number is what the longest delay of the effect's range needs at
+the model's integration step, but at least eight. If the steps are shorter, as between the rows of a log, commands that
+together lasted less than delay / (number - 1) are stored as their mean, so that the memory always covers the delay.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 ROWS = 8
-"""Least number of commands remembered."""
+"""Smallest number of commands in the memory."""
 
 
 class CommandDelay(Effect):
@@ -49,7 +48,7 @@ class CommandDelay(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("delay",)
 
     delay: Float[Array, "*batch"] = eqx.field(converter=number)
-    """From when a command is given to when the motors receive it; zero or positive."""
+    """Time between a command and its arrival at the motors; zero or positive."""
 
     @classmethod
     def neutral(cls) -> CommandDelay:
@@ -67,7 +66,7 @@ class CommandDelay(Effect):
     def _steady(self, rotor_speed: Vec, parameters: Parameters, rows: int) -> Memory:
         steady = command_before(rotor_speed, parameters)
         age = jnp.zeros_like(rotor_speed[0])
-        # Commands that began at the same instant had no time to act, save the oldest, which has acted for ever.
+        # Equal ages: all but the oldest command have lasted no time, and the oldest has acted for ever.
         return Vec(*(age,) * rows), *(steady,) * rows
 
     def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
@@ -76,11 +75,11 @@ class CommandDelay(Effect):
         inverse = 1 / jnp.where(held, dt, 1.0)
 
         def before(age):
-            """Share of the step in which commands that began up to ``age`` seconds ago have not arrived yet."""
+            """Share of the step in which commands that began at most ``age`` seconds ago have not arrived yet."""
             late = self.delay - age
-            # Comparisons instead of clip: at a delay of zero the derivative is that of a growing delay.
+            # Comparisons, not clip: at zero delay the derivative is the one towards positive delays.
             part = jnp.where(late < 0, 0.0, jnp.where(late * inverse < 1, late * inverse, 1.0))
-            # In a step without duration the command is the one that is active at its instant.
+            # A step of zero length has the command that is active at its instant.
             return jnp.where(held, part, jnp.where(late > 0, 1.0, 0.0))
 
         received, newer = command, command
@@ -88,8 +87,8 @@ class CommandDelay(Effect):
             received = received + (older - newer) * before(age)
             newer = older
 
-        # A row of its own, if the newest one has lasted long enough: rows this long reach as far back as the delay.
-        # Else both as their mean. A step without duration changes nothing.
+        # The newest command gets a row of its own if the row before it has lasted long enough: rows of this length
+        # reach back as far as the delay. Otherwise both become their mean. A step of zero length changes nothing.
         own = ages[0] >= self.delay / (len(earlier) - 1) * (1 - 1e-3)
         lasted = ages[0] + dt
         share = dt / jnp.where(lasted > 0, lasted, 1.0)

@@ -1,10 +1,10 @@
-"""A speed controller that limits how fast it follows: its output, |du/dt| <= 1 / slowness, or the rotor.
+"""A motor controller with a rate limit, on its output, |du/dt| <= 1 / slowness, or on the speed of the rotor.
 
-With ``rotor`` = 0 the output runs towards the command at that rate and stops there. What the motors receive in a step
-is the exact mean of this ramp; remembered is where it ended. With ``rotor`` = 1 it is the rotor's acceleration that is
-limited, as by a limit of the motor's current: |dOmega/dt| <= K / slowness. Values between divide the slowness. It is
-given as the time from zero to full output, so that zero is no limit; the mean makes the effect grow from there with a
-slope, where the end of the ramp alone would show nothing until the limit is slower than a step.
+With ``rotor`` = 0 the output moves towards the command at most at that rate. The motors receive the exact mean of this
+ramp over a step; the memory holds its end. With ``rotor`` = 1 the acceleration of the rotor is limited, as by a limit
+of the motor's current: |dOmega/dt| <= K / slowness. Values between divide the slowness between the two. The slowness is
+the time from zero to full output, so that zero is no limit. Because of the mean, the effect has a derivative at zero;
+the end of the ramp alone would not change until the limit is slower than a step.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class EscRateLimit(Effect):
     experiment: ClassVar[str] = (
         "command steps of several sizes, rotor speed logged: a limit shows in the large ones only"
     )
-    # No rotor comes near the limits that are tried for commands.
+    # No rotor reaches the rates that are tried as limits of the command.
     coarse: ClassVar[dict[int, float]] = {1: 0.8}
     units: ClassVar[dict[str, str]] = {"slowness": "s", "rotor": "1"}
     source: ClassVar[str] = (
@@ -42,7 +42,7 @@ class EscRateLimit(Effect):
         "rotor": Limits(0.0, 1.0, 0.0, 1.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("slowness",)
-    # Of commands that have arrived, and of a rotor with all its lags.
+    # After delay and hysteresis of the commands, and after all lags of the rotor.
     rank: ClassVar[int] = 3
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"rotor": 0.0}, {"rotor": 1.0})
 
@@ -57,7 +57,7 @@ class EscRateLimit(Effect):
 
     @property
     def _slowness(self) -> Array:
-        # Comparison instead of maximum: at zero the derivative is that of a growing slowness.
+        # Comparison, not maximum: at zero the derivative is the one towards positive slowness.
         return jnp.where(self.slowness >= 0, self.slowness, 0.0)
 
     def start(self, rotor_speed: Vec, parameters: Parameters) -> Memory:
@@ -88,7 +88,7 @@ class EscRateLimit(Effect):
         limits = parameters.motor_gain * (dt / jnp.where(limited, slowness, 1.0))
 
         def reached(target, speed, lag, limit):
-            # A target so far away that the rotor, lagging, comes as far in this step as the limit lets it.
+            # The target at which the lagging rotor comes in this step as far as the limit allows.
             share = -jnp.expm1(-dt / lag)
             furthest = limit / jnp.where(share > 0, share, 1.0)
             kept = speed + jnp.clip(target - speed, -furthest, furthest)

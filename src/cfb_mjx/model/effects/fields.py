@@ -1,4 +1,4 @@
-"""What the fields of effects are made of, and the drone's geometry that several effects share."""
+"""Converters for the fields of effects, and geometry of the drone that several effects share."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters.parameters import Parameters
 
 HOVER_SPEED = 1594.0
-"""Rotor speed at which coefficients that grow with rotor speed are given, rad/s: hover of the drone with guards."""
+"""Rotor speed, rad/s, at which coefficients that grow with rotor speed are given: hover of the drone with guards."""
 
 
 def number(value) -> Array:
-    """Converter of a field that is one number."""
+    """Convert a field that is one number."""
     return jnp.asarray(value, jnp.result_type(float))
 
 
 def vector(size: int) -> Callable[..., Array]:
-    """Converter of a field with ``size`` components; one number stands for all of them, leading axes are a batch."""
+    """Converter of a field with ``size`` components; a single number is used for all, leading axes are a batch."""
 
     def convert(value) -> Array:
         value = number(value)
@@ -32,7 +32,7 @@ def vector(size: int) -> Callable[..., Array]:
 
 
 def hub_positions(parameters: Parameters) -> tuple[Vec, Vec]:
-    """x and y of the four rotor hubs from their centre, body axes, m."""
+    """x and y of the four rotor hubs relative to their centre, body axes, m."""
     half = parameters.rotor_spacing / 2
     return half * Vec(*rotors.POSITION_SIGNS_X), half * Vec(*rotors.POSITION_SIGNS_Y)
 
@@ -40,7 +40,7 @@ def hub_positions(parameters: Parameters) -> tuple[Vec, Vec]:
 def hub_velocities(condition: Condition) -> tuple[Vec, Vec, Vec]:
     """Velocity of the four rotor hubs through the air, v + omega x r_i, by body axis, m/s.
 
-    The air is taken to move alike at all four.
+    The air is assumed to be the same at all four.
     """
     x, y = hub_positions(condition.parameters)
     (vx, vy, vz), (wx, wy, wz) = condition.airspeed_body, condition.body_rate

@@ -1,8 +1,8 @@
-"""A term found in the residual of flights that no known effect explains: a sum of products of signals.
+"""A formula for the residual of flights that no known effect explains: a sum of products of signals.
 
-Torque and force along each body axis are linear combinations of a fixed library of signals; forces that hang on the
-place (a tether, a wall) are combinations along the world's axes. Coefficients are found by sparse regression
-(`cfb_mjx.sysid.tracing.formula`) and printed with their units; a formula describes, it does not explain.
+Torque and force along each body axis are linear combinations of a fixed library of signals. Forces that depend on the
+place (a tether, a wall) are combinations along the world's axes. The coefficients are found by sparse regression
+(`cfb_mjx.sysid.tracing.formula`) and printed with their units. A formula is a description, not an explanation.
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ TERMS: dict[str, str] = (
     }
     | {p: "m" for p in _P}
 )
-"""Signals along the body's axes, with units: velocity v and rate w in body axes, rotor speeds n in units of hover (mean
+"""Signals along the body's axes, with units: velocity v and rate w in body axes, rotor speeds n relative to hover (mean
 above hover, and the patterns that roll, pitch and yaw the drone), position in the world."""
 PLACES: dict[str, str] = {"1": "1"} | {p: "m" for p in _P} | {f"{p}^2": "m^2" for p in _P}
-"""Signals of forces along the world's axes."""
+"""Signals of the forces along the world's axes, with units."""
 AXES = ("torque_x", "torque_y", "torque_z", "force_x", "force_y", "force_z")
 
 

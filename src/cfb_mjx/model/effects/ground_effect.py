@@ -2,10 +2,10 @@
 
     f_i *= 1 + strength (height^2 + d^2) / (height^2 + z_i^2),  d = 0.1 m
 
-with z_i the height of rotor i, from the position of the rotors' centre and the tilt; below the floor it counts as zero.
-Far up the gain falls as 1/z^2, as Cheeseman and Bennett's 1 / (1 - (R / 4 z)^2) does (there strength * (height^2 + d^2)
-= R^2 / 16); unlike theirs it stays finite at the floor. The strength is that at d, where drones do fly: the gain at the
-floor itself is an extrapolation no flight would tell.
+where z_i is the height of rotor i, from the position of the rotors' centre and the tilt; a height below the floor
+counts as zero. Far from the floor the gain falls as 1/z^2, as 1 / (1 - (R / 4 z)^2) of Cheeseman and Bennett does
+(there strength * (height^2 + d^2) = R^2 / 16); unlike theirs it is finite at the floor. The strength is the gain at
+height d, where drones do fly; the gain at the floor itself would be an extrapolation that no flight determines.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from cfb_mjx.model.vector import Vec, rotate
 from cfb_mjx.parameters.limits import Limits
 
 REFERENCE = 0.1
-"""Height of the rotors at which the strength is given, m."""
+"""Height of the rotors above the floor at which the strength is defined, m."""
 
 
 class GroundEffect(Effect):
@@ -43,14 +43,14 @@ class GroundEffect(Effect):
         "height": Limits(0.001, 10.0, 0.01, 1.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
-    # Of the thrust that the flow through the rotors leaves.
+    # Acts on the thrust after the effects of the flow through the rotors.
     rank: ClassVar[int] = 1
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"height": 0.05}, {"height": 0.12}, {"height": 0.25})
 
     strength: Float[Array, "*batch"] = eqx.field(converter=number)
     """Relative gain of thrust at `REFERENCE` above the floor."""
     height: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Height at which half of the gain at the floor is left."""
+    """Height at which half of the gain at the floor remains."""
 
     @classmethod
     def neutral(cls) -> GroundEffect:
@@ -61,7 +61,7 @@ class GroundEffect(Effect):
         w, x, y, z = condition.quaternion
         along, across = hub_positions(parameters)
         center = condition.position[2] - rotate(condition.quaternion, Vec.unstack(parameters.center_of_gravity))[2]
-        # The last row of the rotation matrix: how high a point beside the centre lies.
+        # The last row of the rotation matrix: height of a point relative to the centre.
         above = along * (2 * (x * z - w * y)) + across * (2 * (y * z + w * x)) + center
         return RotorLoads(loads.thrust * beside_surface(above, self.strength, self.height), loads.torque, loads.rate)
 
@@ -70,9 +70,9 @@ def beside_surface(distance: Vec, strength: Array, reach: Array) -> Vec:
     """Factors on the rotors' thrusts near a flat surface.
 
     Args:
-        distance: of every rotor, m; behind the surface it counts as zero.
+        distance: distance of every rotor, m; behind the surface it counts as zero.
         strength: relative gain at `REFERENCE`.
-        reach: distance at which half of the gain at the surface is left, m.
+        reach: distance at which half of the gain at the surface remains, m.
     """
     core = reach**2
     gain = strength * (core + REFERENCE**2)

@@ -1,14 +1,14 @@
-"""Gusts: air that wanders about its mean, alike everywhere, with the spectrum of a first-order Gauss-Markov process.
+"""Gusts: a random velocity of the air, the same everywhere, with the spectrum of a first-order Gauss-Markov process.
 
     one-sided spectrum of axis k:  intensity_k^2 (2 / pi) time_scale / (1 + (time_scale w)^2),  w in rad/s
     autocorrelation:               intensity_k^2 exp(-|t| / time_scale)
 
-It is the one Dryden (MIL-F-8785C) gives the gust along the wind, with time_scale = L / V at a scale of length L and an
-airspeed V; there, near the ground, L is about the height, and the vertical intensity a tenth of the mean wind. The
-gust is a sum of `HARMONICS` cosines that carry the same variance each, one from each quantile of that spectrum, with
-frequencies and phases by the ``seed``: a function of time, so that every integrator, step and machine flies through the
-same air. Every whole number is another gust; over many of them the autocorrelation is the one above within 0.04
-intensity^2. Remembered are the time since the flight began and the gust, held through a step.
+This is the Dryden spectrum (MIL-F-8785C) of the gust along the wind, with time_scale = L / V for a length scale L and
+an airspeed V. Near the ground L is about the height, and the vertical intensity a tenth of the mean wind. The gust is a
+sum of `HARMONICS` cosines of equal variance, one from each quantile of the spectrum, with frequencies and phases given
+by the ``seed``. It is a function of time, so that every integrator, step and machine flies through the same air. Every
+whole number gives another gust; over many of them the autocorrelation is the one above within 0.04 intensity^2. The
+memory holds the time since the flight began and the gust, which is constant during a step.
 """
 
 from __future__ import annotations
@@ -27,11 +27,12 @@ from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 HARMONICS = 12
-"""Per axis."""
-# The share of the variance below w is (2 / pi) atan(time_scale w). The last quantile has no end: three times its begin.
+"""Number of cosines per axis."""
+# The share of the variance below w is (2 / pi) atan(time_scale w). The last quantile is unbounded: cut at 3 times its
+# lower edge.
 _EDGES = np.tan(np.pi / 2 * np.arange(HARMONICS) / HARMONICS)
 _SPANS = np.diff(_EDGES, append=3 * _EDGES[-1])
-# Of frequencies and phases: where seed 0 has them, and how far each moves from a seed to the next.
+# Frequencies and phases: their values for seed 0, and how far each moves from one seed to the next.
 _FIRST, _STEPS = np.random.default_rng(0).uniform(size=(2, 2, 3, HARMONICS)).round(4)
 
 
@@ -63,9 +64,9 @@ class Gust(Effect):
     intensity: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
     """Standard deviation along the world's axes."""
     time_scale: Float[Array, "*batch"] = eqx.field(converter=number, default=1.0)
-    """Time after which a gust is forgotten."""
+    """Correlation time of the gust."""
     seed: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
-    """Which gust it is."""
+    """Number of the gust; a whole number."""
 
     @classmethod
     def neutral(cls) -> Gust:

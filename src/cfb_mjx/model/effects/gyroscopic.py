@@ -1,10 +1,10 @@
-"""Gyroscopic torque of the turning rotors:
+"""Gyroscopic torque of the spinning rotors:
 
     tau = -omega x h,   h = scale J_m sum_i(-yaw_i Omega_i) e_z
 
-with J_m the model's own moment of inertia of a rotor (``rotor_inertia``), so that a scale of 1 is what physics says and
-0 is the paper's model, and where yaw_i is the sign of rotor i's reaction on the body (a rotor that pushes the body one
-way turns the other way). The torque is at right angles to the body rate: it does no work.
+where J_m is the model's own moment of inertia of a rotor (``rotor_inertia``), so that a scale of 1 is physics and 0 the
+paper's model. yaw_i is the sign of rotor i's reaction torque on the body; the rotor spins in the opposite direction.
+The torque is perpendicular to the body rate and does no work.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Gyroscopic(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("scale",)
 
     scale: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of the rotors' angular momentum, by what the model's J_m makes it."""
+    """Factor on the angular momentum of the rotors that follows from the model's J_m."""
 
     @classmethod
     def neutral(cls) -> Gyroscopic:
@@ -54,8 +54,8 @@ class Gyroscopic(Effect):
         absolute, own = values.pop("rotor_inertia"), None if parameters is None else float(parameters.rotor_inertia)
         if not own or not isinstance(absolute, Real):
             raise CfbError(
-                "effects.gyroscopic.parameters.rotor_inertia is a share of the model's own rotor_inertia now; "
-                "write scale in its place, 1 for all of it, and give the model a rotor_inertia above zero."
+                "effects.gyroscopic.parameters.rotor_inertia is now a factor on the model's own rotor_inertia; write "
+                "scale instead (1 for its full value), and give the model a rotor_inertia above zero."
             )
         return values | {"scale": absolute / own}
 

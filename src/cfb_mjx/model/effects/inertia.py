@@ -1,7 +1,7 @@
-"""Moments of inertia other than the model says: J_k *= 1 + relative_k on each principal axis.
+"""Moments of inertia that differ from the model's: J_k *= 1 + relative_k on each principal axis.
 
-Nothing keeps the result within the triangle inequality that real bodies obey: the effect is there to show by how much a
-flight asks for another inertia, and a derivative must not stop at that border.
+The result may violate the triangle inequality that holds for real bodies. The effect shows how far a flight asks for
+another inertia, and its derivative must not stop at that border.
 """
 
 from __future__ import annotations

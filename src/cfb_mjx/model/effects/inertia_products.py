@@ -1,11 +1,12 @@
-"""Products of inertia: the principal axes are not the body's.
+"""Products of inertia: the principal axes of inertia are not the body's axes.
 
     J_ij = relative_ij sqrt(J_i J_j),   J omega' = tau - omega x J omega with the whole tensor J
 
-A battery that lies askew does this, and turns roll into yaw. tau is of all forces but a string's tension and those of
-the floor.
+The cause is for example a battery that lies askew; it couples roll into yaw. tau is the torque of all forces except the
+tension of a string and the forces of the floor.
 
-Not searched for by `cfb close-loop`: where a drone lacks many effects it takes up what several of them leave. Name it.
+`cfb close-loop` does not search for it: in a drone that lacks many effects it absorbs the residuals of several of them.
+Name it to fit it.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ class InertiaProducts(Effect):
     units: ClassVar[dict[str, str]] = {"relative": "1"}
     source: ClassVar[str] = "J. L. Meriam, L. G. Kraige, Engineering Mechanics: Dynamics, sec. 7/7 and app. B"
     prior: ClassVar[dict[str, tuple[float, float]]] = {"relative": (-0.2, 0.2)}
-    # Up to one half any three of them leave a tensor that is positive.
+    # Up to one half, any three values give a positive definite tensor.
     limits: ClassVar[dict[str, Limits]] = {"relative": Limits(-0.49, 0.49, -0.3, 0.3)}
     strengths: ClassVar[tuple[str, ...]] = ("relative",)
     rank: ClassVar[int] = INERTIAL
     searched: ClassVar[bool] = False
 
     relative: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
-    """Elements xy, xz and yz of the tensor, each over the geometric mean of its two moments."""
+    """Elements xy, xz and yz of the tensor, each divided by the geometric mean of its two moments."""
 
     @classmethod
     def neutral(cls) -> InertiaProducts:
@@ -61,5 +62,5 @@ class InertiaProducts(Effect):
         minors = rows[1].cross(rows[2]), rows[2].cross(rows[0]), rows[0].cross(rows[1])
         inverse_determinant = 1 / rows[0].dot(minors[0])
         turning = Vec(*(minor.dot(left) * inverse_determinant for minor in minors))
-        # What the diagonal does is computed by the body: here goes only the products' own momentum.
+        # The body computes the diagonal part; add only the momentum of the products.
         return replace(wrench, torque=wrench.torque - across(turning) - omega.cross(across(omega)))

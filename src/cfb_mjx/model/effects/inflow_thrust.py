@@ -1,10 +1,10 @@
-"""Thrust lost to axial inflow: a rotor climbing along its axis sees its blades' angle of attack reduced.
+"""Thrust lost to axial inflow: climbing along the rotor's axis reduces the angle of attack of its blades.
 
     f_i -= coefficient (Omega_i / 1594 rad/s) (v + omega x r_i)_z
 
-with v the velocity through the air, in body axes, rotor by rotor: it damps heave, and through the hubs' own motion roll
-and pitch. A positive coefficient means that a climbing rotor loses thrust. The change is not clamped: near zero rotor
-speed it vanishes by itself.
+where v is the velocity through the air in body axes. The effect acts rotor by rotor: it damps heave and, through the
+motion of the hubs, roll and pitch. With a positive coefficient a climbing rotor loses thrust. The change is not
+clamped; it vanishes by itself near zero rotor speed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class InflowThrust(Effect):
     feels_air: ClassVar[bool] = True
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Per rotor at hover speed."""
+    """Thrust lost per velocity, per rotor at hover speed."""
 
     @classmethod
     def neutral(cls) -> InflowThrust:

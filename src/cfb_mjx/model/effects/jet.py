@@ -1,11 +1,11 @@
-"""The jet of a fan: air that moves along an axis, widens and slows down by what it draws in.
+"""The jet of a fan: air that moves along an axis, widens, and slows down by the air it entrains.
 
     air = speed (width / b) exp(-ln 2 (r / b)^2) s(x) along ``direction``,  b = width + spreading x
 
-at the distance x along the axis from ``origin`` and r beside it. b is where the speed has fallen to half of that on the
-axis; b times the speed on the axis stays, as the momentum of a round jet does. s(x) = (1 + tanh(2 x / width)) / 2 lets
-the jet begin at the fan; the slow air it draws in there and at its side is left out, and so is that the rotors of one
-drone may be in faster and slower air.
+at the distance x along the axis from ``origin`` and r from the axis. b is the radius at which the speed has fallen to
+half of that on the axis. The product of b and the speed on the axis is constant, as the momentum of a round jet
+requires. s(x) = (1 + tanh(2 x / width)) / 2 lets the jet begin at the fan. The slow entrained air near the fan and
+beside the jet is left out, and the air is the same at all rotors of a drone.
 """
 
 from __future__ import annotations
@@ -58,15 +58,15 @@ class Jet(Effect):
     searched: ClassVar[bool] = False
 
     speed: Float[Array, "*batch"] = eqx.field(converter=number)
-    """On the axis at the fan."""
+    """Speed on the axis at the fan."""
     origin: Float[Array, "*batch 3"] = eqx.field(converter=vector(3), default=0.0)
-    """Of the fan, world."""
+    """Position of the fan, world."""
     direction: Float[Array, "*batch 3"] = eqx.field(converter=vector(3), default=(1.0, 0.0, 0.0))
-    """In which it blows, world; its length means nothing."""
+    """Direction in which the fan blows, world; the length is ignored."""
     width: Float[Array, "*batch"] = eqx.field(converter=number, default=0.1)
-    """Distance from the axis, at the fan, at which the speed has fallen to half."""
+    """Distance from the axis at which the speed has fallen to half, at the fan."""
     spreading: Float[Array, "*batch"] = eqx.field(converter=number, default=0.1)
-    """By how much that distance grows per distance from the fan."""
+    """Growth of that distance per distance from the fan."""
 
     @classmethod
     def neutral(cls) -> Jet:
@@ -80,7 +80,7 @@ class Jet(Effect):
         away = center - Vec.unstack(self.origin)
         along = away.dot(axis)
         square = away.dot(away) - along * along
-        # Behind the fan nothing widens; the profile there is that of the fan, and vanishes.
+        # Behind the fan the width is constant; the jet vanishes there.
         b = self.width + self.spreading * jnp.where(along > 0, along, 0.0)
         begins = 0.5 * (1 + jnp.tanh(2 * along / self.width))
         return axis * (self.speed * begins * (self.width / b) * jnp.exp(-math.log(2) * square / b**2))

@@ -1,9 +1,9 @@
-"""Motors that spin up quicker than they spin down (or slower): active drive one way, drag the other.
+"""Motors that spin up and down at different rates: active drive in one direction, drag in the other.
 
     T_i *= 1 + (spin_up (1 + d_i) + spin_down (1 - d_i)) / 2,  d_i = tanh((target_i - Omega_i) / width)
 
-so T (1 + spin_up) while spinning up and T (1 + spin_down) while spinning down, switched smoothly over ``width``. The
-direction is that of the start of a step and holds for the step.
+The time constant is T (1 + spin_up) while spinning up and T (1 + spin_down) while spinning down, with a smooth
+transition of width ``width``. The direction at the start of a step holds for the whole step.
 """
 
 from __future__ import annotations
@@ -43,14 +43,14 @@ class MotorAsymmetry(Effect):
         "width": Limits(0.1, 100000.0, 1.0, 1000.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("spin_up", "spin_down")
-    # By the target the windings leave.
+    # Direction towards the target that the lag of the windings leaves.
     rank: ClassVar[int] = 2
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"width": 15.0}, {"width": 60.0})
 
     spin_up: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Relative change of the lag while spinning up, above -1."""
+    """Relative change of the time constant while spinning up, above -1."""
     spin_down: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Relative change of the lag while spinning down, above -1."""
+    """Relative change of the time constant while spinning down, above -1."""
     width: Float[Array, "*batch"] = eqx.field(converter=number, default=50.0)
     """Distance from the target at which a motor counts as spinning up or down."""
 

@@ -1,4 +1,4 @@
-"""Motors that turn faster or slower than the model says for the same command: K_i *= 1 + relative_i."""
+"""Motors that turn faster or slower than the model's for the same command: K_i *= 1 + relative_i."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class MotorGainMismatch(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("relative",)
 
     relative: Float[Array, "*batch 4"] = eqx.field(converter=vector(4))
-    """Change of each motor's gain, motors M1..M4."""
+    """Relative change of each motor's gain, motors M1..M4."""
 
     @classmethod
     def neutral(cls) -> MotorGainMismatch:

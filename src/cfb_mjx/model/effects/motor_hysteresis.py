@@ -1,10 +1,10 @@
-"""A speed controller that does not follow small changes of the command: play, as of a gear.
+"""A motor controller that does not follow small changes of the command: play, as in a gear.
 
     y' = min(max(y, u - width), u + width),   u' = u + share (y' - u)
 
-An output ``y`` stays where it is while the command ``u`` moves within ``width`` of it, and is dragged along beyond
-that. The motors receive a mixture of both. Small commands to and fro are swallowed; in large ones the output is late by
-up to ``width`` whichever way they go.
+The output ``y`` stays constant while the command ``u`` moves within ``width`` of it, and is dragged along beyond that.
+The motors receive a mixture of both. Small oscillations of the command are suppressed; during large ones the output
+lags behind by up to ``width`` in both directions.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ class MotorHysteresis(Effect):
         "share": Limits(0.0, 1.0, 0.0, 1.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("width",)
-    # Play narrower than what commands do from row to row hardly shows.
+    # Play narrower than the changes of the command from row to row is hardly visible.
     coarse: ClassVar[dict[int, float]] = {0: 0.15}
-    # Of commands that have arrived, before their rate is limited.
+    # After the delay of the commands, before their rate limit.
     rank: ClassVar[int] = 2
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"share": 1.0},)
 
     width: Float[Array, "*batch"] = eqx.field(converter=number)
     """Half the play, as a share of full command; zero or positive."""
     share: Float[Array, "*batch"] = eqx.field(converter=number, default=1.0)
-    """Of the motors' command that passes through the play."""
+    """Share of the motors' command that passes through the play."""
 
     @classmethod
     def neutral(cls) -> MotorHysteresis:
@@ -58,12 +58,13 @@ class MotorHysteresis(Effect):
 
     def command(self, command: Vec, memory: Memory, dt: Any, parameters: Parameters) -> tuple[Vec, Memory]:
         last, place = memory
-        # Comparison instead of maximum: at zero the derivative is that of a growing play.
+        # Comparison, not maximum: at zero the derivative is the one towards positive play.
         width = jnp.where(self.width >= 0, self.width, 0.0)
         there = width > 0
 
         def placed(u, before, z):
-            # Where in its play an output is, -1 to 1: so that without play it has a slope, and the command is as it is.
+            # Position of the output within its play, -1 to 1: with it, the derivative exists without play too, and the
+            # command is unchanged there.
             moved = u - before
             at_end = jnp.where(moved > 0, -1.0, jnp.where(moved < 0, 1.0, z))
             return jnp.where(there, jnp.clip(z - moved / jnp.where(there, width, 1.0), -1.0, 1.0), at_end)

@@ -1,8 +1,8 @@
-"""A second lag in front of the motor's own, as of the current in its windings or a filter in its controller:
+"""A second lag in front of the motor's own, such as the current in its windings or a filter in its controller:
 
     lag y' = K u - y,   T Omega' = y - Omega
 
-y is remembered; its exact mean over a step is what the motor heads for during the step.
+The memory holds y; its exact mean over a step is the target of the motor during the step.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ class MotorSecondOrder(Effect):
     prior: ClassVar[dict[str, tuple[float, float]]] = {"lag": (0.0, 0.03)}
     limits: ClassVar[dict[str, Limits]] = {"lag": Limits(0.0, 1.0, 0.0, 0.1)}
     strengths: ClassVar[tuple[str, ...]] = ("lag",)
-    # Of the speed that battery and warmth leave.
+    # After battery and temperature have changed the steady speed.
     rank: ClassVar[int] = 1
 
     lag: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of the additional first-order lag; zero or positive."""
+    """Time constant of the additional first-order lag; zero or positive."""
 
     @classmethod
     def neutral(cls) -> MotorSecondOrder:
@@ -53,9 +53,9 @@ class MotorSecondOrder(Effect):
         self, motors: Motors, rotor_speed: Vec, memory: Memory, dt: Any, parameters: Parameters
     ) -> tuple[Motors, Memory]:
         (last,) = memory
-        # Comparison instead of maximum: at zero the derivative is that of a growing lag.
+        # Comparison, not maximum: at zero the derivative is the one towards positive lags.
         lag = jnp.where(self.lag >= 0, self.lag, 0.0)
-        # exp(-100) is nothing; asking for less would divide by the square of a vanishing lag in the derivative.
+        # exp(-100) is zero for all purposes, and a smaller lag would make the derivative divide by its square.
         slow = lag > 0.01 * dt
         decay = jnp.where(slow, jnp.exp(-dt / jnp.where(slow, lag, 1.0)), 0.0)
         mean = jnp.where(dt > 0, lag * (1 - decay) / jnp.where(dt > 0, dt, 1.0), 1.0)

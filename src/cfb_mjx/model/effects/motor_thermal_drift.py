@@ -1,9 +1,9 @@
-"""Motors that get weaker as they warm up: winding resistance rises, the magnets' field falls.
+"""Motors that weaken as they warm up: the winding resistance rises and the magnets' field falls.
 
     steady rotor speed of motor i *= 1 - drop h_i,  time_constant h_i' = (Omega_i / 1594 rad/s)^3 - h_i
 
-h is the warmth, 0 of a cold motor and 1 of one that has hovered for long: a rotor's power grows with the cube of its
-speed, and so do losses, roughly. Motors are cold where a log, or a rollout, begins.
+h is the warmth: 0 for a cold motor, 1 for one that has hovered for long. The power of a rotor grows with the cube of
+its speed, and the losses roughly do so too. Motors are cold at the start of a log or a rollout.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class MotorThermalDrift(Effect):
     drop: Float[Array, "*batch"] = eqx.field(converter=number)
     """Relative loss of speed of a motor that has hovered for long."""
     time_constant: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of warming up."""
+    """Time constant of the warming."""
 
     @classmethod
     def neutral(cls) -> MotorThermalDrift:
@@ -61,5 +61,5 @@ class MotorThermalDrift(Effect):
     def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
         (warmth,) = condition.memory
         load = (condition.rotor_speed * (1 / HOVER_SPEED)).map(lambda ratio: ratio * ratio * ratio)
-        # Exact for a constant load: rows of a log may be far apart.
+        # Exact for a constant load, because rows of a log may be far apart.
         return (warmth + (load - warmth) * (1 - jnp.exp(-dt / self.time_constant)),)

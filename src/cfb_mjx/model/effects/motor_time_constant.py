@@ -1,4 +1,4 @@
-"""Motors quicker or lazier than the model says: T *= 1 + relative, the same for all four."""
+"""Motors that respond faster or slower than the model's: T *= 1 + relative, the same for all four."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class MotorTimeConstant(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("relative",)
 
     relative: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Change of the motors' lag; above -1."""
+    """Relative change of the motors' time constant; above -1."""
 
     @classmethod
     def neutral(cls) -> MotorTimeConstant:

@@ -17,8 +17,8 @@ from cfb_mjx.parameters.limits import Limits
 class ParasiticDrag(Effect):
     """F_i = -(linear_i + quadratic_i sqrt(v_i^2 + cross (|v|^2 - v_i^2))) v_i along each body axis i.
 
-    v is the velocity through the air in body axes. With ``cross`` 0 the axes do not know of each other; with 1 the
-    force grows with the speed |v|, as that of a bluff body.
+    v is the velocity through the air in body axes. With ``cross`` 0 the axes are independent; with ``cross`` 1 the
+    force grows with the speed |v|, as for a bluff body.
     """
 
     name: ClassVar[str] = "parasitic_drag"
@@ -41,7 +41,7 @@ class ParasiticDrag(Effect):
         "quadratic": Limits(0.0, 1.0, 0.0, 0.1),
         "cross": Limits(0.0, 1.0, 0.0, 1.0),
     }
-    # The linear part is what `rotor_drag` does at hover; tracing looks for it there.
+    # At hover the linear part is the same as `rotor_drag`, under which the search looks for it.
     strengths: ClassVar[tuple[str, ...]] = ("quadratic",)
     feels_air: ClassVar[bool] = True
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"cross": 0.0}, {"cross": 1.0})
@@ -49,7 +49,7 @@ class ParasiticDrag(Effect):
     linear: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
     quadratic: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
     cross: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
-    """Share of the speed across an axis in the drag along it."""
+    """Weight of the speed across an axis in the drag along it, 0 to 1."""
 
     @classmethod
     def neutral(cls) -> ParasiticDrag:
@@ -58,7 +58,7 @@ class ParasiticDrag(Effect):
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         velocity = condition.airspeed_body
         square = velocity.dot(velocity)
-        # A square root has no slope at rest; what is added is far below what any drag can show.
+        # The square root has no derivative at rest; the small number is far below any measurable drag.
         speed = velocity.map(lambda v: jnp.sqrt(v * v + self.cross * (square - v * v) + 1e-12))
         coefficient = Vec.unstack(self.linear) + Vec.unstack(self.quadratic) * speed
         return Wrench(wrench.force - coefficient * velocity, wrench.torque)

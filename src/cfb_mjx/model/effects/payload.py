@@ -1,9 +1,9 @@
 """A payload fixed to the body, ``height`` above the rotors' centre (negative: below) and ``offset`` beside it.
 
-It adds its mass, draws the centre of gravity towards itself and adds m M / (m + M) (|d|^2 - d_k^2) to the moment of
-inertia about axis k, d being the way from the old centre of gravity to the payload (parallel axes, about the common
-centre). The payload's own moment of inertia and, where the payload lies beside the z axis, products of inertia are left
-out.
+It adds its mass, moves the centre of gravity towards itself, and adds m M / (m + M) (|d|^2 - d_k^2) to the moment of
+inertia about axis k, where d is the vector from the old centre of gravity to the payload (parallel-axis theorem about
+the common centre of gravity). The payload's own moment of inertia is left out, and so are the products of inertia of a
+payload that lies beside the z axis.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ class Payload(Effect):
         "offset": Limits(-1.0, 1.0, -0.08, 0.08),
     }
     strengths: ClassVar[tuple[str, ...]] = ("mass",)
-    # To first order: what hangs beside the axis has an inertia of its own besides.
+    # To first order; a mass beside the axis also changes the moments of inertia.
     said_by: ClassVar[dict[str, str]] = {"offset": "cog_offset"}
-    # Hung on the drone as its own inertia and centre of gravity leave it.
+    # Added to the inertia and centre of gravity that other effects have changed.
     rank: ClassVar[int] = 1
     probes: ClassVar[tuple[dict[str, float], ...]] = (
         {"height": -0.02, "offset": 0.0},
@@ -51,11 +51,11 @@ class Payload(Effect):
     )
 
     mass: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of the payload, as a point."""
+    """Mass of the payload, a point."""
     height: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Above the rotors' centre."""
+    """Height above the rotors' centre."""
     offset: Float[Array, "*batch 2"] = eqx.field(converter=vector(2), default=0.0)
-    """Beside it, along the body's x and y axes."""
+    """Offset from the rotors' centre along the body's x and y axes."""
 
     @classmethod
     def neutral(cls) -> Payload:

@@ -1,16 +1,17 @@
-"""A load slung on a string from a point on the rotors' axis: a spherical pendulum whose pivot flies.
+"""A load on a string from a point on the rotors' axis: a spherical pendulum with a moving pivot.
 
     n'' = -(1 - n n^T) (a + g e_z) / length - |n'|^2 n - 2 damping_ratio sqrt(g / length) n'
     F_world = T n,  T = max(length |n'|^2 - n . F / M, 0) m M / (m + M)
     torque = (0, 0, pivot) x F,  about the rotors' centre, body axes
 
-n is the unit vector from the drone to the load, a the drone's acceleration, M its mass and F the force (world) of all
-else but gravity: the tension T follows from the string keeping its length. Where the string is tied below the centre of
-gravity (``pivot`` negative), a sideways pull also turns the drone; that the pivot then moves beside the drone's centre
-is left out. A string does not push; where it would go slack the load is still carried along on its sphere. Remembered
-are n and n'; at the start the load hangs still. Swings are hardly damped, and once a string was slack nothing tells
-where they began: beside a log, the force the model misses turns n towards where the string pulls (a Luenberger
-observer).
+n is the unit vector from the drone to the load, a the drone's acceleration, M its mass and F the force (world) of
+everything except gravity. The tension T follows from the constant length of the string. Where the string is tied below
+the centre of gravity (``pivot`` negative), a sideways pull also turns the drone; the motion of the pivot relative to
+the drone's centre is left out. A string cannot push; where it would be slack the load still moves on its sphere. The
+memory holds n and n'; at the start the load hangs still.
+
+Swings are hardly damped, and after a slack string nothing determines their state. Along a log the force that the model
+does not explain therefore turns n towards the direction of the pull (a Luenberger observer).
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.parameters import Parameters
 
 FOLLOWING = 8.0
-"""Twice the damping of the error of a load followed beside a log, 1/s."""
+"""Twice the damping of the observer's error along a log, 1/s."""
 UNSURE = 0.5
-"""What else a model may miss, m/s^2: weaker pulls say little of where the string points."""
+"""Acceleration that the model may miss for other reasons, m/s^2: weaker pulls hardly show the string's direction."""
 GAP = 0.05
-"""After rows this far apart, s, a load is taken to hang still below what the drone feels."""
+"""Gap between rows, s, after which the load is assumed to hang still, opposite to the specific force."""
 
 
 class PayloadSwing(Effect):
@@ -68,13 +69,13 @@ class PayloadSwing(Effect):
     )
 
     mass: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of the load."""
+    """Mass of the load."""
     length: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of the string."""
+    """Length of the string."""
     damping_ratio: Float[Array, "*batch"] = eqx.field(converter=number, default=0.02)
-    """Of the swing, against critical damping."""
+    """Damping ratio of the swing."""
     pivot: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
-    """Where the string is tied: above the rotors' centre, along body z; below it negative."""
+    """Height of the point where the string is tied above the rotors' centre, along body z; negative below it."""
 
     @classmethod
     def neutral(cls) -> PayloadSwing:
@@ -99,10 +100,10 @@ class PayloadSwing(Effect):
         gravity = condition.parameters.gravity
         felt = acceleration + Vec(0.0, 0.0, gravity)
         across = felt - along * along.dot(felt)
-        # Without gravity there is no swing; the square root has no derivative there.
+        # Without gravity there is no swing, and the square root has no derivative at zero.
         swings = gravity > 0
         damping = 2 * self.damping_ratio * jnp.sqrt(jnp.where(swings, gravity / self.length, 1.0)) * swings
-        # Semi-implicit, as the body itself: the swing neither grows nor dies by the numbers.
+        # Semi-implicit, like the body: the integration itself neither damps nor excites the swing.
         turning = turning - (across * (1 / self.length) + turning * damping) * dt
         along = along + turning * dt
         along = along * (1 / jnp.sqrt(along.dot(along)))
@@ -113,7 +114,7 @@ class PayloadSwing(Effect):
         felt = acceleration + Vec(0.0, 0.0, condition.parameters.gravity)
         mass, own = self.mass, condition.parameters.mass
         pull = mass / own * jnp.maximum(self.length * turning.dot(turning) - along.dot(felt), 0.0)
-        # An angle where the pull is strong, and nothing where there is none.
+        # Tends to the angle of the error where the pull is strong, and to zero where it is weak.
         off = (missed - along * along.dot(missed)) * (pull / (pull * pull + UNSURE**2))
         along = along + off * (FOLLOWING * dt)
         turning = turning + off * (FOLLOWING**2 / 2 * dt)

@@ -1,18 +1,19 @@
-"""A moment that hangs on the position: air that moves in a room, or a velocity column that leans.
+"""A moment that depends on the position: air that moves in a room, or a biased velocity column.
 
-A drone's jet draws in the air around it, sinks, spreads on the floor and rises along the walls. In a closed room the
-air above the floor therefore moves towards where the jet goes down most of the time, the faster the farther out: a wind
-w = -convergence (p - middle). Flying through it twists the drone as if it flew faster outwards (`blade_flapping`), with
-one gradient along each of the world's horizontal axes:
+A drone's jet entrains the air around it, sinks, spreads on the floor and rises along the walls. In a closed room the
+air above the floor therefore moves towards the place where the jet goes down most of the time, faster at larger
+distances: a wind w = -convergence (p - middle). Flight through it acts like a faster flight outwards (`blade_flapping`)
+with one gradient along each of the world's horizontal axes:
 
     tau = (Omega / 1594 rad/s) (-q_y, q_x, 0),  q = R^T (gradient * (p_x, p_y, 0))
 
-with the mean rotor speed. A gradient over the coefficient of `blade_flapping` is the convergence. An on-board estimator
-whose velocity leans towards the middle does the same to predictions that start from its column: compare the column with
-the slope of the position before you believe in air, and ask the accelerometer, which feels that air's drag. The middle
-is the origin of the positions; another one adds a constant torque, which `cog_offset` takes.
+where Omega is the mean rotor speed. The gradient divided by the coefficient of `blade_flapping` is the convergence. An
+on-board estimator whose velocity is biased towards the middle has the same effect on predictions that start from the
+velocity column. Before you believe in moving air, compare the column with the derivative of the position, and check the
+accelerometer, which measures the drag of such air. The middle is the origin of the positions; another middle adds a
+constant torque, which `cog_offset` describes.
 
-Not searched for by `cfb close-loop`: cables and walls act by the position as well. Name it to ``cfb refine``.
+`cfb close-loop` does not search for it, because cables and walls also act by position. Name it in ``cfb refine``.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class PositionMoment(Effect):
     searched: ClassVar[bool] = False
 
     gradient: Float[Array, "*batch 2"] = eqx.field(converter=vector(2))
-    """Torque per distance along the world's x and y axes."""
+    """Torque per distance from the middle along the world's x and y axes."""
 
     @classmethod
     def neutral(cls) -> PositionMoment:

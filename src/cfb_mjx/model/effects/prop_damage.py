@@ -1,9 +1,9 @@
-"""A propeller that is nicked, bent or of another kind: one rotor pulls less and drags more at the same speed.
+"""A propeller that is nicked, bent or of another type: one rotor gives less thrust and more torque at the same speed.
 
     thrust_scale_m *= 1 + thrust,   torque_scale_m *= 1 + torque
 
-for the one motor m (1 to 4, as in logs). A motor that turns at another speed is `motor_gain_mismatch`; the two are told
-apart by measured rotor speeds.
+for one motor m (1 to 4, as in logs). A motor that turns at another speed is `motor_gain_mismatch`; measured rotor
+speeds tell the two apart.
 """
 
 from __future__ import annotations
@@ -48,9 +48,9 @@ class PropDamage(Effect):
     thrust: Float[Array, "*batch"] = eqx.field(converter=number)
     """Relative change of the rotor's thrust."""
     torque: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Relative change of its aerodynamic torque."""
+    """Relative change of the rotor's aerodynamic torque."""
     motor: Float[Array, "*batch"] = eqx.field(converter=number, default=1.0)
-    """Its number, 1 to 4."""
+    """Number of the motor, 1 to 4."""
 
     @classmethod
     def neutral(cls) -> PropDamage:

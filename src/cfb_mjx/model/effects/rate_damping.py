@@ -1,15 +1,16 @@
-"""Roll and pitch braked by the rotor discs: a disc that turns with the body meets air along its axis at its edge.
+"""Damping of roll and pitch by the rotor discs: the edges of a disc that turns with the body move along its axis.
 
     tau -= coefficient (Omega / 1594 rad/s) (omega_x, omega_y, 0)
 
-with the mean rotor speed. Beside the hubs' own motion up and down, which `inflow_thrust` has, every disc feels its own
-turning: by blade-element theory ``rho a c Omega R^4 / 16`` per blade, 5e-6 N m s for a propeller of the Crazyflie
-Brushless, four times that for the drone.
+where Omega is the mean rotor speed. `inflow_thrust` already has the motion of the hubs; in addition every disc responds
+to its own rotation. Blade-element theory gives ``rho a c Omega R^4 / 16`` per blade, 5e-6 N m s for a propeller of the
+Crazyflie Brushless and four times that for the drone.
 
-Predictions of flights under a controller ask for more. Commands that answer a disturbance act on a simulated drone that
-feels no disturbance; a brake makes it follow them less. Compare what the innovations say (``innovations`` in the report
-of `cfb close-loop`) before you believe in it as physics. Not searched for by itself, only where a drone's effects are
-fitted together: filters of a gyro and slow motors look like it.
+Predictions of flights under a controller ask for more damping than that. The logged commands are the controller's
+response to disturbances, and the simulated drone has no disturbances; with damping it follows such commands less.
+Before you believe in the damping as physics, look at the innovations (``innovations`` in the report of `cfb
+close-loop`). The search does not look for it by itself, only where the effects of a drone are fitted together, because
+gyro filters and slow motors look like it.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class RateDamping(Effect):
     searched: ClassVar[bool] = False
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of the four rotors together at hover speed."""
+    """Torque per body rate of the four rotors together at hover speed."""
 
     @classmethod
     def neutral(cls) -> RateDamping:

@@ -1,17 +1,18 @@
-"""Small torques of gentle flights answered by less than their size, the body rate returns instead. No physics.
+"""A statistical correction, not physics: in gentle flight only a share of a computed torque acts, and the rate decays.
 
     unanswered = dilution / (1 + (tau_x^2 + tau_y^2) / knee^2 + m / turning^2)
     tau_i     <- (1 - unanswered) tau_i - unanswered reversion I_i omega_i,    i = x, y
     time_constant m' = omega_x^2 + omega_y^2 - m
 
-of all torques of the rotors and all other effects. In gentle flight the torques of rotors and air nearly cancel, a
-controller cancels what the model misses as well, and the small sum a model computes is mostly error: of a small one
-only a share is to be expected (attenuation by errors in variables), of a large one, or in a flight that has been
-turning hard of late, all of it. In place of the rest is what follows on average, whatever brings it about: the body
-rate returns to zero (reversion to the mean). A model with a larger inertia does the former to all torques, and errs
-wherever they are large; one with more damping does the latter, and errs there as well.
+applied to the sum of all torques of the rotors and all other effects. In gentle flight the torques of rotors and air
+nearly cancel, and a controller cancels what the model misses as well, so the small sum that a model computes is mostly
+error. The best forecast uses only a share of a small sum (attenuation by errors in variables), and all of a large one
+or of any sum in a flight with recent fast rotations. The rest is replaced by the average response, whatever its cause:
+the body rate returns to zero (reversion to the mean). A model with a larger inertia would attenuate all torques, and
+one with more damping would brake all rotations; both would be wrong where these are large.
 
-For predictors only (`cfb refine --predictor`): a plant with it would listen to its rotors less the gentler it is flown.
+For predictors only (`cfb refine --predictor`): a plant with this effect would respond less to its rotors the more
+gently it is flown.
 """
 
 from __future__ import annotations
@@ -56,20 +57,20 @@ class RegressionDilution(Effect):
         "time_constant": Limits(0.001, 10000.0, 0.05, 60.0),
     }
     strengths: ClassVar[tuple[str, ...]] = ("dilution",)
-    # Of all torques there are.
+    # Acts on the sum of all torques.
     rank: ClassVar[int] = EXPECTATION
     searched: ClassVar[bool] = False
 
     dilution: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Share of a small torque of a gentle flight that is not answered."""
+    """Share of a small torque in gentle flight that does not act."""
     knee: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Torque of which half of that share is."""
+    """Torque at which that share is halved."""
     reversion: Float[Array, "*batch"] = eqx.field(converter=number)
-    """How fast the body rate returns to zero where no torque is answered."""
+    """Rate at which the body rate decays where no torque acts."""
     turning: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Rms body rate about x and y of a flight in which half of that share of a small torque is."""
+    """Root mean square of the body rate about x and y at which that share of a small torque is halved."""
     time_constant: Float[Array, "*batch"] = eqx.field(converter=number)
-    """How long the flight is remembered: within `prior`, what it does; longer, which flight it is."""
+    """Averaging time of the body rate: within `prior` it describes the present motion; longer, the whole flight."""
 
     @classmethod
     def neutral(cls) -> RegressionDilution:
@@ -91,5 +92,5 @@ class RegressionDilution(Effect):
     def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:
         ((turned,),) = condition.memory
         x, y, _ = condition.body_rate
-        # Exact for a constant body rate: rows of a log may be far apart.
+        # Exact for a constant body rate, because rows of a log may be far apart.
         return (Vec(turned + (x * x + y * y - turned) * (1 - jnp.exp(-dt / self.time_constant))),)

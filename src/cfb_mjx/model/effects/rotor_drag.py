@@ -1,10 +1,10 @@
-"""Rotor drag: a turning rotor resists being moved along its disc (induced drag and H-force).
+"""Rotor drag: a spinning rotor resists motion along its disc (induced drag and H-force).
 
-On each rotor i, with v_i = v + omega x r_i the velocity of its hub through the air, in body axes:
+On each rotor i, where v_i = v + omega x r_i is the velocity of its hub through the air in body axes:
 
     F_i,xy = -(coefficient / 4) (Omega_i / 1594 rad/s) v_i,xy
 
-acting at the hub, so besides braking the body it damps yaw.
+The force acts at the hub, so it also damps yaw.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class RotorDrag(Effect):
     feels_air: ClassVar[bool] = True
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of the four rotors together at hover speed."""
+    """Force per velocity of the four rotors together at hover speed."""
 
     @classmethod
     def neutral(cls) -> RotorDrag:

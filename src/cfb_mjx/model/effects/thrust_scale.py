@@ -1,4 +1,4 @@
-"""All rotors pull harder or weaker than the model says: thrust_scale *= 1 + relative."""
+"""All rotors give more or less thrust than the model says: thrust_scale *= 1 + relative."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ThrustScale(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("relative",)
 
     relative: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Change of every rotor's thrust."""
+    """Relative change of every rotor's thrust."""
 
     @classmethod
     def neutral(cls) -> ThrustScale:

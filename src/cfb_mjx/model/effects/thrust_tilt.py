@@ -1,11 +1,11 @@
-"""Thrust that does not point along body z: rotors mounted askew, or body axes that the estimator sees askew.
+"""Thrust that does not point along body z: tilted rotors, or body axes that the estimator sees tilted.
 
     F_i = f_i (tilt + twist t_i),  tau += r_i x F_i
 
-on each rotor i, with f_i its thrust, r_i its place, t_i the tangent counter-clockwise round the drone; small angles.
-The common part of the rotors' tilts (``tilt``) moves the force sideways; the part that leans every rotor the same way
-round the drone (``twist``) turns it. Where the rotors pull unequally, the first turns it as well and the second moves
-it. That the rotors' reaction torques lean too is left out.
+on each rotor i, where f_i is its thrust, r_i its position and t_i the tangent counter-clockwise round the drone; small
+angles. The common tilt of the rotors (``tilt``) moves the force sideways; a tilt of every rotor in the same direction
+round the drone (``twist``) causes a yaw torque. If the rotors' thrusts differ, the first also causes a torque and the
+second a force. The tilt of the reaction torques is left out.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class ThrustTilt(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("tilt", "twist")
 
     tilt: Float[Array, "*batch 2"] = eqx.field(converter=vector(2))
-    """Of the thrust towards body x and y."""
+    """Tilt of the thrust towards body x and y."""
     twist: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0)
-    """Of every rotor counter-clockwise round the drone, seen from above."""
+    """Tilt of every rotor counter-clockwise round the drone, seen from above."""
 
     @classmethod
     def neutral(cls) -> ThrustTilt:
@@ -53,7 +53,7 @@ class ThrustTilt(Effect):
     def body(self, wrench: Wrench, condition: Condition) -> Wrench:
         x, y = hub_positions(condition.parameters)
         along_x, along_y = Vec.unstack(self.tilt)
-        # `Effect.body` is always told.
+        # `Effect.body` always receives the loads.
         thrust = not_none(condition.loads).thrust
         round_ = self.twist / (condition.parameters.rotor_spacing * 0.5**0.5)
         force_x, force_y = thrust * (along_x + -round_ * y), thrust * (along_y + round_ * x)

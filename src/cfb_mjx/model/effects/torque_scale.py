@@ -1,4 +1,4 @@
-"""All rotors resist more or less than the model says: torque_scale *= 1 + relative."""
+"""All rotors have more or less aerodynamic torque than the model says: torque_scale *= 1 + relative."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class TorqueScale(Effect):
     strengths: ClassVar[tuple[str, ...]] = ("relative",)
 
     relative: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Change of every rotor's aerodynamic torque."""
+    """Relative change of every rotor's aerodynamic torque."""
 
     @classmethod
     def neutral(cls) -> TorqueScale:

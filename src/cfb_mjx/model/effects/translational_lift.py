@@ -1,9 +1,9 @@
-"""Translational lift: a rotor that moves sideways through the air meets more of it and lifts more.
+"""Translational lift: a rotor that moves sideways through the air meets more air and lifts more.
 
     f_i += coefficient (v_i,x^2 + v_i,y^2)
 
-with v_i the velocity of the hub through the air, body axes. Of the blade elements' thrust this is the part that grows
-with the square of the sideways velocity, whatever the rotor's speed; the fall of the induced velocity adds to it.
+where v_i is the velocity of the hub through the air in body axes. This is the part of the blade elements' thrust that
+grows with the square of the sideways velocity at any rotor speed; the decrease of the induced velocity adds to it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class TranslationalLift(Effect):
     feels_air: ClassVar[bool] = True
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Per rotor."""
+    """Additional thrust per squared velocity, per rotor."""
 
     @classmethod
     def neutral(cls) -> TranslationalLift:

@@ -1,14 +1,14 @@
-"""Vortex ring state: a rotor that sinks into its own wake draws the air faster, and lifts less.
+"""Vortex ring state: a rotor that sinks into its own wake accelerates the air more and lifts less.
 
     f_i -= coefficient (Omega_i / 1594 rad/s) (w - w_h),  w_h = induced_velocity Omega_i / 1594 rad/s
     (w - w_h) / w_h = -1.125 m - 1.372 m^2 - 1.718 m^3 - 0.655 m^4,  m = v_i,z / w_h from -2 to 0
 
-with w the induced velocity, in hover w_h, after the curve measured on helicopters. In climb nothing changes; below
-twice the induced velocity the rotor is a windmill, and the curve is held. The coefficient means what that of
-`inflow_thrust` does: thrust lost per flow through the rotor.
+where w is the induced velocity and w_h its value in hover. The curve was measured on helicopters. In climb nothing
+changes; in descents faster than twice the induced velocity the rotor is a windmill, and the curve is constant. The
+coefficient has the meaning of that of `inflow_thrust`: thrust lost per flow through the rotor.
 
-Not searched for by `cfb close-loop`: in slow descents it looks as `inflow_thrust` of another strength does. Name it
-where a drone fell faster than half its induced velocity, 2 m/s.
+`cfb close-loop` does not search for it: in slow descents it looks like another strength of `inflow_thrust`. Name it if
+a drone fell faster than half its induced velocity, 2 m/s.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ class VortexRing(Effect):
     feels_air: ClassVar[bool] = True
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Per rotor at hover speed."""
+    """Thrust lost per velocity, per rotor at hover speed."""
     induced_velocity: Float[Array, "*batch"] = eqx.field(converter=number)
-    """At hover speed."""
+    """Induced velocity at hover speed."""
 
     @classmethod
     def neutral(cls) -> VortexRing:
@@ -62,7 +62,7 @@ class VortexRing(Effect):
         hover = self.induced_velocity * ratio
 
         def faster(axial, hover):
-            # w - w_h; from the velocities themselves, as a stopped rotor has no ratio of them.
+            # w - w_h from the velocities themselves: for a stopped rotor their ratio does not exist.
             still = hover <= 1e-6
             share = jnp.clip(axial / jnp.where(still, 1.0, hover), _WINDMILL, 0.0)
             curve = 0.0

@@ -2,11 +2,11 @@
 
     f_i *= 1 + strength (reach^2 + d^2) / (reach^2 + a_i^2),  d = 0.1 m
 
-with a_i the distance of rotor i from the plane, which lies ``distance`` from the world's origin in ``direction``;
-behind it the distance counts as zero. The form is that of `ground_effect`. A ceiling ([0, 0, 1]) draws the drone up;
-beside a wall the rotors next to it lose some thrust, and the drone leans towards it.
+where a_i is the distance of rotor i from the plane, which lies ``distance`` from the world's origin in ``direction``;
+behind the plane it counts as zero. The formula is that of `ground_effect`. A ceiling ([0, 0, 1]) attracts the drone;
+near a wall the rotors beside it lose some thrust, and the drone leans towards the wall.
 
-Not searched for by `cfb close-loop`, for the room is not in the log: name it, with the plane where it is.
+`cfb close-loop` does not search for it, because the log does not contain the room. Name it and give the plane.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class WallEffect(Effect):
     }
     strengths: ClassVar[tuple[str, ...]] = ("strength",)
     assumed: ClassVar[tuple[str, ...]] = ("direction", "distance")
-    # Of the thrust that the flow through the rotors leaves.
+    # Acts on the thrust after the effects of the flow through the rotors.
     rank: ClassVar[int] = 1
     searched: ClassVar[bool] = False
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"reach": 0.05}, {"reach": 0.12}, {"reach": 0.25})
@@ -59,11 +59,11 @@ class WallEffect(Effect):
     strength: Float[Array, "*batch"] = eqx.field(converter=number)
     """Relative gain of thrust 0.1 m from the surface."""
     reach: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Distance at which half of the gain at the surface is left."""
+    """Distance at which half of the gain at the surface remains."""
     direction: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
-    """From the drone to the surface, world; of any length but zero."""
+    """Normal of the surface, pointing away from the drone, world; any length except zero."""
     distance: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Of the surface from the world's origin, along the direction."""
+    """Distance of the surface from the world's origin, along the direction."""
 
     @classmethod
     def neutral(cls) -> WallEffect:

@@ -1,15 +1,15 @@
-"""A steady wind: air that moves alike everywhere, for every effect that depends on the airspeed, and
+"""A steady wind: air that moves with one velocity everywhere, for every effect that depends on the airspeed, and
 
     F_world = conductance * velocity
 
-for the drag that no other effect of the model describes. With `rotor_drag` or `parasitic_drag` in the model their drag
-carries the wind, and the conductance should be 0, or it counts twice. Without them it stands for the drone's drag in
-moving air only (that of its own motion is left out): a constant force, of which flights tell the product
-conductance * velocity and nothing more. The velocity is fitted at a given conductance.
+for the drag that no other effect of the model describes. With `rotor_drag` or `parasitic_drag` in the model, their drag
+transmits the wind and the conductance should be 0, or the wind counts twice. Without them the conductance stands for
+the drone's drag in moving air only (the drag of its own motion is left out). It causes a constant force; flights
+determine only the product conductance * velocity. The velocity is fitted for a given conductance.
 
-``felt`` is the share of the wind that other effects feel. A search takes 0, a constant force and no more: whether a
-force is carried by the drag it also finds is more than it can tell, and so the wind does not count twice there. A model
-file that gives a conductance and no ``felt`` means 0 as well, as it did when winds were forces only.
+``felt`` is the share of the wind that acts on other effects. A search uses 0, that is a constant force alone: it cannot
+tell whether the force is transmitted by a drag that it also finds, and with 0 the wind does not count twice. A model
+file with a conductance and no ``felt`` also means 0, as in versions in which winds were forces only.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ class Wind(Effect):
     probes: ClassVar[tuple[dict[str, float], ...]] = ({"felt": 0.0},)
 
     velocity: Float[Array, "*batch 3"] = eqx.field(converter=vector(3))
-    """Of the air, world axes."""
+    """Velocity of the air, world axes."""
     conductance: Float[Array, "*batch"] = eqx.field(converter=number)
-    """Force per wind speed, of whatever no other effect describes; 0 beside effects of drag."""
+    """Force per wind speed, for drag that no other effect describes; 0 if the model has effects of drag."""
     felt: Float[Array, "*batch"] = eqx.field(converter=number, default=1.0)
-    """Share of it that other effects feel."""
+    """Share of the wind that acts on other effects, 0 to 1."""
 
     @classmethod
     def neutral(cls) -> Wind:
@@ -66,7 +66,7 @@ class Wind(Effect):
 
     @classmethod
     def migrated(cls, values: Mapping[str, Any], parameters: Parameters | None) -> Mapping[str, Any]:
-        # Winds of earlier versions were fitted as forces that no other effect felt.
+        # In earlier versions winds were fitted as forces that no other effect felt.
         before = "felt" not in values and values.get("conductance", 0) != 0
         return {**values, "felt": 0.0} if before else values
 

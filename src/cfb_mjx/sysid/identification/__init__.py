@@ -1,4 +1,4 @@
-"""Refitting the model to flights: parameters, noise, estimators, uncertainty."""
+"""Identification: fit the model's parameters and noise levels to flights, with uncertainty."""
 
 from cfb_mjx.sysid.identification.fitting import default_parameters, fit
 from cfb_mjx.sysid.identification.result import Estimate, Fit

@@ -1,4 +1,4 @@
-"""Whether a flight was flown under feedback: do the commands answer what the gyro could not be expected to say?"""
+"""Test for feedback: do the commands respond to the unpredictable part of the gyro's readings?"""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from cfb_mjx.model.rotors import TORQUE_SIGNS
 from cfb_mjx.sysid.identification.flight_data import Segments
 
 LAGS = 5
-"""Rows within which a controller answers."""
+"""Number of rows within which a controller responds."""
 SIGNIFICANT = 1e-6
+"""Largest p-value at which feedback is considered present."""
 
 
 @dataclass(frozen=True)
@@ -24,15 +25,15 @@ class Feedback:
 
     @property
     def present(self) -> bool:
-        """Whether the flight was under feedback."""
+        """Whether the flight was flown under feedback."""
         return self.p_value < SIGNIFICANT
 
 
 def detect(segments: Segments, residual: np.ndarray) -> Feedback:
     """Correlate innovations with the command changes that follow.
 
-    An innovation is what past rows, past commands included, do not explain: a command sequence decided beforehand
-    cannot follow it, a controller's must.
+    An innovation cannot be predicted from past rows and commands. A predetermined command sequence cannot correlate
+    with it, whereas a controller's commands must.
 
     Args:
         segments: flight data.

@@ -1,7 +1,8 @@
-"""Kalman filters with a slowly wandering disturbance, one scalar channel at a time; the rotor's also runs backwards.
+"""Kalman filters with a slowly varying disturbance, one per scalar channel, and a smoother of the rotor speeds.
 
-Each filter walks along the rows of one segment and returns the one-step innovations and their variances. States are
-two numbers (the quantity and its disturbance), so covariances are three numbers and every update is written out.
+Each filter runs over the rows of one segment and returns one-step innovations and their variances. The states are the
+quantity and its disturbance, and for the body also an error of the rotor speeds. The states are so few that all updates
+are written out by component.
 """
 
 from __future__ import annotations
@@ -18,32 +19,44 @@ from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.robust import limited
 
 CORRELATION_TIME = 0.5
-"""Of the wandering offsets of specific force and steady rotor speed, s: battery and inflow, below about 0.3 Hz."""
+"""Correlation time of the disturbances of specific force and steady rotor speed, s: battery and inflow, below 0.3 Hz."""
 
 
 class Unlogged(NamedTuple):
-    """What commands that were not logged do to the body: an error of the rotor speeds that decays with their lag.
+    """Effect of commands that were not logged: an error of the rotor speeds that decays with the motors' lag.
 
-    On each axis of the body, and along z, the error is one number: the sum over the rotors with their signs, rad/s.
+    For each axis of the body, and along z, the error is a scalar: the sum over the rotors with their signs, rad/s.
     """
 
     variance: Float[Array, " n"]
-    """What every interval adds to the error's variance."""
+    """Variance that each interval adds to the error, (rad/s)^2."""
     decay: Float[Array, " n"]
+    """Factor by which the error decays over each interval."""
     jump: Float[Array, "n 3"]
-    """Body rate per error, within the interval in which it arises."""
+    """Change of body rate per unit error in the interval in which the error arises."""
     later: Float[Array, "n 3"]
-    """Body rate per error, over an interval at whose start it was there."""
+    """Change of body rate per unit error in an interval at whose start the error already exists."""
     force: Float[Array, ""]
-    """Specific force along z per error, m/s^2 per rad/s."""
+    """Specific force along z per unit error, m/s^2 per rad/s."""
     start: Float[Array, ""]
-    """Variance of the error at the first row, where no command before tells the rotor speeds."""
+    """Variance of the error at the first row, where the rotor speeds are not known from earlier commands."""
 
 
 def rate_innovations(
     parameters: Parameters, noise: Noise, piece: Segments, torque: Float[Array, "n 3"], unlogged: Unlogged, robust: bool
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
-    """Three filters with state (body rate, disturbance, rotor error), one per axis, coupled by the gyroscopic term."""
+    """Innovations of the gyro: one filter per axis with state (body rate, disturbance, rotor error).
+
+    The three filters are coupled by the gyroscopic term.
+
+    Args:
+        parameters: the drone.
+        noise: noise levels.
+        piece: one segment.
+        torque: mean torque over each interval, N m.
+        unlogged: effect of commands that were not logged.
+        robust: limit the influence of outliers.
+    """
     inertia = parameters.inertia
     r, q, d = noise.gyro**2, noise.rate_walk**2, noise.disturbance**2
 
@@ -54,7 +67,8 @@ def rate_innovations(
         w, a, o, pww, pwa, pwo, paa, pao, poo = carry
         dt, tau, measured, more, decay, jump, later = inputs
         keep = jnp.exp(-dt / noise.correlation_time)
-        # Heun: at 100 Hz the gyroscopic torque of the row before is 5 ms old, and it alone tells the scale of J_zz.
+        # Heun's method: at 100 Hz the gyroscopic torque at the previous row is on average 5 ms old, and only this
+        # torque determines the scale of J_zz.
         ahead = w + dt * (tau / inertia + a + turning(w))
         w = w + dt * (tau / inertia + a + 0.5 * (turning(w) + turning(ahead))) + later * o
         a, o = keep * a, decay * o
@@ -81,11 +95,17 @@ def rate_innovations(
 def force_innovations(
     noise: Noise, piece: Segments, force: Float[Array, " n"], unlogged: Unlogged, robust: bool
 ) -> tuple[Float[Array, "n 1"], Float[Array, "n 1"]]:
-    """Specific force along z against the model's ``force`` (m/s^2) behind the accelerometer's low-pass.
+    """Innovations of the specific force along z, relative to the model's force behind the accelerometer's low-pass.
 
-    What the model misses is an offset that wanders, and a rotor error.
+    The state holds a slowly varying offset and the rotor error. Without the low-pass (30 Hz on the Crazyflie) the slope
+    of thrust over rotor speed would be underestimated.
 
-    Without the low-pass (30 Hz on the Crazyflie) the slope of thrust over rotor speed comes out too small.
+    Args:
+        noise: noise levels.
+        piece: one segment.
+        force: the model's specific force along z, m/s^2.
+        unlogged: effect of commands that were not logged.
+        robust: limit the influence of outliers.
     """
     slope = unlogged.force
     r, d, lag = noise.accelerometer**2, noise.force_disturbance**2, noise.accelerometer_lag
@@ -113,7 +133,7 @@ def force_innovations(
 
 
 class _Belief(NamedTuple):
-    """Rotor speed x and wandering error of its steady value b, with covariance, each (..., 4)."""
+    """Rotor speed x and slowly varying error b of its steady value, with their covariance, each (..., 4)."""
 
     x: Array
     b: Array
@@ -125,15 +145,15 @@ class _Belief(NamedTuple):
 def rotor_innovations(
     parameters: Parameters, noise: Noise, piece: Segments, robust: bool
 ) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"]]:
-    """Rotor speeds from commands, with a wandering error of the steady speed (battery, load)."""
+    """Innovations of the rotor speeds predicted from commands, with a slowly varying error of the steady speed."""
     _, (_, _, error, variance) = _rotor_filter(parameters, noise, piece, robust)
     return error, variance
 
 
 def smoothed_rotor_speed(parameters: Parameters, noise: Noise, piece: Segments, robust: bool) -> Float[Array, "rows 4"]:
-    """Rotor speeds from measurements and commands together (Rauch, Tung and Striebel 1965), rad/s.
+    """Rotor speeds, rad/s, smoothed from measurements and commands together (Rauch, Tung and Striebel 1965).
 
-    Differences of raw readings carry more noise than a rotor's acceleration does, and errors in a regressor pull J_m
+    Differences of raw readings are noisier than a rotor's acceleration is large, and errors in a regressor bias J_m
     towards zero.
     """
     start, (prior, post, _, _) = _rotor_filter(parameters, noise, piece, robust)
@@ -175,13 +195,13 @@ def _rotor_filter(parameters: Parameters, noise: Noise, piece: Segments, robust:
         prior = _Belief(
             x,
             b,
-            # The floor keeps the padding's covariance invertible for the smoother.
+            # The small constant keeps the covariance in the padding invertible for the smoother.
             decay**2 * at.pxx + 2 * decay * mix * at.pxb + mix**2 * (at.pbb + miss**2) + q * dt + 1e-6,
             keep * (decay * at.pxb + mix * at.pbb),
             keep**2 * at.pbb + d * (1 - keep**2) + 1e-6,
         )
         s, e = prior.pxx + r, measured - x
-        # The padding repeats the last reading; it must count once.
+        # The padding repeats the last reading, which must count only once.
         kx, kb = valid * prior.pxx / s, valid * prior.pxb / s
         step = limited(e, s, robust)
         post = _Belief(

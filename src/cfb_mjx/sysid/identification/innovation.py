@@ -1,14 +1,14 @@
-"""One-step innovations of a filter with a slowly varying disturbance: the estimator that feedback does not bias.
+"""One-step innovations of filters with a slowly varying disturbance: the estimator that feedback does not bias.
 
-Flights are flown under feedback: the commands answer disturbances the model does not know. Predicting many steps ahead
-from such data correlates input and error, and least squares then bends the inertia to fit. Here every row is predicted
-from the rows before it only, by a Kalman filter per channel whose state holds the quantity itself and an unknown
-acceleration that wanders (Ornstein-Uhlenbeck). With that noise described, the prediction errors of the true parameters
-are white, and their likelihood is maximised without bias whatever the controller does (Ljung, System Identification,
-2nd ed., section 13.4).
+Flights are flown under feedback, so the commands respond to disturbances that the model does not know. In multi-step
+predictions from such data the input is correlated with the error, and least squares then biases the inertia. Here every
+row is predicted from earlier rows only, by one Kalman filter per channel. Its state holds the quantity itself and an
+unknown, slowly varying acceleration (an Ornstein-Uhlenbeck process). If this noise model is right, the innovations at
+the true parameters are white for any controller, and maximising their likelihood gives unbiased estimates (Ljung,
+System Identification, 2nd ed., section 13.4).
 
-Measured rotor speeds are an input of the body, not an output: they are smoothed over the whole segment, and only what
-the gyro and the accelerometer say is predicted from the past alone.
+Measured rotor speeds are an input of the body, not an output. Therefore they are smoothed over the whole segment, and
+only gyro and accelerometer are predicted from the past alone.
 """
 
 from __future__ import annotations
@@ -37,26 +37,32 @@ from cfb_mjx.sysid.identification.flight_data import Segments
 from cfb_mjx.sysid.identification.noise import Noise
 
 CHANNELS = ("rate_x", "rate_y", "rate_z", "specific_force_z", "rotor_1", "rotor_2", "rotor_3", "rotor_4")
+"""Channels of the innovations."""
 
 START = 0.1
-"""Std of a rotor's speed at the first row of a segment about its steady speed then, as a share of the motor gain."""
+"""Standard deviation of a rotor speed about its steady value at the first row of a segment, over the motor gain."""
 
 
 class Drive(eqx.Module):
-    """What the rotors do to the body, row by row."""
+    """Loads of the rotors on the body at each row."""
 
     torque: Float[Array, "s n 3"]
-    """Mean over the interval before a row, about the centre of gravity, N m."""
+    """Mean torque over the interval before a row, about the centre of gravity, N m."""
     force: Float[Array, "s n"]
-    """Specific force along z at the row and at the rotors' centre, where the accelerometer is, m/s^2."""
+    """Specific force along z at a row, at the rotors' centre, where the accelerometer is, m/s^2."""
 
 
 def drive(
     parameters: Parameters, noise: Noise, segments: Segments, use_measured: bool = True, robust: bool = False
 ) -> Drive:
-    """Rotor loads from measured rotor speeds where a segment has them (if ``use_measured``), else from commands.
+    """Compute the rotors' loads from measured rotor speeds, or from commands where there are none.
 
-    Of ``noise`` only the rotors' levels matter.
+    Args:
+        parameters: the drone.
+        noise: noise levels; only those of the rotors are used.
+        segments: flight data.
+        use_measured: use measured rotor speeds in segments that have them.
+        robust: limit the influence of outliers on the smoothed rotor speeds.
     """
 
     def one(piece: Segments) -> Drive:
@@ -81,20 +87,20 @@ def innovations(
     robust: bool = False,
     weighed: Parameters | None = None,
 ) -> tuple[Float[Array, "s n 8"], Float[Array, "s n 8"]]:
-    """Innovations and their variances (`CHANNELS`), zero and one where a row does not count.
+    """Innovations of `CHANNELS` and their variances; zero and one where a row does not count.
 
-    The rotor channels count where rotor speed was measured; they are predicted from the commands.
+    The rotor channels are predicted from commands, and count where rotor speed was measured.
 
     Args:
         parameters: the drone.
         noise: noise levels.
         segments: flight data.
         driven: `drive` of the same parameters and segments.
-        use_measured: as it was driven.
-        robust: let no reading move a filter by more than three standard deviations.
-        weighed: parameters that say what errors of the commands do to the body; ``parameters`` by default.
+        use_measured: as for `drive`.
+        robust: limit the correction of a filter by any reading to three standard deviations.
+        weighed: parameters for the effect of commands that were not logged; by default ``parameters``.
     """
-    # As weights these are not differentiated by the parameters.
+    # These serve as weights, so no derivative is taken through them.
     weighed = jax.lax.stop_gradient(parameters if weighed is None else weighed)
 
     def one(piece: Segments, loads: Drive):
@@ -125,27 +131,29 @@ def _modelled_speed(parameters: Parameters, piece: Segments) -> Float[Array, "n 
 
 
 def _loads(parameters, dt, start, end, excess, body_rate):
-    """Mean torque about the centre of gravity over an interval (N m), and specific force along z at its end (m/s^2).
+    """Mean torque about the centre of gravity over an interval, N m, and specific force along z at its end, m/s^2.
 
-    ``excess`` is by how much the mean of the steady speeds commanded is above the one that leads from start to end:
-    the mean of the rotor speed is above the path's by as much, as T (end - start) is the integral of either's distance.
+    ``excess`` is the difference between the mean of the commanded steady speeds and the constant steady speed that
+    leads from ``start`` to ``end``. The mean rotor speed differs from that of the exponential path by the same amount,
+    because in both cases T (end - start) is the integral of steady speed minus rotor speed.
     """
     constants = rotors.prepare(parameters, dt)
     risen = -jnp.expm1(-dt / parameters.motor_time_constant)
-    # Towards the steady speed whose exponential passes through both ends: a straight line would be off by its sag.
+    # Steady speed of the exponential through both ends; a straight line would ignore the curvature.
     goal = start + (end - start) / jnp.where(risen > 0, risen, 1.0)
     mean = wrench_of(
         parameters, rotors.path_to(constants, Vec.unstack(start + excess), Vec.unstack(goal + excess)).mean
     )
     torque = mean.torque - Vec.unstack(parameters.center_of_gravity).cross(mean.force)
-    # At the rotors' centre: 3 mm off it, turning at 100 rad/s^2 reads 0.3 m/s^2, twice the accelerometer's noise.
+    # Specific force at the rotors' centre: 3 mm away from it, an angular acceleration of 100 rad/s^2 adds 0.3 m/s^2,
+    # twice the accelerometer's noise.
     last = wrench_of(parameters, rotors.loads_at(constants, Vec.unstack(end), 0.0 * Vec.unstack(end)))
     apart = jax.tree.map(lambda x: Vec.unstack(x) if x.ndim else x, parameters)
     return torque.stack(), at_rotor_center(apart, last, Vec.unstack(body_rate))[1].components[2]
 
 
 def _unlogged(parameters: Parameters, noise: Noise, piece: Segments, use_measured: bool) -> Unlogged:
-    """Rotor errors that the filters must allow for: of the first row, and of commands that were not logged."""
+    """Rotor-speed errors to be modelled by the filters: at the first row, and from commands that were not logged."""
     interval, lag = piece.interval[1:], jnp.mean(parameters.motor_time_constant)
     decay = jnp.exp(-interval / lag)
     counts = 1.0 - jnp.asarray(piece.measured) * use_measured
@@ -169,15 +177,16 @@ def _unlogged(parameters: Parameters, noise: Noise, piece: Segments, use_measure
 
 
 def as_held(parameters: Parameters, hold: Float[Array, ""] | None, segments: Segments) -> Segments:
-    """Commands replaced by constants over the interval after each row that move the rotors as far as the true ones did.
+    """Replace the commands between two rows by the constant command that moves the rotors equally far.
 
-    A controller faster than the log sends commands between rows. Each logged one acts for ``hold`` seconds (the
-    controller's period); the others are taken to lie on the parabola through the two logged about them and the one
-    before (a line would make fast commands too small: 4 % at 11 Hz of rows 10 ms apart).
+    A controller that is faster than the log sends commands between rows. Each logged command acts for ``hold`` seconds
+    (the controller's period). The others are assumed to lie on the parabola through the logged commands before and
+    after them and the one before these. (A straight line would underestimate fast commands, by 4 % at 11 Hz with rows
+    10 ms apart.)
 
     Args:
-        parameters: the drone; only the motors' lag matters, by which later commands count for more.
-        hold: s; None, or infinite, takes every command to act until the next row.
+        parameters: the drone; only the motors' lag is used, because later commands have more influence.
+        hold: s; if None or infinite, every command acts until the next row.
         segments: flight data.
     """
     if hold is None:
@@ -193,7 +202,7 @@ def as_held(parameters: Parameters, hold: Float[Array, ""] | None, segments: Seg
     bend = (step - jnp.concatenate([step[:, :1], step[:, :-1]], axis=1) / ratio) / (1 + ratio)
     between = share * step - (1 - held**2) / 6 * bend
     command = jnp.asarray(segments.command).at[:, :-1].add(jnp.where(interval > 0, between, 0.0))
-    # Later ones count for more in the rotors' speed at the next row, and for no more in their mean on the way there.
+    # Later commands have more influence on the rotor speed at the next row, but not on its mean over the interval.
     excess = jnp.asarray(segments.excess).at[:, :-1].set(jnp.where(interval > 0, -later * step, 0.0))
     unsure = jnp.sqrt(jnp.clip(1 - held**2, 0.0, 1.0)) * segments.doubt[:, :-1]
     doubt = jnp.asarray(segments.doubt).at[:, :-1].set(jax.lax.stop_gradient(unsure))
@@ -201,22 +210,23 @@ def as_held(parameters: Parameters, hold: Float[Array, ""] | None, segments: Seg
 
 
 class Weights(NamedTuple):
-    """What innovations are weighed by; while a least-squares fit runs, by what it began with.
+    """Weights of the innovations, which stay constant during a least-squares fit.
 
-    If the weights followed the parameters, the sum of squares would fall where variances grow, and no step along its
-    slope (which is that of the innovations alone) would lower it.
+    If the weights followed the parameters, the sum of squares would decrease where the variances grow. But the gradient
+    that the solver uses is that of the innovations alone, so its steps would not lower the sum.
     """
 
     parameters: Parameters
     doubt: Float[AnyArray, "s n 4"]
-    """Of the commands (`Segments.doubt`)."""
+    """Uncertainty of the commands (`Segments.doubt`)."""
     variance: Float[Array, "s n 8"]
+    """Variance of each innovation."""
 
 
 def weights(
     parameters: Parameters, noise: Noise, segments: Segments, use_measured: bool = True, robust: bool = False
 ) -> Weights:
-    """Of the innovations of these parameters."""
+    """Weights from the innovations' variances at the given parameters."""
     driven = drive(parameters, noise, segments, use_measured, robust)
     _, variance = innovations(parameters, noise, segments, driven, use_measured, robust)
     return jax.lax.stop_gradient(Weights(parameters, segments.doubt, variance))
@@ -230,7 +240,16 @@ def whitened(
     robust: bool = False,
     weighed: Weights | None = None,
 ) -> Float[Array, "s n 8"]:
-    """Innovations over their standard deviations, which are not differentiated: as ``weighed``, or their own."""
+    """Innovations divided by their standard deviations, which are constants in derivatives.
+
+    Args:
+        parameters: the drone.
+        noise: noise levels.
+        segments: flight data.
+        use_measured: as for `drive`.
+        robust: as for `innovations`.
+        weighed: fixed weights; by default the innovations' own variances.
+    """
     if weighed is not None:
         segments = eqx.tree_at(lambda s: s.doubt, segments, weighed.doubt)
     driven = drive(parameters, noise, segments, use_measured, robust)

@@ -1,4 +1,4 @@
-"""Noise of a flight: what the sensors do to what they measure, and what pushes the drone that no model knows."""
+"""Noise model of a flight: measurement noise of the sensors, and disturbances that the model does not describe."""
 
 from __future__ import annotations
 
@@ -12,53 +12,53 @@ from cfb_mjx.sysid.identification.flight_data import FlightData
 _SHORTEST, _LONGEST = 0.03, 3.0  # correlation time of the disturbance, s
 
 UNTIMED = 0.3
-"""Least of `Noise.command`: a step came at any moment between two rows (1 / sqrt(12) of it), however smooth the others
-are. Steps that come in time with the rows would else decide how long commands act."""
+"""Lower bound of `Noise.command`: a step may occur at any moment between two rows (1 / sqrt(12) of it), however smooth
+the other commands are. Otherwise, steps in phase with the rows would dominate the estimate of the command hold."""
 _FLOORS = np.array([1e-4] * 6 + [1e-3] * 3 + [1e-3, 1e-5, 1e-3, 1e-2, 1e-2, 1e-2, UNTIMED])
-"""Least of every level, in the order of `Noise` without the correlation time."""
+"""Lower bound of every level, in the order of `Noise` without the correlation time."""
 
 
 class Noise(eqx.Module):
-    """Standard deviations, one per axis where there are axes, and the two time constants that go with them."""
+    """Noise levels (standard deviations, one per axis where there are axes) and the two time constants."""
 
     gyro: Float[Array, "3"]
-    """White noise of a gyro row, rad/s."""
+    """White measurement noise of the gyro per row, rad/s."""
     rate_walk: Float[Array, "3"]
     """White angular acceleration, rad/s per square root of a second."""
     disturbance: Float[Array, "3"]
-    """Wandering angular acceleration, rad/s^2."""
+    """Slowly varying angular acceleration, rad/s^2."""
     correlation_time: Float[Array, ""]
-    """Of the wandering angular acceleration, s."""
+    """Correlation time of the slowly varying angular acceleration, s."""
     accelerometer: Float[Array, ""]
-    """White noise of the z accelerometer, m/s^2."""
+    """White measurement noise of the z accelerometer per row, m/s^2."""
     accelerometer_lag: Float[Array, ""]
     """Time constant of the accelerometer's low-pass filter, s."""
     force_disturbance: Float[Array, ""]
-    """Wandering specific force along z, m/s^2."""
+    """Slowly varying specific force along z, m/s^2."""
     rotor: Float[Array, ""]
-    """White noise of a rotor speed row, rad/s."""
+    """White measurement noise of the rotor speed per row, rad/s."""
     rotor_walk: Float[Array, ""]
-    """White rotor acceleration, rad/s per square root of a second: what the motor model misses."""
+    """White rotor acceleration, for errors of the motor model, rad/s per square root of a second."""
     rotor_disturbance: Float[Array, ""]
-    """Wandering error of the steady rotor speed, rad/s."""
+    """Slowly varying error of the steady rotor speed, rad/s."""
 
     command: Float[Array, ""]
-    """Error of the mean command between two rows, as a share of `Segments.doubt`: commands that were not logged."""
+    """Error of the mean command between two rows due to commands not logged, as a share of `Segments.doubt`."""
 
     def to_vector(self) -> Float[Array, "17"]:
-        """Unconstrained numbers, for optimisation."""
+        """Unconstrained vector for optimisation."""
         middle = jnp.sqrt(_SHORTEST * _LONGEST)
         time = jnp.log(self.correlation_time / middle) / jnp.log(_LONGEST / middle)
         levels = (self.gyro, self.rate_walk, self.disturbance, self.accelerometer, self.accelerometer_lag)
         levels = (*levels, self.force_disturbance, self.rotor, self.rotor_walk, self.rotor_disturbance, self.command)
         levels = jnp.concatenate([jnp.atleast_1d(level) for level in levels])
-        # A level at its floor stays there and movable: a thousandth of the floor above it.
+        # A level at its bound is placed slightly above it, so that its logarithm stays finite.
         logs = jnp.log(jnp.maximum(levels - _FLOORS, 1e-3 * _FLOORS))
         return jnp.concatenate([logs[:9], jnp.arctanh(jnp.clip(time, -0.999, 0.999))[None], logs[9:]])
 
     @staticmethod
     def from_vector(vector: Float[Array, "17"]) -> Noise:
-        """Inverse of `to_vector`; a floor keeps a vanishing level from flattening the likelihood."""
+        """Inverse of `to_vector`. The levels have lower bounds, because the likelihood is flat where a level vanishes."""
         x = jnp.exp(jnp.concatenate([vector[:9], vector[10:]])) + _FLOORS
         middle = jnp.sqrt(_SHORTEST * _LONGEST)
         return Noise(
@@ -77,7 +77,7 @@ class Noise(eqx.Module):
 
     @staticmethod
     def first(data: FlightData) -> Noise:
-        """Where a fit starts: sensors as their third differences show, the rest as seen on real flights."""
+        """Initial noise levels of a fit: sensor noise from third differences, the rest as typical of real flights."""
         rotor = data.rotor_speed_noise if np.isfinite(data.rotor_speed_noise) else 10.0
         levels = dict(
             gyro=np.maximum(data.rate_noise, 1e-3),
@@ -92,5 +92,5 @@ class Noise(eqx.Module):
             rotor_disturbance=20.0,
             command=2 * UNTIMED,
         )
-        # An explicit type: weakly typed numbers would compile every program twice.
+        # Explicit dtype: with weakly typed numbers every program would be compiled twice.
         return Noise(**{name: jnp.asarray(level, jnp.result_type(float)) for name, level in levels.items()})

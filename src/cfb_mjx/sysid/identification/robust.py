@@ -1,4 +1,4 @@
-"""Outliers: readings that no Gaussian noise of the level found explains, such as a bad radio packet."""
+"""Robust treatment of outliers, such as bad radio packets: Huber's loss and a mixture density."""
 
 from __future__ import annotations
 
@@ -6,11 +6,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 OUTLIER = 3.0
-"""Beyond so many standard deviations an error counts linearly instead of squared (Huber 1964), and moves no filter."""
+"""Threshold, in standard deviations, beyond which an error counts linearly instead of squared (Huber 1964), and to
+which the correction of a filter is limited."""
 
 
 def limited(error: Array, variance: Array, robust: bool) -> Array:
-    """The part of an innovation a filter believes."""
+    """The innovation by which a filter is corrected; with ``robust``, limited to `OUTLIER` standard deviations."""
     if not robust:
         return error
     bound = OUTLIER * jnp.sqrt(variance)
@@ -18,24 +19,24 @@ def limited(error: Array, variance: Array, robust: bool) -> Array:
 
 
 def tempered(whitened: Array, robust: bool) -> Array:
-    """Residuals in standard deviations; with ``robust``, half their square is Huber's loss."""
+    """Residuals in standard deviations; with ``robust``, transformed so that half their square is Huber's loss."""
     if not robust:
         return whitened
     size = jnp.abs(whitened)
-    # The inner maximum keeps the gradient of the branch not taken finite.
+    # The inner maximum keeps the gradient of the unused branch finite.
     outside = jnp.sqrt(2 * OUTLIER * jnp.maximum(size, OUTLIER) - OUTLIER**2)
     return jnp.where(size <= OUTLIER, whitened, jnp.sign(whitened) * outside)
 
 
 SHARE, SPREAD = 0.01, 50.0
-"""Outliers as noise levels are found: this share of the readings, with so many times the noise of the others."""
+"""Assumed share of outliers when noise levels are fitted, and their noise as a multiple of that of the others."""
 
 
 def surprise(whitened: Array, robust: bool) -> Array:
-    """Minus twice the log-density of residuals in standard deviations, without the constant.
+    """Minus twice the log-density of residuals in standard deviations, up to a constant.
 
-    With ``robust``, of a mixture of good readings and outliers: a scale found with Huber's loss would still grow with
-    the size of the outliers.
+    With ``robust``, the density is a mixture of good readings and outliers, because a scale estimated with Huber's loss
+    would still grow with the size of the outliers.
     """
     if not robust:
         return whitened**2

@@ -1,4 +1,4 @@
-"""The fit itself: projected Gauss-Newton steps on the predictions' robust loss."""
+"""Fit of model parameters to predictions: projected Gauss-Newton steps on a robust loss."""
 
 from __future__ import annotations
 
@@ -20,35 +20,41 @@ from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 
 @dataclass(frozen=True)
 class Refinement:
-    """Outcome of `refine`."""
+    """Outcome of `refine`.
+
+    Attributes:
+        model: the fitted drone, without trims.
+        numbers: the N fitted parameters.
+        values: (N,) of the parameters.
+        deviations: (N,) standard deviations, from the scatter of blocks of windows; NaN for a parameter at a bound.
+        trims: trim torque (3,) of each flight, N m, by log name.
+        cost: mean loss before and after the fit.
+        normal: normal equations at ``values``.
+        data: windows that were predicted.
+    """
 
     model: Quadrotor
     numbers: tuple[Number, ...]
     values: np.ndarray
     deviations: np.ndarray
-    """Standard deviations from the scatter of blocks of windows; NaN where a number stands at a bound."""
     trims: dict[str, np.ndarray]
-    """(3,) of each flight, N m."""
     cost: tuple[float, float]
-    """Mean loss before and after."""
     normal: Normal
-    """Normal equations at ``values``."""
     data: Predictions
-    """What was predicted."""
 
     def at_bound(self, number: Number) -> bool:
-        """Whether a number stands where it may not go further."""
+        """Whether a parameter is at one of its bounds."""
         value, margin = self.values[self.numbers.index(number)], AT_BOUND * number.scale
         return bool(number.held or value <= number.low + margin or value >= number.high - margin)
 
     @property
     def pressed(self) -> list[str]:
-        """Names of strengths of effects (`Effect.strengths`) that stand at a bound."""
+        """Names of the strengths of effects (`Effect.strengths`) that are at a bound."""
         fitted = (n for n in self.numbers if not n.held)
         return [n.name for n in fitted if n.field in KNOWN[n.effect].strengths and self.at_bound(n)]
 
     def uncertainty(self, effect: str) -> dict[str, float | list[float | None] | None]:
-        """Standard deviations of an effect's numbers by field; None where one stands at a bound."""
+        """Standard deviations of an effect's parameters by field; None for a parameter at a bound."""
         found: dict[str, Any] = {}
         for number, std in zip(self.numbers, self.deviations, strict=True):
             if number.effect == effect:
@@ -58,7 +64,7 @@ class Refinement:
 
     @property
     def correlation(self) -> np.ndarray:
-        """(N, N) of the numbers' errors; NaN for those at a bound."""
+        """Correlation (N, N) of the parameters' errors; NaN for parameters at a bound."""
         free = np.array([not self.at_bound(n) for n in self.numbers])
         inverse = np.linalg.inv(self.normal.weighed(free))[: free.sum(), : free.sum()]
         spread = np.sqrt(np.diag(inverse))
@@ -67,11 +73,11 @@ class Refinement:
         return found
 
     def foreseen(self, numbers: Sequence[Number], model: Quadrotor) -> float:
-        """Mean loss that more numbers promise, as far as the loss's curvature where they begin tells.
+        """Mean loss after one Gauss-Newton step with additional parameters.
 
         Args:
-            numbers: of effects that are not fitted yet.
-            model: with these effects, at values at which they hardly act.
+            numbers: additional parameters, of effects that are not fitted yet.
+            model: the drone with these effects, at values where they hardly act.
         """
         every = (*self.numbers, *numbers)
         model = _prepared(model, every)
@@ -86,15 +92,15 @@ class Refinement:
         return data.started(tried).cost(tried, trims + turn * TRIM)
 
     def growth(self, effects: Sequence[str]) -> float:
-        """By how much the mean loss grows without some effects, as far as its curvature at the optimum tells."""
+        """Increase of the mean loss without some effects, according to its curvature at the optimum."""
         matrix, change, answer = self._answer(effects)
         whole = change + answer
         return float(0.5 * whole @ matrix @ whole / self.data.count)
 
     def without(self, effects: Sequence[str]) -> Left:
-        """What is left without some effects.
+        """Errors of the predictions without some effects.
 
-        The other numbers make up for them as far as the curvature of the loss at the optimum tells; not at all if that
+        The other parameters compensate according to the curvature of the loss at the optimum, or not at all if that
         predicts worse.
         """
         _, change, answer = self._answer(effects)
@@ -112,15 +118,15 @@ class Refinement:
 
     @property
     def left(self) -> Left:
-        """What is left with all effects."""
+        """Errors of the predictions with all effects."""
         return self.judged(self.model)
 
     def judged(self, model: Quadrotor) -> Left:
-        """What another model leaves of the same predictions, each flight with the trim that was found."""
+        """Errors of the same predictions by another model, each flight with its fitted trim."""
         return self._left(model, self._trims)[0]
 
     def loss(self, model: Quadrotor) -> float:
-        """Mean loss of the same predictions by another model, likewise."""
+        """Mean loss of the same predictions by another model, each flight with its fitted trim."""
         return self._left(model, self._trims)[1]
 
     @property
@@ -128,7 +134,7 @@ class Refinement:
         return np.array(list(self.trims.values()))
 
     def _left(self, model: Quadrotor, trims: np.ndarray) -> tuple[Left, float]:
-        """What a model leaves with some trims, and its mean loss."""
+        """Errors of a model's predictions with the given trims, and their mean loss."""
         trimmed = _trimmed(model)
         data = self.data.started(trimmed)
         errors = data.errors(trimmed, trims)
@@ -136,11 +142,13 @@ class Refinement:
         return Left(model, errors, losses), data.mean(losses, trims)
 
     def _answer(self, effects: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """How the fit answers to some effects' absence, all in scales: numbers first, then the trims if estimated.
+        """Linear response of the fit to the removal of effects, in units of the scales.
+
+        The order is that of the parameters, then of the trims if they are estimated.
 
         Returns:
-            The weighed matrix, the change of the effects' numbers to neutral, and the move of the others that makes up
-            for it.
+            The weighted normal matrix, the change of the removed effects' parameters to neutral, and the compensating
+            change of the others.
         """
         out = np.array([n.effect in effects for n in self.numbers])
         _, _, scale = bounds(self.numbers)
@@ -157,12 +165,12 @@ class Refinement:
 
 @dataclass(frozen=True)
 class Left:
-    """What a model leaves of the predictions of a fit, each by commands and by rotor speeds where measured.
+    """Errors of a model on the windows of a fit, predicted from commands and, where measured, from rotor speeds.
 
     Attributes:
-        model: the model.
-        errors: (W, H, 2) of attitude and velocity, over what `hold` errs.
-        losses: (W, H, 2) of these.
+        model: the drone.
+        errors: (W, H, 2) errors of attitude and velocity relative to `hold`, one array per kind of prediction.
+        losses: (W, H, 2) their losses.
     """
 
     model: Quadrotor
@@ -182,32 +190,33 @@ def refine(
     most_windows: int | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Refinement:
-    """Fit numbers of a model to its predictions of attitude and velocity at `HORIZONS`.
+    """Fit parameters of a model to its predictions of attitude and velocity at `HORIZONS`.
 
-    The loss of a window is the norm of its error over what `hold` errs at that horizon, squared where small and linear
-    where large, so that no window that goes astray decides. Commands go in, and in a second set of predictions the
-    measured rotor speeds of the flights that have them; both count. Rotor speeds and memories at a window's start come
-    from what was logged before, by the model as it stands at that step of the fit. Every flight counts the same,
-    however long, unless ``weights`` say otherwise. Solved by projected Gauss-Newton steps; run with x64 enabled.
+    The loss is the Huber loss of the norm of each error, relative to the mean error of `hold` at that horizon, so that
+    outlying windows do not dominate. Each window is predicted from commands, and a second time from measured rotor
+    speeds if the flight has them. Rotor speeds and effect memories at a window's start come from the log before it,
+    replayed by the current model of the fit. All flights have the same weight regardless of their length, unless
+    ``weights`` are given. The solver takes projected Gauss-Newton steps. Run with x64 enabled.
 
     Args:
-        model: where to start; effects it lacks are added at neutral.
+        model: where to start; effects that it does not have are added at neutral.
         logs: flights.
-        numbers: what may move (`plausible_numbers`, `free_numbers`); values outside their bounds are brought inside.
-        faults: of the recording, taken out first.
-        weights: of flights by name, where not 1.
-        trimmed: estimate a trim torque of every flight beside the numbers. Without it the numbers are those that serve
-            best on a flight whose trim nobody knows.
-        trims: (3,) of each flight by name, N m, to start from; zero by default.
-        iterations: steps at most.
-        most_windows: windows overlap, and every second or third of them tells nearly as much; by default all count.
-        progress: told what happens.
+        numbers: parameters to fit (`plausible_numbers`, `free_numbers`); values outside their bounds are clipped.
+        faults: of the recording, which are removed first.
+        weights: weights of flights by log name; 1 by default.
+        trimmed: estimate a trim torque for every flight. Without it, the parameters are optimal for flights whose trim
+            is unknown.
+        trims: initial trim torques (3,) by log name, N m; zero by default.
+        iterations: maximum number of steps.
+        most_windows: maximum number of windows; by default all. Windows overlap, so every second or third of them
+            gives nearly the same result.
+        progress: called with a message after each step.
 
     Raises:
-        CfbError: no numbers, no 64-bit numbers, or no log that allows a window.
+        CfbError: there are no parameters to fit, x64 is not enabled, or no log allows a window.
     """
     if jnp.result_type(float) != np.float64:
-        raise CfbError('refine needs 64-bit numbers: jax.config.update("jax_enable_x64", True) before anything else.')
+        raise CfbError('refine needs 64-bit numbers: call jax.config.update("jax_enable_x64", True) first.')
     if not numbers:
         raise CfbError("refine needs at least one number to fit; name an effect.")
     numbers = tuple(numbers)
@@ -249,18 +258,18 @@ def refine(
 
 
 def bounds(numbers: Sequence[Number]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(N,) lowest and highest values, and scales."""
+    """Lower bounds, upper bounds and scales of N parameters, each (N,)."""
     low, high, scale = np.array([(n.low, n.high, n.scale) for n in numbers]).T
     return low, high, scale
 
 
 def _prepared(model: Quadrotor, numbers: tuple[Number, ...]) -> Quadrotor:
-    """Precise, with every effect that is asked for and a trim as the last one."""
+    """The model with every effect of ``numbers`` and a trim as its last effect."""
     names = dict.fromkeys(n.effect for n in numbers)
     here = {type(e).name for e in model.effects}
     added = tuple(KNOWN[name].neutral() for name in names if name not in here)
     if {RotorDrag.name, ParasiticDrag.name} & {*names, *here}:
-        # Their drag carries a wind; a conductance beside it would count it twice.
+        # The drag effects transmit the wind; with a conductance of its own the wind would count twice.
         added = tuple(Wind(0.0, 0.0) if isinstance(effect, Wind) else effect for effect in added)
     return _trimmed(Quadrotor(model.parameters, (*model.effects, *added), body=model.body))
 

@@ -1,4 +1,4 @@
-"""Refining the effects of a model file: what comes out is a model file again, and what to report."""
+"""Refine the effects of a model file; the result is again a model file, with a report."""
 
 from __future__ import annotations
 
@@ -28,14 +28,17 @@ def by_innovations(
     as_logged: bool = False,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[ModelFile, dict[str, Any]]:
-    """The model with some effects fitted to innovations, and what to report.
+    """Fit some effects of a model file to one-step innovations.
 
     Args:
-        base: where to start.
+        base: the model to start from.
         logs: flights; run with x64 enabled.
-        names: of the effects.
+        names: effects to fit.
         as_logged: as for `fit_given`.
-        progress: told what happens.
+        progress: called with a message at each step.
+
+    Returns:
+        The fitted model, and a report with value, standard deviation and bound of each parameter under ``numbers``.
 
     Raises:
         CfbError: as `fit_given`.
@@ -65,15 +68,19 @@ def by_predictions(
     weights: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda _: None,
 ) -> tuple[ModelFile, dict[str, Any]]:
-    """The model with some effects fitted to its predictions, and what to report.
+    """Fit some effects of a model file to multi-step predictions.
 
     Args:
-        base: where to start.
+        base: the model to start from.
         logs: flights; run with x64 enabled.
-        names: of the effects.
-        predictor: leave free what a plant may not change; the model is then marked as one.
+        names: effects to fit.
+        predictor: use the wider bounds of `free_numbers` and mark the model as a predictor.
         weights: as for `refine`.
-        progress: told what happens.
+        progress: called with a message at each step.
+
+    Returns:
+        The fitted model, and a report with the parameters (``numbers``), the mean loss before and after (``loss``) and
+        the trim torque of each flight, N m (``trim_torque_nm``).
 
     Raises:
         CfbError: as `refine`.
@@ -81,7 +88,7 @@ def by_predictions(
     start = Quadrotor.from_file(base)
     numbers = free_numbers(names) if predictor else plausible_numbers(start.parameters, names)
     faults = SensorFaults.from_mappings(base.effects, f"model {base.name}")
-    # What a predictor is for is the next flight, and nobody knows that one's trim.
+    # A predictor is used on new flights, whose trim is unknown.
     found = refine(start, logs, numbers, faults, weights=weights, trimmed=not predictor, progress=progress)
     rows = {}
     for number, value, std in zip(found.numbers, found.values, found.deviations, strict=True):
@@ -99,26 +106,26 @@ def by_predictions(
 
 
 def as_logged(model: ModelFile) -> ModelFile:
-    """The model of a recording out of which no sensor fault is taken, see `SensorFaults.as_logged`."""
+    """The model for flights from which no sensor fault is removed (`SensorFaults.as_logged`)."""
     known = SensorFaults.from_mappings(model.effects, f"model {model.name}").as_logged.to_mappings()
     physics = (e for e in model.effects if e["name"] not in SENSOR_FAULTS)
     return replace(model, effects=(*physics, *known))
 
 
 def judge(model: ModelFile, logs: Sequence[FlightLog]) -> dict[str, Any]:
-    """The evaluation of a model file, as in ``cfb evaluate --json``."""
+    """Evaluate a model file on flights; the result is that of ``cfb evaluate --json``."""
     faults = SensorFaults.from_mappings(model.effects, f"model {model.name}")
     return evaluate(Quadrotor.from_file(model), logs, faults=faults).to_json() | {"model": model.name}
 
 
 def _mappings(effects: Sequence[Effect], uncertainty: Mapping[str, dict]) -> list[dict]:
-    """Effects as a model file lists them, with what is known of their numbers' standard deviations."""
+    """Effects as listed in a model file, with the standard deviations that are known."""
     found = [effect_to_mapping(effect) for effect in effects]
     return [m | ({"uncertainty": uncertainty[m["name"]]} if uncertainty.get(m["name"]) else {}) for m in found]
 
 
 def _kept(base: ModelFile, names: Sequence[str]) -> dict[str, dict]:
-    """What the model says of the uncertainty of effects that are not fitted anew."""
+    """Uncertainties in the model file of the effects that are not refitted."""
     return {e["name"]: e["uncertainty"] for e in base.effects if "uncertainty" in e and e["name"] not in names}
 
 

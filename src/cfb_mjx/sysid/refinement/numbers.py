@@ -1,4 +1,4 @@
-"""Which numbers of a model a refinement may move, and how far."""
+"""Parameters of a model that a refinement may fit, and their bounds."""
 
 from __future__ import annotations
 
@@ -19,21 +19,29 @@ PLANT = (
     *("blade_flapping", "inflow_thrust", "rate_damping", "rotor_drag", "thrust_scale", "inertia", "cog_offset"),
     *("torque_scale", "thrust_tilt", "position_moment", "command_delay", "motor_asymmetry", "battery_sag"),
 )
-"""What a drone in one piece lacks beside the paper's model, all at once: one by one none of them predicts better.
-Loads, wind and what only some drones have are for where there is a reason."""
+"""Effects that an undamaged drone usually has beside the paper's model. They have to be fitted together, because none
+of them alone improves predictions. Loads, wind and other effects of only some drones are fitted on request."""
 INERTIA = 0.25
-"""Largest plausible change of a moment of inertia, as a share: what decks and another battery bring about."""
+"""Largest plausible relative change of a moment of inertia, for instance by decks and another battery."""
 HELD = 1e-12
-"""By so much a number that is held may move: its scale must not be nothing."""
+"""Half-width of the range of a held parameter; it must not be zero, because it is the parameter's scale."""
 STEP = 1e-5
-"""Of a finite difference, in a number's scale."""
+"""Step of a finite difference, in units of a parameter's scale."""
 AIR = 1.2
-"""Density, kg/m^3."""
+"""Air density, kg/m^3."""
 
 
 @dataclass(frozen=True)
 class Number:
-    """One component of a field of an effect, and where it may lie."""
+    """One parameter of a refinement: a component of a field of an effect, and its bounds.
+
+    Attributes:
+        effect: name of the effect.
+        field: of the effect.
+        index: component of the field; None for a scalar.
+        low: lower bound.
+        high: upper bound.
+    """
 
     effect: str
     field: str
@@ -43,44 +51,44 @@ class Number:
 
     @property
     def scale(self) -> float:
-        """Half the range: the unit the fit counts in."""
+        """Half the range, the unit of the fit."""
         return (self.high - self.low) / 2
 
     @property
     def name(self) -> str:
-        """For reports."""
+        """Name for reports, for instance ``inertia.relative[0]``."""
         at = "" if self.index is None else f"[{self.index}]"
         return f"{self.effect}.{self.field}{at}"
 
     @property
     def held_at_neutral(self) -> Number:
-        """The same, where it may not leave the value at which its effect vanishes.
+        """The same parameter, held at the value at which its effect vanishes.
 
-        A fit with such numbers runs the program compiled for all of them.
+        A fit with held parameters reuses the program compiled for all of them.
         """
         value = self.of_neutral()
         return replace(self, low=value - HELD, high=value + HELD)
 
     def said_by(self, effect: str) -> bool:
-        """Whether another effect says the same."""
+        """Whether the parameter is redundant with another effect (`Effect.said_by`)."""
         return KNOWN[self.effect].said_by.get(self.field) == effect
 
     @property
     def held(self) -> bool:
-        """Whether it may not move."""
+        """Whether the parameter is held fixed."""
         return self.high - self.low <= 4 * HELD
 
     def step(self, value: float) -> float:
-        """Of a finite difference at a value: upwards, unless that leaves the range."""
+        """Signed step of a finite difference at a value: upwards unless that leaves the range."""
         step = STEP * self.scale
         return step if value + step <= self.high else -step
 
     def of(self, model: Quadrotor) -> float:
-        """Its value in a model."""
+        """Value of the parameter in a model that has the effect."""
         return self._in(_effect(model, self.effect))
 
     def of_neutral(self) -> float:
-        """Its value where the effect vanishes."""
+        """Value of the parameter where the effect vanishes."""
         return self._in(KNOWN[self.effect].neutral())
 
     def _in(self, effect: Effect) -> float:
@@ -89,16 +97,21 @@ class Number:
 
 
 def plausible_numbers(parameters: Parameters, effects: Sequence[str]) -> tuple[Number, ...]:
-    """Every number of some effects within its prior range; inertia within `INERTIA`, inflow within momentum theory.
+    """All parameters of some effects, with physically plausible bounds.
 
-    Fields that no flight tells (`Effect.assumed`), and those that another of the effects says (`Effect.said_by`), stay
-    as the model has them.
+    The bounds are the prior ranges of the effects. The inertia is limited by `INERTIA`, the inflow coefficient by
+    momentum theory. Fields that no flight determines (`Effect.assumed`) and fields that are redundant with another of
+    the effects (`Effect.said_by`) are not fitted.
+
+    Args:
+        parameters: the drone, for the limit from momentum theory.
+        effects: names of the effects.
 
     Raises:
-        CfbError: an effect the catalogue does not have, or one that is no physics.
+        CfbError: an effect is not in the catalogue, or is not physical.
     """
     if RegressionDilution.name in effects:
-        raise CfbError(f"{RegressionDilution.name} is no physics: it is for predictors only (--predictor).")
+        raise CfbError(f"{RegressionDilution.name} is not a physical effect; it is for predictors only (--predictor).")
     # A disc of area A at hover loses at most dT/dv = 2 rho A v_h of its thrust T = 2 rho A v_h^2 to a climb (Leishman,
     # Principles of Helicopter Aerodynamics, ch. 2), and discs side by side are no wider than the rotors' spacing.
     area = np.pi * float(parameters.rotor_spacing) ** 2 / 4
@@ -108,10 +121,13 @@ def plausible_numbers(parameters: Parameters, effects: Sequence[str]) -> tuple[N
 
 
 def free_numbers(effects: Sequence[str]) -> tuple[Number, ...]:
-    """The same with inertia and inflow free: for predictors.
+    """All parameters of some effects, with wide bounds on inertia and inflow, for predictors.
+
+    Args:
+        effects: names of the effects.
 
     Raises:
-        CfbError: an effect the catalogue does not have.
+        CfbError: an effect is not in the catalogue.
     """
     bounds = {("inertia", "relative"): (-0.7, 4.0), ("inflow_thrust", "coefficient"): (-0.05, 0.2)}
     return _numbers(effects, bounds)
@@ -133,7 +149,13 @@ def _numbers(effects: Sequence[str], bounds: dict) -> tuple[Number, ...]:
 
 
 def with_values(model: Quadrotor, numbers: tuple[Number, ...], values: Any) -> Quadrotor:
-    """A model that has the effects of some numbers, with other values of these; differentiable by them."""
+    """The model with new values of some parameters; differentiable with respect to them.
+
+    Args:
+        model: the drone, with all effects of ``numbers``.
+        numbers: the N parameters.
+        values: (N,) their new values.
+    """
     effects = list(model.effects)
     order = {type(e).name: i for i, e in enumerate(effects)}
     for i, number in enumerate(numbers):

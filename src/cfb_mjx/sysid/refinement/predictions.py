@@ -1,4 +1,4 @@
-"""Predictions of many windows from many flights, their errors, and what these say of a model's numbers."""
+"""Predictions of many windows of many flights, their errors, and the normal equations of a model's parameters."""
 
 from __future__ import annotations
 
@@ -26,24 +26,27 @@ from cfb_mjx.sysid.refinement.numbers import STEP, Number, with_values
 from cfb_mjx.sysid.windows import Windows, find_starts, find_windows
 
 HORIZONS = (0.1, 0.2, 0.3, 0.4, 0.5)
+"""Horizons at which predictions are compared with measurements, s."""
 TRIM = 2e-4
-"""Standard deviation of a flight's trim torque, N m: a battery half a millimetre off its place."""
+"""Prior standard deviation of a flight's trim torque, N m: a battery half a millimetre off its place."""
 NO_MEAN = 1e4
-"""Weight of the trims' mean, in units of `TRIM`, against that of one window."""
+"""Weight of the squared mean of the trims, in units of `TRIM`, relative to the weight of one window."""
 HUBER = 0.3
-"""Errors count squared up to this share of what `hold` errs, linearly beyond."""
+"""Threshold of the Huber loss, relative to the error of `hold`."""
 AT_BOUND = 1e-3
-"""A number this near to a bound, in its scale, stands at it."""
+"""Distance from a bound, in units of the scale, within which a parameter counts as being at the bound."""
 ALIKE = 2.0
-"""Factor between the errors of `hold` within which two flights are of one kind."""
+"""Two flights are of one kind if the errors of `hold` differ by less than this factor."""
 CHUNK = 64
+"""Number of windows predicted at once."""
 GROUP = 12
-"""Models predicted side by side."""
+"""Number of models predicted at once."""
 _STEPS = 64
+"""Windows are padded to a multiple of this number of steps."""
 
 
 class Trim(Effect):
-    """A constant torque of one flight; a nuisance of the fit, not in the catalogue."""
+    """A constant torque of one flight: a nuisance parameter of the fit, not in the catalogue."""
 
     name: ClassVar[str] = "trim"
     units: ClassVar[dict[str, str]] = {"torque": "N m"}
@@ -59,32 +62,37 @@ class Trim(Effect):
 
 @dataclass(frozen=True)
 class Normal:
-    """Normal equations in units of the scales: shared numbers first, then three trims of every flight."""
+    """Normal equations in units of the scales: the model's parameters first, then three trims of every flight.
+
+    Attributes:
+        matrix: (n, n) Gauss-Newton matrix, without priors.
+        gradient: (n,) of the loss, without priors.
+        scatter: (n, n) sum over blocks of windows of the outer products of their gradients.
+        count: number of the model's parameters.
+        share: (F,) weights of the flights.
+        trimmed: whether the trims are estimated; otherwise they are fixed.
+    """
 
     matrix: np.ndarray
     gradient: np.ndarray
     scatter: np.ndarray
-    """Sum over blocks of windows of the outer product of their gradients."""
     count: int
-    """Of shared numbers."""
     share: np.ndarray
-    """(F,) what flights count."""
     trimmed: bool
-    """Whether every flight has a trim of its own; else they stay where they are."""
 
     def chosen(self, free: np.ndarray) -> np.ndarray:
-        """Positions of some of the shared numbers, ``free`` (count,), and of the trims that are estimated."""
+        """Positions of the model parameters marked in ``free`` (count,), and of the trims if they are estimated."""
         own = np.full(len(self.gradient) - self.count, self.trimmed)
         return np.flatnonzero(np.concatenate([free, own]))
 
     def weighed(self, free: np.ndarray) -> np.ndarray:
-        """The matrix with its priors, for those of `chosen`."""
+        """The matrix with the priors added, for the parameters of `chosen`."""
         trims = np.zeros(((len(self.gradient) - self.count) // 3, 3))
         at = self.chosen(free)
         return self._whole(np.zeros(self.count), trims)[0][np.ix_(at, at)]
 
     def _whole(self, offset: np.ndarray, trims: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # A prior of one scale (one TRIM), as strong as a single window: it decides where flights say nothing.
+        # The prior has a standard deviation of one scale (one TRIM) and the weight of a single window.
         at = np.concatenate([offset, trims.ravel()])
         prior = np.eye(len(at))
         mean = self.share / len(trims)
@@ -98,6 +106,10 @@ class Normal:
         return free
 
     def step(self, damping, offset, trims, values, low, high) -> tuple[np.ndarray, np.ndarray]:
+        """Damped Gauss-Newton step of parameters and trims, in units of their scales.
+
+        ``offset`` and ``trims`` are the distances from the prior means, in the same units.
+        """
         matrix, gradient = self._whole(offset, trims)
         free = self._free(gradient, values, low, high)
         change = np.zeros(len(gradient))
@@ -106,6 +118,7 @@ class Normal:
         return change[: self.count], change[self.count :].reshape(-1, 3)
 
     def deviations(self, values, low, high, scale) -> np.ndarray:
+        """Standard deviations of the parameters by the sandwich formula; NaN for a parameter at a bound."""
         matrix, gradient = self._whole(np.zeros(self.count), np.zeros(((len(self.gradient) - self.count) // 3, 3)))
         free = self._free(gradient, values, low, high)
         inverse = np.linalg.inv(matrix[np.ix_(free, free)])
@@ -118,32 +131,50 @@ class Normal:
 
 @dataclass(frozen=True)
 class _Part:
-    """The windows of all flights that are predicted from commands, or those predicted from measured rotor speeds."""
+    """Windows of all flights with one kind of input: commands or measured rotor speeds.
+
+    Attributes:
+        measured: whether the input is measured rotor speeds.
+        chunks: the windows in batches of equal shape.
+        flight: (W,) index of the flight of each window.
+        weight: (W,) weight of each window.
+    """
 
     measured: bool
     chunks: list[dict[str, Any]]
-    """Of one shape."""
     flight: np.ndarray
-    """(W,) which flight a window is of."""
     weight: np.ndarray
-    """(W,) what it counts."""
 
 
 @dataclass(frozen=True)
 class Predictions:
-    """Everything that is predicted."""
+    """All windows of a fit.
+
+    Attributes:
+        parts: windows predicted from commands, and windows predicted from measured rotor speeds.
+        share: (F,) weights of the flights, 1 on average.
+        sizes: (H, 2) mean errors of `hold`: attitude, rad, and velocity, m/s.
+        flown: log, windows and prepared rows of every flight; None for the rows of a flight without windows.
+    """
 
     parts: list[_Part]
     share: np.ndarray
-    """(F,) what flights count, 1 on average."""
     sizes: Array
-    """(H, 2) what `hold` errs: attitude rad, velocity m/s."""
     flown: tuple[tuple[FlightLog, Windows, Flight | None], ...]
-    """Of every flight: its log, its windows, and its rows prepared where there are windows."""
 
     @classmethod
     def of(cls, model: Quadrotor, logs: Sequence[FlightLog], share: np.ndarray, most: int | None = None) -> Predictions:
-        """Every window of all flights, or of long ones every second, third and so on, so that ``most`` are left."""
+        """Find the windows of all flights.
+
+        Args:
+            model: supplies the sensor delays.
+            logs: flights.
+            share: (F,) weights of the flights.
+            most: approximate maximum number of windows in all; long flights then keep every second, third, ... window.
+
+        Raises:
+            CfbError: no log allows a window.
+        """
         gyro_delay = float(model.parameters.gyro_delay)
         delays = [delay_of(log, model.parameters) for log in logs]
         starts = [find_starts(log, HORIZONS, delay, gyro_delay) for log, delay in zip(logs, delays, strict=True)]
@@ -160,8 +191,8 @@ class Predictions:
         return cls([], share, sizes, tuple(flown))
 
     def started(self, model: Quadrotor) -> Predictions:
-        """The same windows, with rotor speeds and memories at their starts as a model says they were."""
-        # A trim remembers nothing; without it the program is that of any evaluation.
+        """The same windows, with the rotor speeds and effect memories at their starts according to a model."""
+        # A trim has no memory; without it, the compiled program of the evaluation can be reused.
         plain = Quadrotor(model.parameters, model.effects[:-1], model.body)
         began = starts_of_windows(plain, *zip(*self.flown, strict=True))
         pairs = zip(self.flown, began, strict=True)
@@ -170,7 +201,7 @@ class Predictions:
         return replace(self, parts=[part for part in kinds if part is not None])
 
     def errors(self, model: Quadrotor, trims: np.ndarray) -> list[np.ndarray]:
-        """Of every part: (W, H, 2) errors of attitude and velocity over what `hold` errs."""
+        """Errors (W, H, 2) of attitude and velocity relative to those of `hold`, for every part."""
         found = []
         for part in self.parts:
             chunks = [np.asarray(_scaled(model, c, _own(trims, c), self.sizes, part.measured)) for c in part.chunks]
@@ -178,7 +209,7 @@ class Predictions:
         return found
 
     def losses(self, errors: list[np.ndarray]) -> list[np.ndarray]:
-        """Of `errors`: (W, H, 2) of every part, weighted."""
+        """Weighted Huber losses (W, H, 2) of `errors`, for every part."""
         pairs = zip(self.parts, errors, strict=True)
         return [
             part.weight[:, None, None] * np.where(e < HUBER, 0.5 * e**2 / HUBER, e - 0.5 * HUBER) for part, e in pairs
@@ -186,15 +217,15 @@ class Predictions:
 
     @property
     def count(self) -> int:
-        """Errors that a mean loss is the mean of."""
+        """Number of errors over which the mean loss is taken."""
         return sum(len(part.flight) for part in self.parts) * len(HORIZONS) * 2
 
     def cost(self, model: Quadrotor, trims: np.ndarray) -> float:
-        """Mean loss of a window and horizon; the trims' prior belongs to it."""
+        """Mean loss over windows, horizons and quantities, including the prior of the trims; infinite if diverged."""
         return self.mean(self.losses(self.errors(model, trims)), trims)
 
     def mean(self, losses: list[np.ndarray], trims: np.ndarray) -> float:
-        """`cost` of losses that are known."""
+        """`cost` from losses that are already computed."""
         total = sum(np.sum(loss) for loss in losses)
         prior = np.sum((trims / TRIM) ** 2) + NO_MEAN * np.sum((self.share @ trims / TRIM / len(trims)) ** 2)
         mean = float((total + 0.5 * prior) / self.count)
@@ -208,16 +239,24 @@ class Predictions:
         trims: np.ndarray,
         trimmed: bool = True,
     ) -> Normal:
-        """Of the loss at some values, without priors."""
+        """Normal equations of the loss, without priors, by finite differences.
+
+        Args:
+            model: the drone.
+            numbers: the N parameters.
+            values: (N,) of the parameters.
+            trims: (F, 3) trim torques, N m.
+            trimmed: whether the trims are estimated.
+        """
         count, flights = len(numbers), len(trims)
         width = count + 3 * flights
         matrix, gradient, scatter = np.zeros((width, width)), np.zeros(width), np.zeros((width, width))
         model = with_values(model, numbers, values)
-        # What may not move needs no slope.
+        # Held parameters need no derivative.
         free = [k for k, n in enumerate(numbers) if not n.held]
         steps = np.array([numbers[k].step(values[k]) for k in free])
         moved = [with_values(model, numbers, _but(values, k, by)) for k, by in zip(free, steps, strict=True)]
-        # Where an effect's memory follows the flights, its numbers also act by what is remembered at a window's start.
+        # The parameters of an effect whose memory follows the flight also act through the memory at a window's start.
         kept = {type(e).name for e in model.effects if overrides(e, "follow")}
         began = {i: self.started(moved[i]) for i, k in enumerate(free) if numbers[k].effect in kept}
         along = np.concatenate([[numbers[k].scale for k in free] / steps, np.full(3, 1 / STEP)])
@@ -249,9 +288,9 @@ class Predictions:
 
 
 def _unwrapped(found: np.ndarray, near: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Errors (..., H, 2, 3), of attitude said the other way round where that is nearer to another error.
+    """Errors (..., H, 2, 3) with attitude errors near half a turn replaced by the equivalent vector closer to ``near``.
 
-    A rotation by half a circle or so is one vector or its opposite; a slope must not see a jump between the two.
+    A rotation by about pi has two nearly equivalent rotation vectors; finite differences must not jump between them.
     """
     turn = found[..., 0, :] * sizes[:, :1]
     angle = np.linalg.norm(turn, axis=-1, keepdims=True)
@@ -261,14 +300,15 @@ def _unwrapped(found: np.ndarray, near: np.ndarray, sizes: np.ndarray) -> np.nda
 
 
 def _but(values: np.ndarray, k: int, by: float) -> np.ndarray:
-    """The values, one of them moved."""
+    """The values with the k-th one moved."""
     return values + by * (np.arange(len(values)) == k)
 
 
 def kinds_alike(model: Quadrotor, logs: Sequence[FlightLog]) -> dict[str, float]:
-    """Weights of flights by name, such that many of one kind do not drown the few of another.
+    """Weights of flights by log name that balance the kinds of flight.
 
-    Of one kind are flights in which `hold` errs alike in attitude half a second ahead, within a factor `ALIKE`.
+    Two flights are of one kind if their mean attitude errors of `hold` after half a second differ by less than the
+    factor `ALIKE`. A flight's weight is one over the number of flights of its kind.
     """
     errs = {}
     for log in logs:
@@ -281,9 +321,9 @@ def kinds_alike(model: Quadrotor, logs: Sequence[FlightLog]) -> dict[str, float]
 
 
 def _part(flights: list[tuple], share: np.ndarray, measured: bool) -> _Part | None:
-    """Windows of one kind; None if no flight has any."""
+    """Windows with one kind of input; None if no flight has any."""
     parts, owner = [], []
-    # Logged at several rates, or with a gap, flights have windows of several lengths.
+    # The number of steps per window differs if flights have different rates or gaps.
     steps = max((windows.step.shape[1] for windows, *_ in flights if len(windows)), default=0)
     for i, (windows, start, memory) in enumerate(flights):
         if not len(windows) or (measured and not _has_rotor_speed(windows)):
@@ -300,7 +340,7 @@ def _part(flights: list[tuple], share: np.ndarray, measured: bool) -> _Part | No
     weight = share[flight] * len(flight) / (np.count_nonzero(counts) * counts[flight])
     chunks = []
     for first in range(0, len(flight), CHUNK):
-        # The last chunk repeats its last window: one compiled program serves all.
+        # The last chunk repeats its last window, so that one compiled program serves all.
         rows = np.minimum(np.arange(first, first + CHUNK), len(flight) - 1)
         chunks.append(jax.tree.map(lambda x, r=rows: jnp.asarray(x[r]), every))
     return _Part(measured, chunks, flight, weight)
@@ -311,7 +351,7 @@ def _has_rotor_speed(windows: Windows) -> bool:
 
 
 def _inputs(windows: Windows, start: np.ndarray, memory: tuple, measured: bool, steps: int) -> dict[str, Any]:
-    """What is predicted from, every window with as many steps as the longest needs, in whole `_STEPS`."""
+    """Inputs of the predictions, with every window padded to ``steps``, rounded up to a multiple of `_STEPS`."""
     pad = _STEPS * -(-steps // _STEPS) - windows.step.shape[1]
     fed = windows.rotor_speed[:, 1:] if measured else windows.command
     state = (windows.position, windows.velocity, windows.quaternion, windows.body_rate)
@@ -326,18 +366,18 @@ def _inputs(windows: Windows, start: np.ndarray, memory: tuple, measured: bool, 
 
 
 def _own(trims: np.ndarray, chunk: dict) -> Array:
-    """(W, 3) trim of the flight each window of a chunk is of: other flights are no reason to compile anew."""
+    """Trim (W, 3) of the flight of each window of a chunk. Its shape does not depend on the number of flights."""
     return jnp.asarray(trims[np.asarray(chunk["flight"])])
 
 
 def _norms(predicted: State, windows: Windows) -> np.ndarray:
-    """(W, H, 2) errors of attitude, rad, and velocity, m/s."""
+    """Errors (W, H, 2) of attitude, rad, and velocity, m/s."""
     found = errors(windows, predicted)
     return np.stack([np.radians(found["attitude"]), found["velocity"]], axis=-1)
 
 
 def _rotation_vector(frm: AnyArray, to: AnyArray) -> Array:
-    """(..., 3) rotation that turns one attitude into another, rad."""
+    """Rotation vector (..., 3) from one attitude to another, rad."""
     scalar = jnp.sum(frm * to, axis=-1)
     vector = frm[..., :1] * to[..., 1:] - to[..., :1] * frm[..., 1:] - jnp.cross(frm[..., 1:], to[..., 1:])
     length = jnp.sqrt(jnp.sum(vector**2, axis=-1) + 1e-24)
@@ -346,7 +386,7 @@ def _rotation_vector(frm: AnyArray, to: AnyArray) -> Array:
 
 
 def _error(model: Quadrotor, window: dict, trim: Array, sizes: Array, measured: bool) -> Array:
-    """(H, 2, 3) errors of attitude and velocity of one window over what `hold` errs."""
+    """Errors (H, 2, 3) of attitude and velocity of one window, relative to those of `hold`."""
     model = eqx.tree_at(lambda m: m.effects[-1].torque, model, trim)
     flown = predict_one(model, State(*window["state"]), window["step"], window["fed"], measured)
     turn = _rotation_vector(window["quaternion"], flown.quaternion[window["at"]])
@@ -356,17 +396,17 @@ def _error(model: Quadrotor, window: dict, trim: Array, sizes: Array, measured: 
 
 @eqx.filter_jit
 def _scaled(model: Quadrotor, chunk: dict, trims: Array, sizes: Array, measured: bool) -> Array:
-    """(W, H, 2, 3) errors of all windows of a chunk."""
+    """Errors (W, H, 2, 3) of all windows of a chunk."""
     return jax.vmap(lambda window, trim: _error(model, window, trim, sizes, measured))(chunk, trims)
 
 
 def _moves(
     model: Quadrotor, moved: list[Quadrotor], chunk: dict, trims: Array, sizes: Array, measured: bool
 ) -> np.ndarray:
-    """`_scaled` (1 + N + 3, W, H, 2, 3) of a model as it is, of others, and with each component of the trims moved.
+    """Errors `_scaled` (1 + N + 3, W, H, 2, 3) of the model, of the moved models, and with each trim component moved.
 
-    By differences, in groups of one size: one program serves whatever is fitted. Derivatives would have to be traced
-    anew for every other set of numbers, which takes a minute where the predictions take a second.
+    Finite differences in groups of fixed size need one compiled program for any set of parameters. Automatic
+    derivatives would be traced again for every new set, which takes a minute where the predictions take a second.
     """
     every = [(m.effects, np.zeros(3)) for m in (model, *moved)] + [
         (model.effects, TRIM * STEP * row) for row in np.eye(3)
@@ -383,7 +423,7 @@ def _moves(
 def _grouped(
     model: Quadrotor, effects: tuple[Effect, ...], chunk: dict, trims: Array, sizes: Array, measured: bool
 ) -> Array:
-    """`_scaled` of models that differ in their effects' numbers, and in the trims, along a leading axis (G)."""
+    """Errors `_scaled` (G, W, H, 2, 3) of G models that differ in the effects' parameters and in the trims."""
 
     def one(own, turned):
         return _scaled(eqx.tree_at(lambda m: m.effects, model, own), chunk, turned, sizes, measured)

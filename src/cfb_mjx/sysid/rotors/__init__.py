@@ -1,1 +1,1 @@
-"""Fitting the rotors on their own: motor dynamics, thrust and torque maps."""
+"""Fits of the rotors on their own: motor dynamics, thrust and torque maps."""

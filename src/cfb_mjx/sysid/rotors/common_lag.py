@@ -1,8 +1,9 @@
-"""The one time constant that stands for a motor with two of them and a dead time.
+"""Single time constant equivalent to a motor with two time constants and a dead time.
 
-Fitted directly, a model without dead time would explain it by its noise levels and bend its constants. So the full
-motor is fitted, and the single lag whose response to the recorded commands is nearest to the full motor's is taken.
-Both responses follow from the commands alone: no noise and no feedback is left to bias this least-squares step.
+A direct fit of a model without dead time would explain the dead time by noise and bias the constants. Instead, the full
+motor is fitted first. Then the single lag is chosen whose response to the recorded commands is closest to that of the
+full motor. Both responses are simulated from the commands alone, so neither noise nor feedback biases this
+least-squares step.
 """
 
 from __future__ import annotations
@@ -28,11 +29,11 @@ def _response(vector, tracks: Tracks):
 
 
 def common_lag(full: Optimum, data: MotorData) -> tuple[float, float]:
-    """Time constant and its standard deviation, s.
+    """Time constant of the closest single lag, and its standard deviation, s.
 
     Args:
-        full: a fit with spin-up and spin-down constants, dead time, or both.
-        data: the recordings it was fitted to.
+        full: fit with spin-up and spin-down constants, a dead time, or both.
+        data: recordings to which it was fitted.
     """
     tracks = jax.tree.map(jnp.asarray, data.tracks)
     goal, full_slope = (np.asarray(x) for x in _response(jnp.asarray(full.vector), tracks))
@@ -47,7 +48,7 @@ def common_lag(full: Optimum, data: MotorData) -> tuple[float, float]:
         vector[2:4] += np.clip(change, -0.5, 0.5)
         if abs(change) < 1e-8:
             break
-    # How the nearest lag follows the constants of the full motor, to first order; the gain moves both alike.
+    # Derivative of the closest lag with respect to the constants of the full motor; gain and offset affect both alike.
     moved = np.einsum("sn,snk->k", slope, full_slope) / np.sum(slope**2) @ full.directions
     level = [i for i, name in enumerate(full.names) if name in ("motor_gain", "motor_speed_offset")]
     moved[level] = 0.0

@@ -1,4 +1,4 @@
-"""Motors and rotor maps of a drone from all that flights and bench tables tell of them."""
+"""Fit motors and rotor maps of a drone to flights and bench tables."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ class RotorFit:
     """Result of `fit_rotors`.
 
     Attributes:
-        base: the model that was started from.
-        motors: from commands and rotor speeds in time; None: there were none.
-        steady: from steady points; None: there were none, or records in time tell the same and more.
-        maps: ``thrust`` and ``torque``, as far as there were points.
-        flown: thrust in flight beside the base model's curve; None: no stretch was long enough.
-        notes: what to know about the files and the fit, in words.
+        base: the model that the fit started from.
+        motors: fit to recordings of commands and rotor speeds over time; None if there were none.
+        steady: fit to steady points; None if there were none, or if recordings over time were used instead.
+        maps: fitted curves under ``thrust`` and ``torque``, if there were points.
+        flown: thrust in flight relative to the base model's curve; None if no stretch was long enough.
+        notes: remarks on the files and the fit.
     """
 
     base: ModelFile
@@ -47,7 +47,7 @@ class RotorFit:
 
     @cached_property
     def entries(self) -> dict[str, tuple[np.ndarray, np.ndarray | None]]:
-        """What a model file takes over, with standard deviations where known."""
+        """Values for the model file, with standard deviations where known."""
         found: dict[str, tuple[np.ndarray, np.ndarray | None]] = {}
         if self.motors is not None:
             found |= {name: told for name in ENTRIES if (told := self.motors.values(name)) is not None}
@@ -56,7 +56,7 @@ class RotorFit:
             found["motor_speed_offset"] = np.asarray(self.steady.offset), np.asarray(self.steady.offset_std)
         for name, fitted in self.maps.items():
             found[f"{name}_polynomial"] = fitted.coefficients, fitted.std
-            # The factors belong to the curve: old ones would count twice.
+            # The factors belong to the fitted curve, so the old ones must be replaced.
             scale, std = np.ones(4), np.zeros(4)
             for motor, value, deviation in zip(fitted.motors, fitted.scale, fitted.scale_std, strict=True):
                 scale[motor - 1], std[motor - 1] = value, deviation
@@ -66,7 +66,7 @@ class RotorFit:
 
     @property
     def estimates(self) -> dict[str, Estimate]:
-        """All constants, those of the motors as if they were one; the curves' beside the base model's own."""
+        """All constants by name, with those of the base model for comparison; the motors are treated as one."""
         found = dict(self.motors.common.estimates) if self.motors else {}
         if self.steady is not None:
             for name, value, std in (
@@ -87,12 +87,12 @@ class RotorFit:
         return found
 
     def model_file(self, source: str) -> ModelFile:
-        """The base model with what was found, its uncertainty and ``source``."""
+        """The base model with the fitted values, their uncertainty, and ``source`` as their origin."""
         new = {key: Entry(np.asarray(value, float), source, std) for key, (value, std) in self.entries.items()}
         return replace(self.base, entries={**self.base.entries, **new})
 
     def to_json(self) -> dict:
-        """All numbers, in JSON terms."""
+        """All results as a JSON-compatible dictionary."""
         found: dict[str, Any] = {"parameters": numbers_of(self.estimates)}
         if self.steady is not None:
             found["steady"] = self.steady.to_json()
@@ -118,21 +118,21 @@ def fit_rotors(
     tared: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> RotorFit:
-    """Fit what the files tell of motors and rotors.
+    """Fit motors and rotor maps to the data in some files.
 
     Args:
-        files: `cfb_mjx.logs.rotor_files.read_rotor_files`; run with x64 enabled.
+        files: content of the files, from `cfb_mjx.logs.rotor_files.read_rotor_files`; run with x64 enabled.
         base: model to start from.
         offset: as for `fit_motors`.
-        asymmetric: likewise.
-        dead_time: likewise.
-        per_motor: likewise, and as for `fit_map`.
+        asymmetric: as for `fit_motors`.
+        dead_time: as for `fit_motors`.
+        per_motor: as for `fit_motors` and `fit_map`.
         robust: as for `fit_map`.
-        tared: likewise.
+        tared: as for `fit_map`.
         progress: called with (done, total) while motors are fitted.
 
     Raises:
-        CfbError: thrust that is not one rotor's of this drone, or too little data.
+        CfbError: a thrust is not that of one rotor of this drone, or there is too little data.
     """
     require_one_rotor(files.tables, base)
     nominal, notes = base.parameters(), list(files.notes)
@@ -144,7 +144,7 @@ def fit_rotors(
     if files.points and not files.records:
         steady = fit_steady(files.points)
     elif files.points:
-        notes.append("steady points were not used: command steps tell gain and offset too, and the lag.")
+        notes.append("steady points were not used: the command steps determine gain and offset too, and the lag.")
     sigma = float(base.entries["reference_rotor_speed"].value)
     maps = fit_maps(files.tables, sigma, per_motor, robust, tared)
     flown = thrust_in_flight(_flown(files.flights), nominal)
@@ -152,9 +152,9 @@ def fit_rotors(
 
 
 def _flown(logs: Sequence[FlightLog]) -> list[FlightLog]:
-    """What of some recordings is flight."""
+    """The parts of recordings in which the drone flies."""
     found = []
     for log in logs:
-        with suppress(CfbError):  # motors on the ground are a recording of motors all the same
+        with suppress(CfbError):  # a recording on the ground is still useful for the motors
             found.append(flown_part(log, Path(log.name)))
     return found

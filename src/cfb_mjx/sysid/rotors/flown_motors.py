@@ -1,4 +1,4 @@
-"""The motors of a drone from its flights: constants of each, their dead time, and how far they follow the battery."""
+"""Motors of a drone from its flights: constants of each motor, dead time, and dependence on the battery voltage."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from cfb_mjx.sysid.rotors.supply import SURE, fit_with_sag
 
 @dataclass(frozen=True)
 class Told:
-    """An effect of the motors.
+    """An effect of the motors that was identified from rotor speeds.
 
     Attributes:
-        effect: with its numbers.
-        std: their standard deviations, by field.
-        t: how surely it is there: standard normal where it is not.
-        at_bound: names of numbers that stand at the end of what is plausible.
-        without: other effects of the motors, moved to make up for it; those that are not there stay as they are.
-        alike: names of effects whose numbers make up for its own.
+        effect: with its fitted values.
+        std: standard deviations of the values, by field.
+        t: significance; standard normal if the effect is absent.
+        at_bound: names of parameters at the end of their plausible range.
+        without: other effects of the motors, adjusted to compensate for the absence of this one.
+        alike: names of effects with parameters strongly correlated with its own.
     """
 
     effect: Effect
@@ -39,12 +39,12 @@ class Told:
 
     @property
     def name(self) -> str:
-        """Of the effect."""
+        """Name of the effect."""
         return self.effect.name
 
     @classmethod
     def of(cls, effect: Effect, number: str, std: float) -> Told:
-        """An effect of one number, beside constants that were fitted with it."""
+        """An effect with one fitted parameter, ``number``, and its standard deviation."""
         value = float(getattr(effect, number))
         at = (f"{effect.name}.{number}",) if value in effect.prior[number] else ()
         return cls(effect, {number: std}, value / std, at)
@@ -52,11 +52,11 @@ class Told:
 
 @dataclass(frozen=True)
 class Motors:
-    """What commands and measured rotor speeds tell.
+    """Motors identified from commands and measured rotor speeds.
 
     Attributes:
-        entries: of a model file.
-        effects: of the motors.
+        entries: refitted constants, as entries of a model file.
+        effects: effects of the motors.
         known: whether rotor speeds were measured.
     """
 
@@ -66,13 +66,16 @@ class Motors:
 
 
 def flown_motors(logs: Sequence[FlightLog], nominal: Parameters, rows: int, piece: float) -> Motors:
-    """Each motor's constants, the dead time of all, and how far they follow the battery; nothing without rotor speeds.
+    """Fit the constants of each motor, their common dead time, and their dependence on the battery voltage.
+
+    The result is empty if no flight has measured rotor speeds.
 
     Args:
-        logs: flights; of long ones the middle is enough.
-        nominal: where to start.
-        rows: that are fitted to, about: the middles of flights.
-        piece: seconds of a flight at least, of so many flights evenly spread as that allows.
+        logs: flights; the middle part of each is used.
+        nominal: parameters to start from.
+        rows: approximate number of rows to fit.
+        piece: minimum duration of the part used of a flight, s. It limits the number of flights, which are evenly
+            spread over ``logs``.
     """
     flown = [log for log in logs if log.rotor_speed is not None]
     if not flown:
@@ -84,7 +87,8 @@ def flown_motors(logs: Sequence[FlightLog], nominal: Parameters, rows: int, piec
     values = {name: fit.values(name) for name in ENTRIES}
     effects = []
     if "dead_time" in fit.common.extras and "asymmetric" not in fit.common.extras:
-        # Beside a dead time of its own the lag is the motors' alone, not the one lag that is nearest to both.
+        # The dead time becomes an effect of its own, so the lag is that of the motors alone, not the single lag that
+        # is closest to lag and dead time together.
         lag = "motor_time_constant"
         each = [fit.motors[number].optimum for number in sorted(fit.motors)]
         values[lag] = np.array([o.value(lag) for o in each]), np.array([o.std(lag) for o in each])
@@ -102,12 +106,12 @@ def flown_motors(logs: Sequence[FlightLog], nominal: Parameters, rows: int, piec
 
 
 def evenly_spread(logs: Sequence[FlightLog], count: int) -> list[FlightLog]:
-    """So many of some flights, from the first to the last."""
+    """Pick ``count`` of the flights, evenly spread from the first to the last."""
     return [logs[i] for i in np.linspace(0, len(logs) - 1, count).round().astype(int)]
 
 
 def _middle(log: FlightLog, rows: int) -> MotorRecord:
-    """The motors in the middle of a flight, with the battery's voltage."""
+    """Record of the motors in the middle of a flight, with interpolated battery voltage."""
     skipped = max(0, (len(log) - rows) // 2)
     part = log.rows(np.arange(skipped, len(log) - skipped))
     voltage = part.battery_voltage

@@ -1,4 +1,4 @@
-"""Where a rotor's cubic does what no rotor does: falls with rotor speed, or is negative."""
+"""Check of a rotor's fitted cubic: where it falls with rotor speed or is negative, which no rotor does."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ SIGMA = 2900.0
 
 @dataclass(frozen=True)
 class Shape:
-    """Where a cubic misbehaves between standstill and ``top``; lists of (from, to), rad/s.
+    """Ranges of rotor speed (from, to), rad/s, in which a cubic is unphysical, between standstill and ``top``.
 
     Attributes:
-        falling: stretches in which the curve does not increase with rotor speed.
-        negative: stretches in which it is below zero.
-        measured: (lowest, highest) measured rotor speed.
-        top: where the check ends.
+        falling: ranges in which the curve does not increase with rotor speed.
+        negative: ranges in which the curve is negative.
+        measured: lowest and highest measured rotor speed, rad/s.
+        top: upper end of the check, rad/s.
     """
 
     falling: tuple[tuple[float, float], ...]
@@ -34,7 +34,7 @@ class Shape:
         return not any(a < high and b > low for a, b in self.falling)
 
     def notes(self) -> list[str]:
-        """What to know about the curve, one phrase each."""
+        """Remarks on the curve, one phrase each."""
         low, high = self.measured
         found = []
         for word, stretches in (("negative", self.negative), ("does not increase", self.falling)):
@@ -48,10 +48,10 @@ class Shape:
 
 
 def shape_of(coefficients: np.ndarray, measured: tuple[float, float], sigma: float = SIGMA) -> Shape:
-    """Check a cubic through the origin from standstill to full speed (2900 rad/s, or what was measured beyond).
+    """Check a cubic through the origin from standstill to full speed (2900 rad/s, or the highest measured speed).
 
     Args:
-        coefficients: (3,) of s^3, s^2, s.
+        coefficients: (3,) of s^3, s^2, s with ``s = Omega / sigma``.
         measured: lowest and highest measured rotor speed, rad/s.
         sigma: reference rotor speed, rad/s.
     """
@@ -66,7 +66,7 @@ def shape_of(coefficients: np.ndarray, measured: tuple[float, float], sigma: flo
 
 
 def _stretches(polynomial: list[float], top: float, sigma: float) -> tuple[tuple[float, float], ...]:
-    """Where a quadratic is below zero on (0, top)."""
+    """Ranges in (0, top) in which a polynomial is negative, scaled by ``sigma``."""
     roots = np.roots(polynomial)
     real = [float(r.real) for r in roots if abs(r.imag) < 1e-12 and 0 < r.real < top]
     edges = [0.0, *sorted(real), top]

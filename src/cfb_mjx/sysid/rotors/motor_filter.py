@@ -1,14 +1,14 @@
-"""One-step innovations of a motor: first-order lag with its own time constant for spin-up and spin-down, dead time.
+"""One-step innovations of a motor with first-order lag, separate spin-up and spin-down time constants, and dead time.
 
-``Omega' = (K u(t - d) + offset + b - Omega) / T``, with ``T`` that of spin-up where the steady speed lies above the
-rotor speed and that of spin-down where it lies below (paper eq. 5 with one T and d = 0). ``b`` wanders
-(Ornstein-Uhlenbeck): battery and load move the steady speed, and a controller answers what they do to the flight, so
-that its commands are correlated with them. Why the likelihood of one-step innovations is not bent by that:
+``Omega' = (K u(t - d) + offset + b - Omega) / T``, where ``T`` is the spin-up constant if the steady speed is above the
+rotor speed and the spin-down constant if it is below (paper eq. 5: one T, d = 0). ``b`` is an Ornstein-Uhlenbeck
+process: battery and load change the steady speed, and the controller responds to the consequences, so the commands are
+correlated with it. This does not bias the likelihood of one-step innovations; see
 `cfb_mjx.sysid.identification.innovation`, whose rotor filter this one generalises.
 
-Between two events, a row or a command taking effect, everything is constant and the speed never crosses its target,
-so the exponential is exact for any sampling and the dead time is continuous: events are sorted by time, not counted
-in rows.
+Between two events (a row, or a command that takes effect) the command is constant and the speed never crosses its
+target. So the exponential solution is exact for any sampling. Events are sorted by time rather than counted in rows, so
+the dead time is continuous.
 """
 
 from __future__ import annotations
@@ -22,34 +22,37 @@ from cfb_mjx.sysid.rotors.motor_tracks import Tracks
 
 NAMES = ("motor_gain", "motor_speed_offset", "spin_up_time_constant", "spin_down_time_constant", "dead_time")
 OFFSET_UNIT, DEAD_TIME_UNIT = 1000.0, 0.01
-"""rad/s and s that the unknowns of order one stand for."""
+"""Units of the unknowns for offset, rad/s, and dead time, s; the unknowns are then of order one."""
 CORRELATION_TIME = 0.5
-"""Of the wandering steady speed, s: below about 1/(2 pi 0.5 s) = 0.3 Hz it is constant, above it wanders."""
+"""Correlation time of the error of the steady speed, s; the corner frequency is 1/(2 pi 0.5 s) = 0.3 Hz."""
 
 
 class Motor(eqx.Module):
-    """Constants of a motor and the levels of its noise. All scalars."""
+    """Constants and noise levels of a motor, all scalars."""
 
     gain: Float[Array, ""]
     """K, rad/s."""
     offset: Float[Array, ""]
-    """rad/s."""
+    """Steady speed at zero command, rad/s."""
     spin_up: Float[Array, ""]
     """Time constant while the steady speed is above the rotor speed, s."""
     spin_down: Float[Array, ""]
-    """Time constant while it is below, s."""
+    """Time constant while the steady speed is below the rotor speed, s."""
     dead_time: Float[Array, ""]
-    """From a command to its first effect, s. Negative where rotor speeds are stamped earlier than commands."""
+    """Time from a command to its first effect, s. Negative if rotor speeds are stamped earlier than commands."""
     reading: Float[Array, ""]
-    """White noise of a rotor speed row, rad/s."""
+    """White measurement noise of the rotor speed per row, rad/s."""
     walk: Float[Array, ""]
     """White angular acceleration of the rotor, rad/s per square root of a second."""
     wander: Float[Array, ""]
-    """Wandering error of the steady speed, rad/s."""
+    """Standard deviation of the slowly varying error of the steady speed, rad/s."""
 
     @staticmethod
     def from_vector(x: Float[Array, "8"]) -> Motor:
-        """From logarithms and unit offsets; a floor keeps a vanishing noise level from flattening the likelihood."""
+        """Motor from the vector of unknowns: logarithms, except offset and dead time, which are in their units.
+
+        The noise levels have a floor, because the likelihood is flat where a level vanishes.
+        """
         up, down = jnp.exp(jnp.clip(x[2:4], jnp.log(1e-4), jnp.log(10.0)))
         return Motor(
             jnp.exp(x[0]),
@@ -64,27 +67,28 @@ class Motor(eqx.Module):
 
 
 class Events(eqx.Module):
-    """Rows and commands taking effect, in order of time: (2N, S) each, time first for the scan."""
+    """Rows and commands that take effect, sorted by time: arrays (2N, S), with time as the first axis for the scan."""
 
     time: Array
     """Since the piece's first row, s."""
     command: Array
-    """That takes effect, where ``switches``."""
+    """Command that takes effect where ``switches`` is 1."""
     switches: Array
+    """1 where a command takes effect, 0 for a row."""
     rotor_speed: Array
     measured: Array
     judged: Array
 
     @property
     def interval(self) -> Array:
-        """Since the event before, s."""
+        """Time since the previous event, s."""
         return jnp.diff(self.time, axis=0, prepend=self.time[:1])
 
 
 def events(motor: Motor, tracks: Tracks) -> Events:
-    """Merge rows with the commands, which act ``dead_time`` later; differentiable in the dead time."""
+    """Merge the rows with the commands, which take effect ``dead_time`` later; differentiable in the dead time."""
     zero = jnp.zeros(tracks.time.shape)
-    # What was commanded before the first row is not known: its command is taken to have held.
+    # Commands before the first row are unknown; assume that the first command was held.
     effect = jnp.maximum(tracks.time + motor.dead_time, 0.0)
     commands = (effect, tracks.command, zero + 1, zero, zero, zero)
     rows = (tracks.time, zero, zero, tracks.rotor_speed, tracks.measured, tracks.judged)
@@ -93,9 +97,9 @@ def events(motor: Motor, tracks: Tracks) -> Events:
 
 
 def innovations(motor: Motor, tracks: Tracks) -> tuple[Float[Array, "e s"], Float[Array, "e s"], Float[Array, "e s"]]:
-    """Errors of predicting every rotor speed from the rows before it, rad/s, their variances, and which are judged.
+    """One-step prediction errors of the rotor speeds, rad/s, their variances, and the mask of those that count.
 
-    In order of events; zero and one where there is nothing to judge.
+    The order is that of the events. Errors that do not count are zero, with variance one.
     """
     happening = events(motor, tracks)
     r, q, d = motor.reading**2, motor.walk**2, motor.wander**2
@@ -128,13 +132,13 @@ def innovations(motor: Motor, tracks: Tracks) -> tuple[Float[Array, "e s"], Floa
 
 
 def negative_log_likelihood(motor: Motor, tracks: Tracks) -> Float[Array, ""]:
-    """Of all innovations, nats, without the constant."""
+    """Negative log-likelihood of all innovations, nats, up to a constant."""
     error, variance, _ = innovations(motor, tracks)
     return 0.5 * jnp.sum(jnp.log(variance) + error**2 / variance)
 
 
 def simulate(motor: Motor, tracks: Tracks) -> Float[Array, "s n"]:
-    """Rotor speeds that follow from the commands alone, from the measured first row of every piece, rad/s."""
+    """Simulate rotor speeds from the commands, starting at the measured first row of every piece, rad/s."""
     happening = events(motor, tracks)
 
     def step(carry, event):
@@ -147,6 +151,6 @@ def simulate(motor: Motor, tracks: Tracks) -> Float[Array, "s n"]:
 
     start = (tracks.rotor_speed[:, 0], tracks.command[:, 0])
     _, speed = jax.lax.scan(step, start, (happening.interval, happening.command, happening.switches))
-    # The events that are rows, in their order.
+    # Select the events that are rows, in their order.
     rows = jnp.argsort(happening.switches.T, axis=1, stable=True)[:, : tracks.time.shape[1]]
     return jnp.take_along_axis(speed.T, rows, axis=1)

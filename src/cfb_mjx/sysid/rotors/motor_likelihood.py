@@ -1,4 +1,4 @@
-"""Maximum likelihood of a motor's constants and noise levels together, and how sure the data make them."""
+"""Maximum-likelihood estimate of a motor's constants and noise levels, and its uncertainty."""
 
 from __future__ import annotations
 
@@ -23,32 +23,33 @@ from cfb_mjx.sysid.rotors.motor_filter import simulate as simulate_tracks
 from cfb_mjx.sysid.rotors.motor_tracks import ROWS, MotorData, Tracks
 
 ROUNDS, STEPS = 12, 8
-"""Few steps between updates of the Fisher information: far from the optimum it changes a lot."""
+"""Maximum number of updates of the Fisher information, and of steps between them. The steps are few, because far from
+the optimum the information changes a lot."""
 BLOCK = 256
-"""Events (two for each row) of a bootstrap block."""
-# One unit of `assess` each; a constant that is free by more than half of it counts as unknown: K and the time constants
-# by 25 %, the offset by 250 rad/s, the dead time by 5 ms.
+"""Events (two per row) in a bootstrap block."""
 _GRAIN = {"motor_gain": 0.5, "motor_speed_offset": 500.0, "dead_time": 0.01}
+"""Units of the constants for `assess`. A constant counts as unidentified if it is free by more than half a unit: K and
+the time constants by 25 %, the offset by 250 rad/s, the dead time by 5 ms."""
 _SIZE, _NOISE = 8, 5
 PRIOR = 3.0
-"""Standard deviation of the weak prior about the first guess on all unknowns but the gain: a factor 20 in lags and
-noise levels, 3000 rad/s of offset, 30 ms of dead time."""
+"""Standard deviation of the weak prior about the first guess, for all unknowns but the gain: a factor of 20 for lags
+and noise levels, 3000 rad/s for the offset, 30 ms for the dead time."""
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """Where the likelihood of one model variant is largest.
+    """Maximum-likelihood estimate of one model variant with k free constants.
 
     Attributes:
-        names: constants that were free; ``motor_time_constant`` moves spin-up and spin-down together.
-        vector: (8,) of `Motor.from_vector`.
+        names: of the free constants; ``motor_time_constant`` moves spin-up and spin-down together.
+        vector: (8,) unknowns, as of `Motor.from_vector`.
         loss: negative log-likelihood, nats.
-        rows: that were judged.
-        uncertainty: of the free constants, in units of `grain`; from command-driven changes only.
-        directions: (8, k) change of the vector by one grain of each free constant.
-        inflation: (k,) by how much the bootstrap widened the standard deviations.
-        whiteness: lag-one correlation of the innovations, near 0 when the noise model fits.
-        outliers: share of the innovations beyond five standard deviations.
+        rows: number of rows in the likelihood.
+        uncertainty: of the free constants, in their units for `assess`; from the response to commands only.
+        directions: (8, k) change of the vector per unit of each free constant.
+        inflation: (k,) factor by which the bootstrap widened the standard deviations.
+        whiteness: lag-one correlation of the innovations; near 0 if the noise model is right.
+        outliers: share of innovations beyond five standard deviations.
     """
 
     names: tuple[str, ...]
@@ -63,11 +64,11 @@ class Optimum:
 
     @property
     def motor(self) -> Motor:
-        """Constants and noise levels, as numbers."""
+        """Constants and noise levels as plain numbers."""
         return jax.tree.map(float, Motor.from_vector(jnp.asarray(self.vector)))
 
     def value(self, name: str) -> float:
-        """A constant, SI."""
+        """Value of a constant, SI."""
         motor = self.motor
         found = {
             "motor_gain": motor.gain,
@@ -88,7 +89,7 @@ class Optimum:
 
 
 def first_guess(data: MotorData, time_constant: float, gain: float, offset: float) -> np.ndarray:
-    """(8,) vector to start from: the model's constants, K and the reading noise as the data show them."""
+    """Initial vector (8,): the model's constants, with K and the reading noise estimated from the data."""
     seen = data.speed_per_command
     gain = seen if np.isfinite(seen) and seen > 100 and offset == 0 else gain
     noise = np.clip(data.noise, 0.1, 100.0)
@@ -96,16 +97,21 @@ def first_guess(data: MotorData, time_constant: float, gain: float, offset: floa
 
 
 def maximise(data: MotorData, names: tuple[str, ...], start: np.ndarray) -> Optimum:
-    """Free the constants ``names`` and the noise levels from ``start`` on; the rest keeps its value.
+    """Maximise the likelihood over some constants and all noise levels.
 
-    The search runs in coordinates in which the Fisher information is the identity: the constants differ by orders of
-    magnitude in how well they are known, and a quasi-Newton method is slow until it has learnt that.
+    The search runs in coordinates in which the Fisher information is the identity. Otherwise a quasi-Newton method
+    would be slow, because the curvature differs by orders of magnitude between the constants.
+
+    Args:
+        data: recordings of the motor.
+        names: of the free constants; the others keep their value.
+        start: (8,) initial vector, as of `Motor.from_vector`.
     """
     tracks = jax.tree.map(jnp.asarray, data.tracks)
     basis = np.stack([_direction(name) for name in names] + list(np.eye(_SIZE)[_NOISE:]), axis=1)
     vector, loss = np.array(start), np.inf
     if "dead_time" in names and vector[4] == 0.0:
-        # The likelihood has a kink where commands coincide with rows; a search that starts on it may stay there.
+        # The likelihood has a kink where commands coincide with rows, so do not start there.
         vector[4] = 0.25 * data.interval / DEAD_TIME_UNIT
     for _ in range(ROUNDS):
         found, value, steps = _search(
@@ -127,11 +133,11 @@ def _direction(name: str) -> np.ndarray:
 def _search(vector, whitener, start, tracks: Tracks):
     def plain(z):
         x = vector + whitener @ z
-        # What does not matter would otherwise wander off without end.
+        # Without a prior, unknowns that do not affect the likelihood would diverge.
         prior = 0.5 * jnp.sum((x[1:] - start[1:]) ** 2) / PRIOR**2
         return negative_log_likelihood(Motor.from_vector(x), tracks) + prior
 
-    # Few unknowns and many rows: forward mode costs half of what storing every step for the reverse does.
+    # With few unknowns and many rows, forward mode is twice as fast as reverse mode, which stores every step.
     loss = jax.custom_jvp(plain)
 
     @loss.defjvp
@@ -139,7 +145,7 @@ def _search(vector, whitener, start, tracks: Tracks):
         slope, value = jax.jacfwd(lambda z: (plain(z),) * 2, has_aux=True)(*primals)
         return value, slope @ tangents[0]
 
-    # z counts standard deviations, so the tolerance is a hundredth of one.
+    # z is in standard deviations, so the tolerance is a hundredth of one.
     solver = optx.BFGS(rtol=1e-9, atol=1e-2)
     found = optx.minimise(lambda z, _: loss(z), solver, jnp.zeros(_SIZE), max_steps=STEPS, throw=False)
     return vector + whitener @ found.value, plain(found.value), found.stats["num_steps"]
@@ -147,7 +153,7 @@ def _search(vector, whitener, start, tracks: Tracks):
 
 @eqx.filter_jit
 def _sensitivity(vector, tracks: Tracks):
-    """Innovations, variances, which are judged, and the derivatives of the first two by the vector; pieces first."""
+    """Innovations, variances, mask, and the derivatives of the first two with respect to the vector; pieces first."""
 
     def whole(x):
         error, variance, judged = innovations(Motor.from_vector(x), tracks)
@@ -159,27 +165,27 @@ def _sensitivity(vector, tracks: Tracks):
 
 @eqx.filter_jit
 def undisturbed(vector, tracks: Tracks) -> Tracks:
-    """The tracks as they would have been measured without any noise."""
+    """The tracks with rotor speeds simulated from the commands, without noise."""
     return eqx.tree_at(lambda t: t.rotor_speed, tracks, simulate_tracks(Motor.from_vector(vector), tracks))
 
 
 def _whitener(vector, basis, tracks) -> np.ndarray:
-    """(8, 8) map from unit-information coordinates to changes of the vector; columns beyond the free ones are zero."""
+    """Matrix (8, 8) from unit-information coordinates to changes of the vector; columns of fixed ones are zero."""
     _, s, _, de, ds = (np.asarray(x) for x in _sensitivity(jnp.asarray(vector), tracks))
     de, ds = de @ basis, ds @ basis
     information = np.einsum("sni,snj->ij", de / s[..., None], de)
     information += 0.5 * np.einsum("sni,snj->ij", ds / s[..., None] ** 2, ds)
-    # A step of the search may not exceed a factor e^2 in what the data do not see.
+    # Limit the steps in directions that the data do not determine to a factor e^2.
     factor = np.linalg.cholesky(information + np.eye(basis.shape[1]) / 4)
     directions = np.linalg.solve(factor, basis.T).T
     return np.pad(directions, ((0, 0), (0, _SIZE - basis.shape[1])))
 
 
 def _judge(data, tracks, names, basis, vector, loss) -> Optimum:
-    """Uncertainty from the response to the commands alone.
+    """Assess the optimum; its uncertainty uses the response to the commands only.
 
-    The colour of the noise also depends on the lag, but only if the noise is exactly as modelled; a recording in which
-    the commands never move must not yield a time constant.
+    The spectrum of the noise also depends on the lag, but only if the noise is exactly as modelled. A recording with
+    constant commands must not determine a time constant.
     """
     error, variance, judged, _, _ = (np.asarray(x) for x in _sensitivity(jnp.asarray(vector), tracks))
     clean = undisturbed(jnp.asarray(vector), tracks)

@@ -1,4 +1,4 @@
-"""What fitted motors would have done under the recorded commands, beside what they did."""
+"""Simulate fitted motors with the recorded commands, for comparison with the measured rotor speeds."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from cfb_mjx.sysid.rotors.motors import MotorFit
 
 @dataclass(frozen=True)
 class Replay:
-    """One motor, the piece of its recordings in which the command moves most.
+    """Simulation of one motor over the piece of its recordings in which the command varies most.
 
     Attributes:
-        motor: number, 0 where not known.
-        time: (n,) s from the piece's start.
+        motor: number 1 to 4; 0 if not known.
+        time: (n,) s from the start of the piece.
         command: (n,) in [0, 1].
-        measured: (n,) rad/s, NaN where missing.
-        simulated: (n,) rad/s, from the commands alone.
-        rms: of measured minus simulated over all recordings of the motor, rad/s.
+        measured: (n,) rotor speed, rad/s; NaN where missing.
+        simulated: (n,) rotor speed from the commands alone, rad/s.
+        rms: of measured minus simulated speed over all recordings of the motor, rad/s.
     """
 
     motor: int
@@ -35,7 +35,7 @@ class Replay:
 
 
 def replay(fit: MotorFit) -> list[Replay]:
-    """Simulate every motor from its commands, with its own constants where it was fitted on its own."""
+    """Simulate every motor from its commands, with its own constants if it was fitted separately."""
     found = []
     for number in sorted({n for record in fit.records for n in record.motors}):
         data = gather(fit.records, number)
@@ -46,7 +46,7 @@ def replay(fit: MotorFit) -> list[Replay]:
         simulated = np.asarray(undisturbed(jnp.asarray(vector), jax.tree.map(jnp.asarray, tracks)).rotor_speed)
         judged = tracks.judged > 0
         error = (tracks.rotor_speed - simulated)[judged]
-        # A scrap of a flight shows little, however much the command moves in it.
+        # Do not show a piece that is much shorter than the others, even if the command varies a lot in it.
         enough = judged.sum(axis=1) >= 0.5 * judged.sum(axis=1).max()
         moves = [float(np.std(c[j])) if ok else -1.0 for c, j, ok in zip(tracks.command, judged, enough, strict=True)]
         shown = int(np.argmax(moves))

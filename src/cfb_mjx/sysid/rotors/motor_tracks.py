@@ -1,4 +1,4 @@
-"""Commands and measured rotor speeds of single motors, cut at gaps into pieces of one shape."""
+"""Commands and measured rotor speeds of single motors, cut at gaps into pieces of equal shape."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from cfb_mjx.model.state import AnyArray
 from cfb_mjx.sysid.identification.flight_data import white_noise
 
 ROWS = 512
-"""Rows of a piece. With the number of pieces rounded up to a power of two, most fits share one compiled program."""
+"""Rows per piece. As the number of pieces is rounded up to a power of two, most fits share one compiled program."""
 FEWEST_PIECES = 32
+"""Smallest number of pieces, with padding."""
 WARM_UP = 0.2
-"""At most this long, s, and at most a quarter of a piece: the rows in which a filter finds its state are not judged."""
+"""Maximum warm-up of the filter, s, and at most a quarter of a piece; its rows do not count in the likelihood."""
 FEWEST_ROWS = 24
+"""Smallest number of measured rows in a piece."""
 
 
 class Tracks(eqx.Module):
-    """S pieces, each of one motor, N rows; the last row of a short piece is repeated."""
+    """S pieces of N rows, each of one motor; short pieces are padded with their last row."""
 
     time: Float[AnyArray, "s n"]
     """Since the piece's first row, s."""
@@ -30,19 +32,19 @@ class Tracks(eqx.Module):
     rotor_speed: Float[AnyArray, "s n"]
     """rad/s; 0 where not measured."""
     measured: Float[AnyArray, "s n"]
-    """1 where a rotor speed was measured; 0 elsewhere, in the padding and at the first row, which starts the filter."""
+    """1 where a rotor speed was measured, except in the padding and in the first row, which initialises the filter."""
     judged: Float[AnyArray, "s n"]
-    """1 for measured rows behind the warm-up."""
+    """1 for measured rows after the warm-up, which count in the likelihood."""
 
 
 @dataclass(frozen=True)
 class MotorData:
-    """Tracks of several recordings together, and where each comes from.
+    """Tracks of several recordings.
 
     Attributes:
-        tracks: padded.
-        motor: (pieces,) motor number of the tracks that are not padding.
-        noise: white noise of a rotor speed row, rad/s, seen in third differences.
+        tracks: with padding.
+        motor: (pieces,) motor number of each piece that is not padding.
+        noise: white noise of the rotor speed per row, rad/s, from third differences.
         speed_per_command: median of rotor speed over command, rad/s.
         interval: median time between rows, s.
     """
@@ -55,12 +57,20 @@ class MotorData:
 
     @property
     def rows(self) -> int:
-        """Rows that are judged."""
+        """Number of rows that count in the likelihood."""
         return int(self.tracks.judged.sum())
 
 
 def gather(records: Sequence[MotorRecord], motor: int | None = None) -> MotorData | None:
-    """Cut recordings into tracks; ``motor`` picks one motor. None where nothing long enough is left."""
+    """Cut recordings into tracks.
+
+    Args:
+        records: recordings.
+        motor: number of the motor to pick; None: all motors.
+
+    Returns:
+        The tracks; None if no stretch is long enough.
+    """
     pieces, owners, noise, ratio, interval = [], [], [], [], []
     for record in records:
         for column, number in enumerate(record.motors):
@@ -70,7 +80,7 @@ def gather(records: Sequence[MotorRecord], motor: int | None = None) -> MotorDat
             turning = np.isfinite(speed) & (command > 0.05)
             if turning.any():
                 ratio.append(np.median(speed[turning] / command[turning]))
-            # Bursts leave the median of the differences alone; missing readings are left out.
+            # The noise estimate is a median of differences, so bursts do not affect it.
             noise.append(float(white_noise(speed[np.isfinite(speed), None])[0]))
             for segment in record.segments():
                 found = _cut(record.time[segment], command[segment], speed[segment])
@@ -93,7 +103,7 @@ def gather(records: Sequence[MotorRecord], motor: int | None = None) -> MotorDat
 
 
 def _cut(time: np.ndarray, command: np.ndarray, speed: np.ndarray) -> list[dict]:
-    """Pieces of one motor's gapless stretch, overlapping by their warm-up; every row is judged once at most."""
+    """Cut a gap-free stretch of one motor into pieces that overlap by the warm-up; each row counts at most once."""
     found, first, judged_from = [], 0, None
     known = np.isfinite(speed)
     while first < len(time) and known[first:].any():

@@ -1,8 +1,8 @@
-"""Motor constants from commands and measured rotor speeds: flights under feedback as well as bench steps.
+"""Motor constants from commands and measured rotor speeds, for flights under feedback and for bench steps.
 
-The paper (section III-B, eq. 5) has one time constant T and a gain K. Optional extras: an offset (steady speed affine
-in the command), separate time constants for spin-up and spin-down, and a dead time. Each extra is tested against the
-model without it. The estimator is described in `cfb_mjx.sysid.rotors.motor_filter`.
+The paper's model (section III-B, eq. 5) has one time constant T and a gain K. Optional extras are an offset (the steady
+speed is then affine in the command), separate time constants for spin-up and spin-down, and a dead time. Each extra is
+tested against the model without it. The estimator is described in `cfb_mjx.sysid.rotors.motor_filter`.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ UNITS = {
     "dead_time": "s",
 }
 ENTRIES = ("motor_time_constant", "motor_gain", "motor_speed_offset")
-"""What a model file holds of the motors."""
+"""Constants of the motors in a model file."""
 SIGNIFICANT = 0.01
+"""Largest p-value at which an extra is supported."""
 _INNER = frozenset({"asymmetric", "dead_time"})
-"""Extras tested whether asked for or not: left out where they are real, they bend all other constants."""
+"""Extras that are always tested, because omitting a real one biases all other constants."""
 _LAGS = ("spin_up_time_constant", "spin_down_time_constant")
 _EXTRA_NAMES = {
     "asymmetric": _LAGS,
@@ -44,24 +45,26 @@ _EXTRA_NAMES = {
     "offset": ("motor_speed_offset",),
 }
 _UNKNOWN = {
-    "motor_gain": "the commands hardly tell the gain",
-    "motor_speed_offset": "the commands stay in too narrow a range to tell the offset",
-    "motor_time_constant": "the commands hardly change, so the lag does not show",
-    "spin_up_time_constant": "the commands hardly ever rise, so the spin-up lag does not show",
-    "spin_down_time_constant": "the commands hardly ever fall, so the spin-down lag does not show",
-    "dead_time": "the commands hardly change, so a dead time does not show",
+    "motor_gain": "the commands hardly determine the gain",
+    "motor_speed_offset": "the range of the commands is too narrow to determine the offset",
+    "motor_time_constant": "the commands hardly change, so the lag cannot be determined",
+    "spin_up_time_constant": "the commands hardly ever rise, so the spin-up lag cannot be determined",
+    "spin_down_time_constant": "the commands hardly ever fall, so the spin-down lag cannot be determined",
+    "dead_time": "the commands hardly change, so a dead time cannot be determined",
 }
 
 
 @dataclass(frozen=True)
 class ExtraTest:
-    """Whether the data ask for an extra: likelihood ratio against the same model without it.
+    """Likelihood-ratio test of an extra against the same model without it.
+
+    The log-likelihood ratio is divided by the variance inflation of the bootstrap, because the innovations are
+    correlated if the noise model is not quite right.
 
     Attributes:
         name: ``asymmetric``, ``dead_time`` or ``offset``.
-        p_value: of the ratio, after dividing it by the bootstrap's variance inflation: rows are not independent where
-            the noise model is not quite right.
-        bic_gain: by how much the Bayesian information criterion falls, likewise; positive is for the extra.
+        p_value: of the ratio.
+        bic_gain: decrease of the Bayesian information criterion; positive if the extra is favoured.
     """
 
     name: str
@@ -70,22 +73,22 @@ class ExtraTest:
 
     @property
     def supported(self) -> bool:
-        """Both criteria agree: significant, and worth its parameter."""
+        """Whether the extra is significant and lowers the Bayesian information criterion."""
         return bool(self.p_value < SIGNIFICANT and self.bic_gain > 0)
 
 
 @dataclass(frozen=True)
 class GroupFit:
-    """One motor, or all as if they were one.
+    """Fit of one motor, or of all motors treated as one.
 
     Attributes:
-        estimates: identified constants, SI. ``motor_time_constant`` is always the one constant of a plain model; where
-            there are extras it is the nearest to them (`common_lag`).
-        unidentifiable: what the data cannot tell: name to explanation.
-        tests: of the extras, also of those that were not asked for.
-        extras: the fit holds: those asked for, and those that the data support, without which the other constants
-            would be wrong.
-        optimum: of the fit with those extras.
+        estimates: identified constants, SI. ``motor_time_constant`` is always the single time constant of a model
+            without extras; in a fit with extras, it is the closest one (`common_lag`).
+        unidentifiable: constants that the data do not determine: name to explanation.
+        tests: of the extras, including those that were not requested.
+        extras: extras in the fit: those requested, and those the data support, without which the other constants would
+            be biased.
+        optimum: maximum-likelihood estimate with those extras.
     """
 
     estimates: dict[str, Estimate]
@@ -96,11 +99,11 @@ class GroupFit:
 
     @property
     def motor(self) -> Motor:
-        """Constants and noise levels, with the extras."""
+        """Constants and noise levels of the fit."""
         return self.optimum.motor
 
     def to_json(self) -> dict:
-        """Constants, tests, noise levels and how well they describe the rows, in JSON terms."""
+        """Constants, tests, noise levels and diagnostics as a JSON-compatible dictionary."""
         tests = {t.name: {"p_value": t.p_value, "bic_gain": t.bic_gain, "supported": t.supported} for t in self.tests}
         noise = self.motor
         return {
@@ -125,10 +128,10 @@ class MotorFit:
     """Result of `fit_motors`.
 
     Attributes:
-        common: all motors as one.
-        motors: each on its own, by number; empty unless asked for.
-        differences: p-value that the motors agree, by constant; empty likewise.
-        records: what was fitted.
+        common: fit of all motors treated as one.
+        motors: fits of single motors, by number; empty unless requested.
+        differences: p-value of the hypothesis that all motors share a constant, by constant; empty unless requested.
+        records: recordings that were fitted.
     """
 
     common: GroupFit
@@ -137,9 +140,9 @@ class MotorFit:
     records: tuple[MotorRecord, ...]
 
     def values(self, name: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """(4,) values and standard deviations for a model file; None where the data do not tell this constant.
+        """Values (4,) and standard deviations (4,) of a constant for a model file; None if it is not identified.
 
-        A motor that was not fitted, or whose own data do not tell the constant, gets the common one.
+        A motor that was not fitted, or whose own data do not determine the constant, gets the common value.
         """
         groups = [self.motors.get(i, self.common) for i in range(1, 5)]
         each = (g.estimates.get(name, self.common.estimates.get(name)) for g in groups)
@@ -158,20 +161,20 @@ def fit_motors(
     per_motor: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> MotorFit:
-    """Fit T and K, and what else is asked for, to recordings of commands and rotor speeds.
+    """Fit time constant, gain and optional extras to recordings of commands and rotor speeds.
 
     Args:
         records: flights (`record_of`) or bench steps; run with x64 enabled.
-        nominal: where to start, and the value of the offset unless it is fitted.
-        offset: fit the steady rotor speed at zero command (``motor_speed_offset``) also where the data do not ask for
-            it.
-        asymmetric: separate time constants for spin-up and spin-down.
-        dead_time: fit the time from a command to its first effect; any number, not a multiple of the row interval.
-        per_motor: fit every motor on its own as well.
+        nominal: initial values, and the value of the offset unless it is fitted.
+        offset: fit the steady rotor speed at zero command (``motor_speed_offset``) even if the data do not require it.
+        asymmetric: fit separate time constants for spin-up and spin-down even if the data do not require them.
+        dead_time: fit the time from a command to its first effect even if the data do not require it. It is continuous,
+            not a multiple of the row interval.
+        per_motor: also fit every motor separately.
         progress: called with (done, total).
 
     Raises:
-        CfbError: too little data, or ``per_motor`` with recordings that do not say which motor they are of.
+        CfbError: there is too little data, or ``per_motor`` is set and the recordings do not state the motor.
     """
     if per_motor:
         _motor_numbers(records)
@@ -184,20 +187,20 @@ def fit_motors(
 
 
 def each_motor(fit: MotorFit, nominal: Parameters, progress: Callable[[int, int], None] | None = None) -> MotorFit:
-    """The same with every motor fitted on its own, with the extras that all of them together need.
+    """Fit every motor separately, with the extras of the common fit.
 
     Args:
-        fit: of all motors as one.
-        nominal: where to start.
+        fit: fit of all motors treated as one.
+        nominal: initial values.
         progress: called with (done, total).
 
     Raises:
-        CfbError: too little data, or recordings that do not say which motor they are of.
+        CfbError: there is too little data, or the recordings do not state the motor.
     """
     numbers = _motor_numbers(fit.records)
     groups = {}
     for done, number in enumerate(numbers):
-        # One motor alone has less to say about extras than all together.
+        # All motors together determine the extras better than one motor.
         data = _gathered(fit.records, number)
         groups[number] = _fit_group(data, nominal, number, fit.common.extras, fit.common.extras)
         if progress is not None:
@@ -206,7 +209,7 @@ def each_motor(fit: MotorFit, nominal: Parameters, progress: Callable[[int, int]
 
 
 def fit_again(fit: MotorFit, records: Sequence[MotorRecord], nominal: Parameters) -> MotorFit:
-    """The same model of all motors as one, with the extras it holds, fitted to other recordings."""
+    """Fit all motors, treated as one, to other recordings, with the same extras as in ``fit``."""
     extras = fit.common.extras
     common = _fit_group(_gathered(records, None), nominal, None, extras, extras)
     return MotorFit(common, {}, {}, tuple(records))
@@ -252,7 +255,11 @@ def _fit_group(data: MotorData, nominal: Parameters, motor: int | None, asked: f
 
 
 def _decide(data: MotorData, asked: frozenset, guess: np.ndarray) -> tuple[Optimum, tuple[ExtraTest, ...], frozenset]:
-    """The fit with the extras asked for or needed, and the tests of all: each is left out of the largest model."""
+    """Choose the extras: test each by removing it from the largest model, keep those requested or supported.
+
+    Returns:
+        The fit with the chosen extras, the tests of all extras, and the chosen extras.
+    """
     all_of = asked | _INNER
     whole = maximise(data, _free(all_of), guess)
     smaller = {e: maximise(data, _free(all_of - {e}), _without(whole, e, guess)) for e in sorted(all_of)}
@@ -267,14 +274,14 @@ def _decide(data: MotorData, asked: frozenset, guess: np.ndarray) -> tuple[Optim
         shifted = maximise(data, _free(extras | {"offset"}), best.vector)
         tests.append(_test("offset", shifted, best))
         if tests[-1].supported:
-            # Held at zero where the data contradict it, it would bend the gain and with it the lag.
+            # A real offset that is held at zero would bias the gain and, with it, the lag.
             best, extras = shifted, extras | {"offset"}
     return best, tuple(tests), extras
 
 
 def _without(fit: Optimum, extra: str, guess: np.ndarray) -> np.ndarray:
-    """The vector of ``fit`` with an extra taken out: where to start the model without it."""
-    # The noise has to explain what the extra did, so its levels start wide again.
+    """Initial vector of the model without an extra, from a fit with it."""
+    # The noise now has to explain what the extra did, so its levels start from the first guess again.
     vector = np.concatenate([fit.vector[:5], guess[5:]])
     if extra == "dead_time":
         vector[2:4] = np.log(np.maximum(np.exp(vector[2:4]) + DEAD_TIME_UNIT * vector[4], 2e-3))
@@ -323,7 +330,7 @@ def _test(extra: str, larger: Optimum, smaller: Optimum) -> ExtraTest:
 
 
 def _differences(groups: dict[int, GroupFit]) -> dict[str, float]:
-    """p-value that all motors share a constant, from their estimates' weighted spread."""
+    """p-values of the hypothesis that all motors share a constant, from the weighted spread of their estimates."""
     found = {}
     for name in UNITS:
         known = [g.estimates[name] for g in groups.values() if name in g.estimates]
@@ -335,5 +342,5 @@ def _differences(groups: dict[int, GroupFit]) -> dict[str, float]:
 
 
 def chi_square_tail(value: float, degrees: int) -> float:
-    """Probability that a chi-square variable with ``degrees`` of freedom exceeds ``value``."""
+    """Probability that a chi-square variable with ``degrees`` degrees of freedom exceeds ``value``."""
     return float(gammaincc(jnp.asarray(degrees / 2), jnp.asarray(value / 2)))

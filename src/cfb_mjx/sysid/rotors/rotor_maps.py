@@ -1,8 +1,8 @@
 """Thrust and torque of a rotor from bench points: a cubic through the origin by linear least squares (paper eqs. 8-9).
 
 ``y(Omega) = c3 s^3 + c2 s^2 + c1 s`` with ``s = Omega / sigma``. A scale that was not tared adds a constant to every
-point, which bends the whole curve: it is fitted wherever the points ask for it. Optionally every motor has a factor of
-its own on the common curve (mean one), and outliers are weighed down (Huber, Robust Statistics, 1981, chapter 7).
+point, which would bias the whole curve, so an offset is fitted if it is significant. Optionally every motor has its own
+factor on the common curve (with mean one), and outliers are down-weighted (Huber, Robust Statistics, 1981, chapter 7).
 """
 
 from __future__ import annotations
@@ -16,13 +16,15 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.sysid.rotors.map_shape import SIGMA, Shape, shape_of
 
 HUBER = 1.345
-"""Residuals beyond this many standard deviations count linearly: 95 % efficient on normal noise."""
+"""Threshold of the Huber loss, in standard deviations: 95 % efficient for normal noise."""
 FEWEST_POINTS = 6
+"""Smallest number of points of a fit."""
 TARE = 3.0
-"""An offset of all points is kept from so many of its standard deviations on."""
+"""An offset of all points is kept if it exceeds this many of its standard deviations."""
 _TARE_LEVELS = 5
-"""Different rotor speeds from which an offset can be told beside three coefficients, with one to spare."""
+"""Number of different rotor speeds required to fit an offset beside the three coefficients, with one to spare."""
 _ITERATIONS = 50
+"""Maximum number of iterations of the fit."""
 
 
 @dataclass(frozen=True)
@@ -30,22 +32,22 @@ class MapFit:
     """A fitted curve.
 
     Attributes:
-        coefficients: (3,) of s^3, s^2, s, like `Parameters.thrust_polynomial`.
-        covariance: (3, 3).
-        scale: (m,) factor of each motor, mean one; empty when all share one curve.
-        scale_std: (m,) its standard deviations.
-        motors: (m,) numbers the factors belong to.
-        scale_p_value: that all factors are one (F test); NaN without factors.
-        rotor_speed: (n,) points, rad/s.
-        value: (n,) measured, N or N m.
-        residual: (n,) measured minus fitted, N or N m.
-        offset: what the points read too much at every speed (a scale that was not tared), N or N m; 0 unless they show
-            it by `TARE` standard deviations. Not part of the curve.
-        offset_std: its standard deviation; 0 where it is not fitted.
-        weight: (n,) 1, or less for what the robust fit takes for outliers.
-        motor: (n,) motor numbers.
-        noise: standard deviation of a point, from the residuals (robustly if asked) or as given, N or N m; (n,).
-        shape: monotonicity and sign.
+        coefficients: (3,) of s^3, s^2, s, as in `Parameters.thrust_polynomial`.
+        covariance: (3, 3) of the coefficients.
+        scale: (m,) factor of each motor, with mean one; empty if all motors share one curve.
+        scale_std: (m,) standard deviations of the factors.
+        motors: (m,) numbers of the motors that have factors.
+        scale_p_value: p-value of the hypothesis that all factors are one (F test); NaN without factors.
+        rotor_speed: (n,) of the points, rad/s.
+        value: (n,) measured value, N or N m.
+        residual: (n,) measured minus fitted value, N or N m.
+        offset: constant excess of all points (a scale that was not tared), N or N m; 0 unless it exceeds `TARE`
+            standard deviations. Not part of the curve.
+        offset_std: standard deviation of the offset; 0 if it is not fitted.
+        weight: (n,) weight of each point; below 1 for outliers in a robust fit.
+        motor: (n,) motor number of each point.
+        noise: (n,) standard deviation of a point, from the residuals (robust if requested) or as given, N or N m.
+        shape: check of monotonicity and sign.
         sigma: reference rotor speed, rad/s.
     """
 
@@ -68,7 +70,7 @@ class MapFit:
 
     @property
     def std(self) -> np.ndarray:
-        """(3,) standard deviations of the coefficients."""
+        """Standard deviations (3,) of the coefficients."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
@@ -77,7 +79,7 @@ class MapFit:
         return np.flatnonzero(np.abs(self.residual) > 4 * self.noise)
 
     def curve(self, rotor_speed: np.ndarray) -> np.ndarray:
-        """The common curve, N or N m."""
+        """Value of the common curve at rotor speeds, N or N m."""
         return powers(rotor_speed, self.sigma) @ self.coefficients
 
     def curve_std(self, rotor_speed: np.ndarray) -> np.ndarray:
@@ -86,7 +88,7 @@ class MapFit:
         return np.sqrt(np.einsum("ni,ij,nj->n", design, self.covariance, design))
 
     def to_json(self) -> dict:
-        """The curve and its points, in JSON terms."""
+        """The curve and its points as a JSON-compatible dictionary."""
         return {
             "coefficients": self.coefficients,
             "covariance": self.covariance,
@@ -108,7 +110,7 @@ class MapFit:
 
 
 def powers(rotor_speed: np.ndarray, sigma: float = SIGMA) -> np.ndarray:
-    """(n, 3) columns s^3, s^2, s."""
+    """Columns s^3, s^2, s (n, 3) of the cubic."""
     s = np.asarray(rotor_speed, dtype=float) / sigma
     return np.stack([s**3, s**2, s], axis=-1)
 
@@ -124,19 +126,19 @@ def fit_map(
     name: str = "map",
     tared: bool = False,
 ) -> MapFit:
-    """Fit thrust [N] or torque [N m] against rotor speed [rad/s].
+    """Fit thrust or torque as a cubic in rotor speed.
 
     Args:
         rotor_speed: (n,) rad/s.
-        value: (n,) measured.
-        motor: (n,) numbers of the motors; all one by default.
-        std: noise of the points, N or N m, for their weights; estimated from the residuals by default.
-        robust: weigh outliers down.
-        per_motor: a factor for each motor on the common curve.
+        value: (n,) measured thrust, N, or torque, N m.
+        motor: (n,) motor number of each point; by default all points are of one motor.
+        std: standard deviation of the points, N or N m, for their weights; by default estimated from the residuals.
+        robust: down-weight outliers.
+        per_motor: fit a factor for each motor on the common curve.
         sigma: reference rotor speed, rad/s.
-        name: for messages.
-        tared: the scale is known to read zero at rest. Otherwise an offset is fitted where the points show one by
-            `TARE` standard deviations; where they do not, what it might be is in the covariance.
+        name: of the data, for messages.
+        tared: the scale is known to read zero at rest. Otherwise an offset is fitted if it exceeds `TARE` standard
+            deviations; if it does not, its uncertainty is included in the covariance.
 
     Raises:
         CfbError: too few points or too few different speeds for a cubic.
@@ -170,7 +172,8 @@ def fit_map(
         covariance = _covariance(design, member, theta, scale, residual, noise, robust)
         if not shared or abs(theta[3]) > TARE * np.sqrt(covariance[3, 3]):
             break
-        # An offset too small to be told still moves the curve: by as much as the one found, or one of its deviations.
+        # An insignificant offset still adds uncertainty to the curve: that of the offset found, or of one standard
+        # deviation if that is larger.
         shared, untold = False, (theta[:3], max(1.0, float(np.sqrt(covariance[3, 3]) / max(abs(theta[3]), 1e-300))))
     if untold is not None:
         moved = untold[1] * (untold[0] - theta[:3])
@@ -197,7 +200,7 @@ def fit_map(
 
 
 def _levels(speed: np.ndarray) -> int:
-    """How many different rotor speeds there are: points closer than 2 % of full speed repeat one setting."""
+    """Number of different rotor speeds; points closer than 2 % of full speed count as one setting."""
     ordered = np.sort(speed[speed > 0])
     return 1 + int(np.sum(np.diff(ordered) > 0.02 * SIGMA)) if len(ordered) else 0
 
@@ -217,14 +220,13 @@ def _enough(speed: np.ndarray, motor: np.ndarray, motors: tuple[int, ...], name:
 
 
 def _slopes(design, member, scale) -> np.ndarray:
-    """(n, 3 or 4) derivatives by the coefficients, which a motor's factor multiplies, and by the offset, which it does
-    not."""
+    """Derivatives (n, 3 or 4) with respect to the coefficients, scaled by the motor's factor, and to the offset."""
     factor = member @ scale if member.shape[1] else np.ones(len(member))
     return np.concatenate([factor[:, None] * design[:, :3], design[:, 3:]], axis=1)
 
 
 def _least_squares(design, member, value, root, scale):
-    """One round: the curve given the factors, then the factors given the curve, with their mean moved to the curve."""
+    """One iteration: fit the curve given the factors, then the factors given the curve, and normalise their mean."""
     rows = root[:, None] * _slopes(design, member, scale)
     theta = np.linalg.lstsq(rows, root * value, rcond=None)[0]
     if member.shape[1]:
@@ -236,7 +238,7 @@ def _least_squares(design, member, value, root, scale):
 
 def _spread(residual: np.ndarray, free: int, robust: bool) -> float:
     if robust:
-        # Fewer residuals than points are free; without the factor a small table looks too good.
+        # Correct for the degrees of freedom; otherwise the noise of a small table is underestimated.
         return max(1.4826 * np.median(np.abs(residual)) * np.sqrt(len(residual) / free), 1e-12)
     return max(float(np.sqrt(residual @ residual / free)), 1e-12)
 
@@ -250,11 +252,11 @@ def _covariance(
     noise: np.ndarray,
     robust: bool,
 ) -> np.ndarray:
-    """Of the coefficients, the offset if there is one, and the factors, whose mean is fixed."""
+    """Covariance of the coefficients, the offset if there is one, and the factors, whose mean is fixed."""
     count, k = member.shape[1], design.shape[1]
     curve = (design[:, :3] @ theta[:3])[:, None]
     slopes = np.concatenate([_slopes(design, member, scale), member * curve], axis=1)
-    # The factors live in the space orthogonal to a common change.
+    # Restrict the factors to the space orthogonal to a common change.
     basis = np.eye(k + count)
     if count:
         within = np.linalg.svd(np.ones((1, count)))[2][1:].T

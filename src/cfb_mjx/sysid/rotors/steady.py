@@ -1,7 +1,7 @@
-"""Motor gain and offset from steady points without time: ``omega = a + b u V``, or ``a + b u`` without a voltage.
+"""Motor gain and offset from steady points: ``omega = a + b u V``, or ``a + b u`` without a voltage.
 
-A brushless controller switches the battery's voltage on for the share u of the time, so the speed follows u V: on a
-bench where the battery sags by a volt that leaves 10 rad/s where a line in u alone leaves 46.
+A brushless motor controller applies the battery voltage for the share u of the time, so the speed is proportional to
+u V. On a bench where the battery voltage drops by a volt, the residual is 10 rad/s; with a line in u alone it is 46.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE
 from cfb_mjx.model.effects.fields import HOVER_SPEED
 
 _FEWEST, _LEVELS = 6, 3
-VARIES = 0.05  # V of spread from which the voltage can be told
-_OUTLIER = 5.0
+VARIES = 0.05  # V; smallest standard deviation of the voltage at which its effect can be determined
+_OUTLIER = 5.0  # spreads
 
 
 @dataclass(frozen=True)
@@ -26,12 +26,14 @@ class SteadyFit:
     """Gain and offset of the motors.
 
     Attributes:
-        gain: rad/s of a command of one, at 3.7 V where the voltage was measured. ``gain_std``: its deviation.
-        offset: rad/s, of the line at no command. ``offset_std``: its deviation.
-        per_volt: rad/s of a command of one and V; None where the voltage was not measured, did not change or
-            explains nothing.
-        spread: rad/s, of the points about the line. ``spread_without_voltage``: about a line in the command alone.
-        outliers: share of points more than five spreads off, left out.
+        gain: increase of the speed per unit command, rad/s; at 3.7 V if the voltage is used.
+        gain_std: its standard deviation.
+        offset: speed of the line at zero command, rad/s.
+        offset_std: its standard deviation.
+        per_volt: gain per volt, rad/s; None if the voltage was not measured, did not vary or explains nothing.
+        spread: rms distance of the points from the line, rad/s.
+        spread_without_voltage: the same for a line in the command alone.
+        outliers: share of points more than five spreads from the line, which are left out.
         points: number of points.
     """
 
@@ -51,7 +53,7 @@ class SteadyFit:
         return None if self.per_volt is None else 1.0 - self.offset / HOVER_SPEED
 
     def to_json(self) -> dict:
-        """What the line tells besides gain and offset, in JSON terms."""
+        """Results other than gain and offset as a JSON-compatible dictionary."""
         return {
             "gain_per_volt": self.per_volt,
             "battery_sag_slope": self.sag_slope,
@@ -63,7 +65,10 @@ class SteadyFit:
 
 
 def fit_steady(tables: list[SteadyPoints]) -> SteadyFit:
-    """Fit the line through all points, all motors as one.
+    """Fit one line through all points of all motors.
+
+    Args:
+        tables: steady points.
 
     Raises:
         CfbError: too few points or too few different commands.
@@ -97,10 +102,10 @@ def fit_steady(tables: list[SteadyPoints]) -> SteadyFit:
 
 
 def _line(x: np.ndarray, y: np.ndarray, setting: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Offset and slope, their deviations, spread of the points, share of outliers.
+    """Robust line fit: offset and slope, their standard deviations, spread of the points, share of outliers.
 
-    Sensors that count a blade twice or miss one read half or double for whole settings: the line starts from least
-    absolute residuals, and what is far from it is left out. Points of one setting share their error.
+    Speed sensors that count a blade twice or miss one read double or half for whole settings. So the fit starts from
+    least absolute residuals and then leaves out distant points. Errors of points of one ``setting`` are correlated.
     """
     from scipy.optimize import least_squares
 

@@ -1,5 +1,4 @@
-"""Motors whose supply sags: on a bench, do they follow the command or the command times the voltage; in flight, how
-far do they follow the battery?"""
+"""Motors with a varying supply voltage: dependence of the rotor speed on it, on a bench and in flight."""
 
 from __future__ import annotations
 
@@ -17,11 +16,11 @@ from cfb_mjx.sysid.rotors.motors import MotorFit, each_motor, fit_again, fit_mot
 from cfb_mjx.sysid.rotors.steady import VARIES
 
 SURE = 3.0
-"""Standard deviations a slope must be away from nothing."""
+"""Significance that a slope needs, in standard deviations."""
 
 
 class Extras(TypedDict, total=False):
-    """What `fit_motors` may be asked for beside lag and gain."""
+    """Options of `fit_motors`: what to fit in addition to lag and gain."""
 
     offset: bool
     asymmetric: bool
@@ -35,17 +34,19 @@ def fit_under_supply(
     progress: Callable[[int, int], None] | None = None,
     **extras: Unpack[Extras],
 ) -> tuple[MotorFit, list[str]]:
-    """Motors from commands, or from commands times voltage where all records have one that changes and it is likelier.
+    """Fit motors to commands, or to commands times voltage if that is likelier.
+
+    The voltage is considered if all recordings have one and it varies.
 
     Args:
         records: as for `fit_motors`.
         nominal: as for `fit_motors`.
         per_motor: as for `fit_motors`.
-        progress: likewise.
-        **extras: likewise.
+        progress: as for `fit_motors`.
+        **extras: as for `fit_motors`.
 
     Returns:
-        The fit, whose gain is that at 3.7 V where the voltage counts, and what was decided, in words.
+        The fit, whose gain is that at 3.7 V if the voltage is used, and notes on the decision.
 
     Raises:
         CfbError: as `fit_motors`.
@@ -74,7 +75,7 @@ def fit_under_supply(
 
 @dataclass(frozen=True)
 class Sag:
-    """How far rotor speed follows the battery: slope and lag of `BatterySag`, and the slope's standard deviation."""
+    """Dependence of rotor speed on battery voltage: slope and lag of `BatterySag`, and the slope's std."""
 
     slope: float
     lag: float
@@ -82,17 +83,18 @@ class Sag:
 
 
 SLOPES = (0.0, 0.5, 1.0)
-"""At which the likelihood is asked; a parabola through them tells the best."""
+"""Slopes at which the likelihood is evaluated; the optimum is that of a parabola through them."""
 LAGS = (0.02, 3.0)
-"""Of what the rotors feel behind the battery's voltage, s: every dip under load, or how empty it is."""
+"""Lags between battery voltage and its effect on the rotors that are tried, s. The rotors respond to every dip under
+load, or only to the state of charge."""
 
 
 def fit_with_sag(
     records: Sequence[MotorRecord], nominal: Parameters, **extras: Unpack[Extras]
 ) -> tuple[MotorFit, Sag | None]:
-    """Every motor on its own, and how far all follow the battery's voltage (``battery_sag``).
+    """Fit every motor separately, together with their common dependence on battery voltage (``battery_sag``).
 
-    A speed that follows the voltage is, divided by ``1 + slope (V - 3.7 V) / 3.7 V``, that of a motor that does not.
+    Dividing the speed by ``1 + slope (V - 3.7 V) / 3.7 V`` removes this dependence.
 
     Args:
         records: as for `fit_motors`.
@@ -100,8 +102,8 @@ def fit_with_sag(
         **extras: as for `fit_motors`.
 
     Returns:
-        The fit, whose constants are those at 3.7 V, and the slope; None where no voltage was logged, it hardly changes,
-        or the motors do not follow it.
+        The fit, whose constants are those at 3.7 V, and the dependence. The latter is None if no voltage was logged, if
+        it hardly varies, or if the motors do not depend on it.
 
     Raises:
         CfbError: as `fit_motors`.
@@ -111,7 +113,7 @@ def fit_with_sag(
         return each_motor(fit, nominal), None
 
     def divided(slope: float, lag: float) -> tuple[MotorFit, float]:
-        """The fit to divided speeds, and its loss as one of the speeds that were measured."""
+        """Fit to the divided speeds, and its negative log-likelihood of the measured speeds."""
         factors = [1 + slope * (_felt(r, lag) - NOMINAL_VOLTAGE) / NOMINAL_VOLTAGE for r in records]
         pairs = zip(records, factors, strict=True)
         found = fit_again(fit, [replace(r, rotor_speed=r.rotor_speed / f[:, None]) for r, f in pairs], nominal)
@@ -135,14 +137,14 @@ def fit_with_sag(
 
 
 def _telling_voltages(records: Sequence[MotorRecord]) -> list[np.ndarray] | None:
-    """The voltages of all records; None unless all have one and it changes enough."""
+    """The voltages of all records; None unless all records have one and it varies enough."""
     voltages = [v for r in records if (v := r.battery_voltage) is not None and np.isfinite(v).all()]
     tells = len(voltages) == len(records) and np.std(np.concatenate(voltages)) >= VARIES
     return voltages if tells else None
 
 
 def _felt(record: MotorRecord, lag: float) -> np.ndarray:
-    """(n,) voltage through a first-order filter, V, from the first reading on."""
+    """Voltage (n,) through a first-order low-pass filter that starts at the first reading, V."""
     voltage = not_none(record.battery_voltage)
     felt = np.empty(len(record.time))
     felt[0] = voltage[0]

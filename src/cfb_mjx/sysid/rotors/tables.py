@@ -1,4 +1,4 @@
-"""Thrust and torque curves through tables of bench points, and whether these are of one rotor of the drone."""
+"""Thrust and torque curves from tables of bench points, and the check that a table is of one rotor of the drone."""
 
 from __future__ import annotations
 
@@ -17,12 +17,16 @@ _FOUR_LEAST = 2.5
 
 
 def require_one_rotor(tables: Sequence[MapTable], base: ModelFile) -> None:
-    """Refuse thrust that is plainly that of four rotors, or a quarter of one's.
+    """Refuse tables whose thrust is clearly that of four rotors, a quarter of one rotor's, or another drone's.
 
-    No propeller this drone carries differs that much from another.
+    The propellers that fit this drone do not differ by such factors.
+
+    Args:
+        tables: bench points.
+        base: the model to compare with.
 
     Raises:
-        CfbError: it is, and what to give.
+        CfbError: the thrust is not that of one rotor; the message names the option to give.
     """
     for table in tables:
         ratio = _pull(table, base)
@@ -53,17 +57,20 @@ def require_one_rotor(tables: Sequence[MapTable], base: ModelFile) -> None:
 def fit_maps(
     tables: Sequence[MapTable], sigma: float, per_motor: bool = False, robust: bool = False, tared: bool = False
 ) -> dict[str, MapFit]:
-    """Fit ``thrust`` and ``torque`` to all tables that have them.
+    """Fit curves of ``thrust`` and ``torque`` to all tables that have these columns.
 
     Args:
         tables: bench points.
         sigma: reference rotor speed, rad/s.
         per_motor: as for `fit_map`.
-        robust: likewise.
-        tared: likewise.
+        robust: as for `fit_map`.
+        tared: as for `fit_map`.
+
+    Returns:
+        The fits under ``thrust`` and ``torque``.
 
     Raises:
-        CfbError: as `fit_map`; ``per_motor`` with points that do not say which motor they are of.
+        CfbError: as `fit_map`; ``per_motor`` with points whose motor is not stated.
     """
     found = {}
     for name, column in _COLUMN.items():
@@ -88,7 +95,7 @@ def fit_maps(
 
 
 def _pull(table: MapTable, model: ModelFile) -> float | None:
-    """Thrust of fast points over what a model's rotor pulls at their speeds; None where it cannot be told."""
+    """Median ratio of the measured thrust at high speeds to a model's thrust; None if it cannot be computed."""
     if table.force is None:
         return None
     sigma = float(model.entries["reference_rotor_speed"].value)

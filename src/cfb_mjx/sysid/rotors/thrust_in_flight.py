@@ -1,8 +1,8 @@
-"""Thrust in flight: the specific force along the body's z axis beside what the rotors should pull at their speeds.
+"""Thrust in flight: comparison of the specific force along the body's z axis with a model's thrust curve.
 
-With the mass known, ``m f_z = r T(Omega) + a S v_z + b |v_xy|^2``: r times the model's thrust curve, the thrust that a
-climb costs (S: sum of the rotor speeds over 2900 rad/s) and the lift that flying forwards adds. Accelerometer and rotor
-speeds are enough for it; neither motors nor inertia take part.
+With known mass, ``m f_z = r T(Omega) + a S v_z + b |v_xy|^2``: r times the model's thrust curve, the thrust lost in a
+climb (S: sum of the rotor speeds over 2900 rad/s), and the lift gained in horizontal flight. Accelerometer, rotor
+speeds, velocity and attitude are used; motor dynamics and inertia do not matter.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from cfb_mjx.model import rotors
 from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 
-_CUT = 4.0  # Hz: above it vibration and the blades' unevenness outweigh what the drone does
-_EDGE, _LEAST = 0.3, 2.0  # s beside the ends of a stretch that a filter spoils; shortest stretch
+_CUT = 4.0  # Hz; at higher frequencies vibration and blade imbalance dominate
+_EDGE, _LEAST = 0.3, 2.0  # s; ends of a stretch where the filter is not valid; shortest stretch
 _SPEED = 2900.0  # rad/s
-_TUNING, _ROUNDS = 1.5, 30  # of Huber's loss, in standard deviations
-_BLOCK = 4.0  # s: parts of a flight that tell the deviation
-_FLOOR = 1e-3  # of the ratio: rotor speeds between rows and slow errors of the accelerometer do not scatter
+_TUNING, _ROUNDS = 1.5, 30  # threshold of the Huber loss, in standard deviations; maximum number of iterations
+_BLOCK = 4.0  # s; length of the jackknife blocks
+_FLOOR = 1e-3  # least relative standard deviation of the ratio, for slow errors that the scatter does not show
 
 
 @dataclass(frozen=True)
 class ThrustInFlight:
-    """What rotors pull in flight, over a model's curve at the same speeds.
+    """Thrust of the rotors in flight relative to a model's curve at the same rotor speeds.
 
     Attributes:
-        ratio: times the model's thrust. ``ratio_std``: its deviation, by leaving out parts of the flights, at least a
-            thousandth.
-        climb: N of a climb of 1 m/s per rotor at 2900 rad/s, negative where a climb costs thrust.
-        lift: N s^2/m^2 of flying forwards.
-        unexplained: rms of what is left, over the weight.
-        mass: kg that were taken for granted: the ratio is proportional to it.
+        ratio: measured thrust over the model's thrust.
+        ratio_std: its standard deviation, by the jackknife over parts of the flights; at least a thousandth of it.
+        climb: change of thrust per rotor at 2900 rad/s in a climb of 1 m/s, N; negative if a climb costs thrust.
+        lift: lift in horizontal flight, N s^2/m^2.
+        unexplained: rms of the residual force over the weight.
+        mass: assumed mass, kg; the ratio is proportional to it.
     """
 
     ratio: float
@@ -49,14 +49,14 @@ class ThrustInFlight:
 
 
 def thrust_in_flight(logs: Sequence[FlightLog], parameters: Parameters) -> ThrustInFlight | None:
-    """Compare specific force and rotor speeds of some flights.
+    """Compare the specific force in flight with the thrust curve at the measured rotor speeds.
 
     Args:
-        logs: flights; those without rotor speeds, and stretches below 2 s, are passed over.
-        parameters: the drone whose mass and thrust curve are compared.
+        logs: flights; flights without rotor speeds and gap-free stretches shorter than 2 s are ignored.
+        parameters: the drone, which supplies mass and thrust curve.
 
     Returns:
-        None where no stretch is long enough.
+        The comparison; None if no stretch is long enough.
     """
     parts = [part for log in logs if log.rotor_speed is not None for part in _parts(log, parameters)]
     if len(parts) < 2:
@@ -71,7 +71,7 @@ def thrust_in_flight(logs: Sequence[FlightLog], parameters: Parameters) -> Thrus
 
 
 def _parts(log: FlightLog, parameters: Parameters) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Columns (n, 3) and force (n,) N of every part of `_BLOCK` s, below `_CUT` Hz."""
+    """Regressors (n, 3) and force (n,), N, of every part of about `_BLOCK` seconds, low-passed at `_CUT`."""
     measured = not_none(log.rotor_speed)
     known = np.isfinite(measured).all(axis=1)
     if known.sum() < 2:
@@ -95,7 +95,7 @@ def _parts(log: FlightLog, parameters: Parameters) -> list[tuple[np.ndarray, np.
     found = []
     for stretch in log.segments():
         time = log.time[stretch]
-        # Rows of a stretch may lie unevenly: a filter wants them even.
+        # The filter needs evenly spaced rows.
         even = np.arange(time[0], time[-1], 1 / rate)
         if len(even) < _LEAST * rate:
             continue
@@ -108,7 +108,7 @@ def _parts(log: FlightLog, parameters: Parameters) -> list[tuple[np.ndarray, np.
 
 
 def _fitted(parts: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, float]:
-    """Huber's fit, and the rms of what it leaves."""
+    """Coefficients (3,) of a least-squares fit with Huber loss, and the rms of its residual."""
     columns, force = (np.concatenate(x) for x in zip(*parts, strict=True))
     weight = np.ones(len(force))
     values, left = np.zeros(3), force

@@ -1,4 +1,4 @@
-"""From flights to the named physical effect a model lacks."""
+"""Model correction: search the catalogue for the physical effects that a model lacks."""
 
 from cfb_mjx.sysid.tracing.closing import close_loop
 from cfb_mjx.sysid.tracing.diagnosis import Diagnosis

@@ -1,4 +1,4 @@
-"""The state of a search on disk, so that an interrupted one goes on to the result it would have had."""
+"""Checkpoint of a search on disk; an interrupted search that continues from it gives the same result."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ FORMAT = "cfb_mjx search 2"
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a search is between two rounds: all that the next depends on, and that cannot be computed again.
+    """State of a search between two rounds: all that the next round needs and that cannot be recomputed.
 
     Attributes:
         hypothesis: the model so far.
-        refused: effects that are not tried again before another is taken in.
-        tried: what was looked at in every round, for the report.
-        vain: rounds since the last effect was taken in.
-        left_out: effects without which a model was fitted to see whether they are missed.
-        judged: that model.
+        refused: names of effects that are not tried again before another effect is added.
+        tried: candidates of every round, for the report.
+        vain: number of rounds since an effect was last added.
+        left_out: names of effects that were left out of ``judged``, one at a time, to test whether they are needed.
+        judged: model that was refitted without each of these effects.
     """
 
     hypothesis: Hypothesis
@@ -45,7 +45,13 @@ class Progress:
 
 @dataclass
 class Checkpoint:
-    """One file, and what its state belongs to: flights, model, code, libraries."""
+    """A checkpoint file.
+
+    Attributes:
+        path: of the file; None: nothing is saved.
+        of: hashes and versions of the inputs of the search (`identity`).
+        state: content of the file; None if there is none.
+    """
 
     path: Path | None = None
     of: dict[str, str] = field(default_factory=dict)
@@ -53,9 +59,15 @@ class Checkpoint:
 
     @classmethod
     def open(cls, path: Path, logs: list[Path], base: ModelFile, say: Callable[[str], None]) -> Checkpoint:
-        """The checkpoint of a search over these files.
+        """Open the checkpoint of a search.
 
-        A file that is of something else is moved aside, and ``say`` is told of what.
+        A file written with other inputs, and an unreadable file, are renamed with the suffix ``.old``.
+
+        Args:
+            path: of the checkpoint, which need not exist.
+            logs: flight files of the search.
+            base: the declared model.
+            say: called with a message if the file is renamed.
         """
         new = cls(path, identity(logs, base))
         if not path.exists():
@@ -70,12 +82,12 @@ class Checkpoint:
         aside = path.with_name(f"{path.name}.old")
         path.replace(aside)
         others = [what for what in new.of if before.get(what) != new.of[what]]
-        why = f"was interrupted with other {', '.join(others)}" if before else "cannot be read"
-        say(f"the search in {path} {why}: beginning anew; it is kept as {aside.name}")
+        why = f"was interrupted with different {', '.join(others)}" if before else "cannot be read"
+        say(f"the search in {path} {why}: starting again; the old file is kept as {aside.name}")
         return new
 
     def save(self, progress: Progress) -> None:
-        """Remember where the search is."""
+        """Write the state of the search to the file."""
         if self.path is None:
             return
         self.state = {
@@ -91,7 +103,10 @@ class Checkpoint:
         write_json(self.path, self.state)
 
     def restore(self, nothing: Hypothesis) -> Progress | None:
-        """What was saved, given the declared model; None if nothing was.
+        """The saved state; None if nothing was saved.
+
+        Args:
+            nothing: hypothesis of the declared model.
 
         Raises:
             CfbError: the file is damaged.
@@ -109,10 +124,10 @@ class Checkpoint:
                 None if judged is None else self._read(judged, nothing),
             )
         except (CfbError, KeyError, TypeError, ValueError) as error:
-            raise CfbError(f"{self.path}: is damaged ({error}); delete it, and the search begins anew.") from None
+            raise CfbError(f"{self.path}: is damaged ({error}); delete it to start the search again.") from None
 
     def discard(self) -> None:
-        """The search is done."""
+        """Delete the file, after the search has finished."""
         if self.path is not None:
             remove(self.path)
 
@@ -129,7 +144,7 @@ class Checkpoint:
 
 
 def identity(logs: list[Path], base: ModelFile) -> dict[str, str]:
-    """What a search depends on, each as a hash or a version."""
+    """Hashes and versions of everything that a search depends on."""
     model = {name: entry.value.tolist() for name, entry in base.entries.items()}
     return {
         "flights": _hash(log.name.encode() + log.read_bytes() for log in logs),

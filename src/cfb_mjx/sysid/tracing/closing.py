@@ -1,4 +1,4 @@
-"""Closing the loop: what a model lacks on some flights, judged on others."""
+"""Model correction: find the effects a model lacks on some flights, and confirm them on others."""
 
 from __future__ import annotations
 
@@ -36,15 +36,18 @@ def close_loop(
     checkpoint: Checkpoint | None = None,
     rules: Rules = RULES,
 ) -> Diagnosis:
-    """Trace what a model lacks on some flights, and judge it on others.
+    """Find the effects that a model lacks and correct it.
+
+    The search uses the fit flights only. Each effect is then tested on the held-out flights, and the corrected model
+    contains the confirmed effects.
 
     Args:
-        fit: flights to learn from.
-        held_out: flights of the same drone nothing is learned from.
+        fit: flights to fit; run with x64 enabled.
+        held_out: other flights of the same drone; no parameter is fitted to them.
         base: the declared model.
-        progress: told what happens.
-        checkpoint: where the search is kept while it runs.
-        rules: what counts.
+        progress: called with a message at each step.
+        checkpoint: where the state is saved while the search runs, and from which an interrupted search continues.
+        rules: thresholds.
     """
     declared = Quadrotor.from_file(base).effects
     parameters = base.parameters()
@@ -56,7 +59,7 @@ def close_loop(
         if whole is not None:
             return whole
         if found.fit.beside_hold > 1:
-            # That may have been cut short.
+            # The search was `brief` and may have ended early.
             found = trace(fit, parameters, delay, progress, declared, rules=rules)
     # Biases of the held-out sensors come from their own kinematics; no model is fitted.
     check = replace(check_sensors(held_out, delay, float(parameters.gyro_delay)), faults=found.sensors.faults)
@@ -79,7 +82,7 @@ def close_loop(
 def _whole(
     found: Trace, fit: list[FlightLog], held_out: list[FlightLog], base: ModelFile, progress: Callable[[str], None]
 ) -> Diagnosis | None:
-    """All effects at once; None where that predicts the fit flights hardly better than what the search found."""
+    """Fit all effects together; None if that predicts the fit flights hardly better than the search's result."""
     check = replace(found.sensors, faults=HEALTHY, findings=[])
     rules = found.search.rules
     search = Search.start(fit, base.parameters(), found.search.delay, check, found.search.declared, PLANT, rules)
@@ -118,14 +121,15 @@ def _whole(
 
 
 def _stands(entry: Reported, part: Part, rules: Rules = RULES) -> bool:
-    """Whether held-out flights bear an effect out; one that the rotor speeds tell must only not be refuted by them."""
+    """Whether the held-out flights confirm an effect, or, if rotor speeds identified it, do not refute it."""
     return not_none(entry.verdict).t >= (-rules.doubtful if part.told else rules.doubtful)
 
 
 def _reported(search: Search, part: Part, after: Evaluation, held_out: list[FlightLog]) -> Reported:
-    """An effect fitted with others, judged by predictions of held-out flights without it.
+    """Report entry of a jointly fitted effect: compare predictions of the held-out flights with and without it.
 
-    Of one that the rotor speeds tell the p-value is theirs: in predictions other effects may hide what it buys.
+    The p-value of an effect identified from rotor speeds is the one found there, because in predictions other effects
+    may hide its benefit.
     """
     t, p_value = paired(evaluate(part.without, held_out, keep_diverged=True), after)
     without = hypothesis_of(search, part.without, {part.name})
@@ -145,7 +149,7 @@ def _reported(search: Search, part: Part, after: Evaluation, held_out: list[Flig
 
 
 def _borne_out(wide: Search, proposal: Proposal) -> bool:
-    """Whether held-out flights confirm a formula."""
+    """Whether the held-out flights confirm a formula."""
     verdict = confirm(wide, proposal.without, proposal.hypothesis)
     return verdict.t >= wide.rules.formula_sure and _change(wide, proposal.without, proposal.hypothesis) <= 0
 
@@ -153,7 +157,12 @@ def _borne_out(wide: Search, proposal: Proposal) -> bool:
 def _judged(
     search: Search, judge: Search, found: Trace, proposal: Proposal | None
 ) -> tuple[Hypothesis, list[Reported], list[Reported]]:
-    """What held-out flights leave of the hypothesis; what they confirm, sensor faults first; what they do not."""
+    """Test every effect found on the held-out flights.
+
+    Returns:
+        The hypothesis without unconfirmed effects, the report entries of sensor faults and confirmed effects, and those
+        of unconfirmed effects.
+    """
     hypothesis = proposal.hypothesis if proposal else found.hypothesis
     reported, unconfirmed = [], []
     for fault in found.sensors.findings:
@@ -168,7 +177,7 @@ def _judged(
         else:
             reported.append(entry)
     if unconfirmed and reported:
-        # What stays was fitted beside what goes.
+        # Refit: the confirmed effects were fitted together with the removed ones.
         hypothesis, linear = search.refine(hypothesis)
         stds = deviations(search, hypothesis, linear)
         for entry in reported:
@@ -180,17 +189,14 @@ def _judged(
 def _unexplained(
     search: Search, wide: Search, proposal: Proposal | None, hypothesis: Hypothesis, judge: Search
 ) -> Unexplained | None:
-    """What is left: a formula, and lines that most flights share, held-out ones too where there are enough of them.
-
-    If neither, what only the held-out flights show.
-    """
+    """Unexplained structure: the formula and spectral lines; without either, terms that only held-out flights show."""
     lines = _lines(search, wide, hypothesis)
     there = [] if proposal or lines else only_there(judge, hypothesis)
     return Unexplained(proposal, lines, there) if proposal or lines or there else None
 
 
 def _lines(search: Search, judge: Search, hypothesis: Hypothesis) -> list[Line]:
-    """Lines that most flights share, held-out ones too where there are enough of them."""
+    """Spectral lines common to most fit flights, and to most held-out flights if there are enough of these."""
     rules = search.rules
     lines = find_lines(residual_rows(search, hypothesis), rules.line_alpha)
     if len(judge.logs) < rules.line_flights:
@@ -202,5 +208,5 @@ def _lines(search: Search, judge: Search, hypothesis: Hypothesis) -> list[Line]:
 
 
 def _change(judge: Search, poorer: Hypothesis, richer: Hypothesis) -> float:
-    """Sum of the logarithms by which the richer hypothesis changes the prediction errors."""
+    """Sum of the changes of the logarithms of the prediction errors from the poorer to the richer hypothesis."""
     return float(np.log(prediction_errors(judge, richer) / prediction_errors(judge, poorer)).sum())

@@ -1,4 +1,4 @@
-"""What closing the loop comes to: effects borne out by other flights, what was weighed, what is left, the new model.
+"""Result of a model correction: confirmed effects, rejected candidates, unexplained structure, the corrected model.
 
 For example:
 
@@ -48,22 +48,30 @@ from cfb_mjx.sysid.tracing.trace import Found, Trace
 
 @dataclass
 class Reported:
-    """One effect or sensor fault as reported."""
+    """One reported effect or sensor fault.
+
+    Attributes:
+        name: of the effect or fault.
+        p_value: on the held-out flights; for a sensor fault, from the comparison of the sensors.
+        parameters: values by field.
+        uncertainty: standard deviations by field.
+        found: result on the fit flights; None for a sensor fault.
+        verdict: result on the held-out flights; None for a sensor fault.
+        at_bound: names of its parameters that are at a bound.
+        asked: values of its parameters according to the innovations, if it was fitted to predictions.
+    """
 
     name: str
     p_value: float
-    """On held-out flights; for sensor faults, of the comparison of the sensors."""
     parameters: dict
     uncertainty: dict
     found: Found | None = None
     verdict: Verdict | None = None
     at_bound: list[str] = field(default_factory=list)
-    """Names of its numbers that stand where they may not go further."""
     asked: list[Asked] = field(default_factory=list)
-    """What the innovations make of its numbers, where predictions decided."""
 
     def to_json(self) -> dict:
-        """The layout of ``report.json``."""
+        """The entry of an effect in ``report.json``."""
         more = {} if self.found is None else {"buys": self.found.buys, "confusable_with": self.found.confusable}
         if self.found is not None:
             more |= {"p_value_cross_validated": self.found.p_value}
@@ -87,24 +95,27 @@ class Reported:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Structure that no effect of the catalogue accounts for."""
+    """Structure that no effect of the catalogue explains.
+
+    Attributes:
+        proposal: a formula that describes it and is confirmed by the held-out flights.
+        lines: spectral lines of the residual.
+        held_out_only: terms that only the held-out flights show, fitted to these; not part of the corrected model.
+    """
 
     proposal: Proposal | None
-    """A formula that describes it, borne out by the held-out flights."""
     lines: list[Line]
-    """What swings at its own pace."""
     held_out_only: list[Term] = field(default_factory=list)
-    """What only the held-out flights show, fitted to them: no part of the corrected model."""
 
     @property
     def formulas(self) -> list[str]:
-        """One line per term, with units and uncertainty."""
+        """One line of text per term, with unit and uncertainty."""
         found = [str(term) for term in self.proposal.terms] if self.proposal else []
         return found + [f"{term} (held-out flights only, not in the model)" for term in self.held_out_only]
 
     @property
     def where(self) -> str:
-        """Axes, signals and frequencies in words."""
+        """Description of the axes, signals and frequencies involved."""
         words = _followed(self.proposal.terms if self.proposal else [])
         there = [f"in the held-out flights only, {each}" for each in _followed(self.held_out_only)]
         return "; ".join(words + there + [str(line) for line in self.lines])
@@ -117,13 +128,13 @@ def _followed(terms: list[Term]) -> list[str]:
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect that was weighed and is not reported.
+    """An effect that was considered but is not reported.
 
     Attributes:
         name: of the effect.
-        gain: nats on blocks left out, at its last try.
-        p_value: likewise.
-        why: it is not reported.
+        gain: in cross-validation, when it was last considered, nats.
+        p_value: in cross-validation, likewise.
+        why: reason why it is not reported.
     """
 
     name: str
@@ -134,16 +145,16 @@ class Candidate:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Residuals and predictions of flights nothing was fitted to; pairs are before and after.
+    """Residuals and prediction errors of the held-out flights; pairs are (before, after) the correction.
 
     Attributes:
-        search: the search on these flights, with the recording's faults taken out.
+        search: search on these flights, with the faults of the recording removed.
         rows: residuals of each flight.
-        pooled: the same in one piece.
-        predictions: errors of predictions, in one piece.
-        structure: which of all these follow which signal.
-        floor: noise floor of the sensors.
-        random: the same with random forces and torques of the size these flights show.
+        pooled: residuals of all flights, concatenated.
+        predictions: prediction errors of all flights, concatenated.
+        structure: which of these residuals and errors depend on which signal.
+        floor: noise floor due to the sensors.
+        random: noise floor due to the sensors and to random forces and torques of the size these flights show.
     """
 
     search: Search
@@ -155,26 +166,27 @@ class HeldOut:
     random: dict[str, float]
 
     def pair(self, axis: str) -> tuple[Pooled, Pooled]:
-        """Where a residual axis is found, before and after."""
+        """The pair of `predictions` or of `pooled` that contains this axis."""
         return self.predictions if axis in self.predictions[0].axes else self.pooled
 
 
 @dataclass
 class Diagnosis:
-    """What a drone has that its model lacks, and all that was weighed to say so.
+    """Result of `close_loop`: the effects that the declared model lacks, and the evidence for them.
 
     Attributes:
-        trace: of the search on the fit flights.
+        trace: outcome of the search on the fit flights.
         base: the declared model.
-        reported: effects and sensor faults, in the order of what they buy.
-        unconfirmed: found on the fit flights, not borne out by the held-out ones.
-        hypothesis: the corrected model as the search has it.
+        reported: sensor faults, then confirmed effects, the most helpful first.
+        unconfirmed: effects found on the fit flights that the held-out flights do not confirm.
+        hypothesis: the corrected model as a hypothesis of the search.
         faults: of the recording.
         before: predictions of the held-out flights by the declared model.
-        after: by the corrected one.
-        unexplained: what no effect accounts for.
-        motors: constants of the motors, fitted anew.
-        together: where the drone lacks so much that its effects were fitted together and judged by predictions.
+        after: predictions of the held-out flights by the corrected model.
+        unexplained: structure that no effect of the catalogue explains; None if there is none.
+        motors: refitted constants of the motors, as entries of a model file.
+        together: outcome of the joint fit, if so many effects are missing that they were fitted together and judged by
+            predictions; otherwise None.
     """
 
     trace: Trace
@@ -191,17 +203,17 @@ class Diagnosis:
 
     @property
     def rules(self) -> Rules:
-        """By which it was judged."""
+        """Thresholds of the search."""
         return self.trace.search.rules
 
     @property
     def models(self) -> tuple[Quadrotor, Quadrotor]:
-        """The drone before and after."""
+        """The drone before and after the correction."""
         return Quadrotor.from_file(self.base), Quadrotor.from_file(self.model_file(self.base.name, {}))
 
     @property
     def dropped(self) -> list[str]:
-        """Effects that the base model declares and a fit of all at once took out, other than `unconfirmed`."""
+        """Names of effects that the base model declares and the joint fit removed, other than `unconfirmed`."""
         if self.together is None:
             return []
         judged = (item.name for item in (*self.reported, *self.unconfirmed))
@@ -210,7 +222,7 @@ class Diagnosis:
 
     @property
     def candidates(self) -> list[Candidate]:
-        """Effects that came near and are not reported, the most nearly found first."""
+        """Effects that were considered but are not reported, the largest gain first."""
         reported = {item.name for item in self.reported}
         unconfirmed = {item.name: item for item in self.unconfirmed}
         last: dict[str, dict] = {}
@@ -225,61 +237,61 @@ class Diagnosis:
             if name in unconfirmed:
                 verdict = unconfirmed[name].verdict
                 there = "" if verdict is None else f" (p = {verdict.p_value:.1g} there)"
-                return f"found on the fit flights, not borne out by the held-out ones{there}"
+                return f"found on the fit flights, not confirmed by the held-out ones{there}"
             if name in drops and drops[name] < rules.material:
                 most = f"at most {100 * max(0.0, drops[name]):.1f} %"
                 return f"lowers no prediction error by {100 * rules.material:.0f} % ({most})"
             if name in drops:
-                return "what it explained the others explain as well or better"
+                return "other effects explain the same as well or better"
             if line["p_value"] * tried >= rules.alpha or line["gain"] <= rules.least_gain:
-                return "not beyond chance"
-            return "less than another effect"
+                return "not significant"
+            return "explains less than another effect"
 
         rows = [Candidate(name, line["gain"], line["p_value"], why(name, line)) for name, line in last.items()]
         return sorted((row for row in rows if row.name not in reported), key=lambda row: -row.gain)
 
     @cached_property
     def held_out(self) -> HeldOut:
-        """Residuals and predictions of the held-out flights, before and after."""
+        """Residuals and prediction errors of the held-out flights, before and after the correction."""
         logs = [one.log for one in self.before.logs]
         judge = self._beside(logs, self.trace.sensors.faults)
-        # Motors fitted anew are part of what changed.
+        # The declared model keeps its own motor constants.
         raw = replace(self._beside(logs, HEALTHY), parameters=self.base.parameters())
-        # Commands missing between rows are no effect: both models get the same share of them.
+        # Commands missing between rows are no effect, so both models use the same command lead.
         declared = replace(judge.nothing(), lead=self.hypothesis.lead)
         rows = aligned(residual_rows(raw, declared), residual_rows(judge, self.hypothesis))
         pooled = pool(rows[0]), pool(rows[1])
         predictions = pool_predictions(self.before, rows[0]), pool_predictions(self.after, rows[1])
         found = [structure(p) + structure(q, PREDICTION_BINS) for p, q in zip(pooled, predictions, strict=True)]
-        # Predictions have commands in; measured rotor speeds would bring noise of their own.
+        # The predictions use commands, so estimate the noise without measured rotor speeds, which add their own.
         blind = replace(judge, logs=[log.replace(rotor_speed=None) for log in judge.logs], _flights={})
         levels = blind.learned(replace(self.hypothesis, levels=FIRST)).levels
         random = noise_floor(self.after, levels_from(jnp.asarray(levels), blind.noise))
         return HeldOut(judge, rows, pooled, predictions, (found[0], found[1]), noise_floor(self.after), random)
 
     def without(self, item: Reported) -> Hypothesis | None:
-        """The best model without an effect; None for a fault of pose or gyro."""
+        """The best model without a reported effect; None for a fault of pose, velocity or gyro."""
         if item.found is None:
             return None
         if self.unexplained is not None and self.unexplained.proposal is not None:
-            # That was fitted before the formula; beside it only this effect may go.
+            # `found.without` was fitted before the formula; here only this effect is removed.
             return self.hypothesis.without(item.name)
         return item.found.without
 
     def residuals(self, poorer: Hypothesis) -> tuple[Pooled, Pooled]:
-        """Residuals of another hypothesis and of the corrected model, on all flights."""
+        """Residuals of another hypothesis and of the corrected model, over the fit and the held-out flights."""
         searches = self.trace.search, self.held_out.search
         both = ([row for s in searches for row in residual_rows(s, each)] for each in (poorer, self.hypothesis))
         less, more = aligned(*both)
         return pool(less), pool(more)
 
     def _beside(self, logs: list[FlightLog], faults: SensorFaults) -> Search:
-        """The search on other flights, with some faults of the recording taken out."""
+        """The search on other flights, with the given faults of the recording removed."""
         search = self.trace.search
         return search.beside(logs, replace(check_sensors(logs, *search.delays), faults=faults))
 
     def to_json(self) -> dict:
-        """The part of ``report.json`` that comes from the flights (DESIGN 6)."""
+        """The part of ``report.json`` that comes from the flights."""
         held_out = before_and_after(self.before, self.after) | {
             "intervals": {"before": self.before.intervals("commands_in"), "after": self.after.intervals("commands_in")},
             "logs": {
@@ -303,7 +315,12 @@ class Diagnosis:
         }
 
     def model_file(self, name: str, provenance: dict) -> ModelFile:
-        """The corrected model."""
+        """The corrected model as a model file.
+
+        Args:
+            name: of the new model.
+            provenance: origin of the model, for the file.
+        """
         effects = []
         for item in self.reported:
             if item.name in self.hypothesis.present and item.name in {type(e).name for e in self.hypothesis.effects}:
@@ -326,7 +343,7 @@ class Diagnosis:
         )
 
     def _moved(self, item: Mapping[str, Any]) -> Mapping[str, Any]:
-        """A declared effect as the drone has it: where the type's spread let it move, with its own numbers."""
+        """A declared effect with its values for this drone, if the joint fit moved it within the type's spread."""
         together = not_none(self.together)
         if item["name"] not in together.typical:
             return item

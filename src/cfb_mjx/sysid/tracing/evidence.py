@@ -1,4 +1,4 @@
-"""Whether a term improves data it was not fitted on beyond chance: blocked cross-validation on inner products."""
+"""Blocked cross-validation on inner products: do additional columns explain data to which they were not fitted?"""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from scipy.stats import norm
 
 FOLDS = 5
 RIDGE = 1e-2
-"""Prior precision of every number in units of its column's scale (half the prior range): weak, and proper."""
+"""Weak prior precision of every parameter, in units of its column's scale (half the prior range)."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """For adding some columns to others.
+    """Cross-validated evidence for adding columns to a fit.
 
     Attributes:
-        gain: half the drop of the sum of squares on blocks left out: nats of log-likelihood.
-        t: cross-fitted score statistic, standard normal where the added columns explain nothing.
-        p_value: one-sided, of ``t``.
-        values: of the added columns fitted to all blocks, in units of their scale.
+        gain: half the decrease of the sum of squares on the left-out blocks, in nats of log-likelihood.
+        t: cross-fitted score statistic; standard normal if the added columns explain nothing.
+        p_value: one-sided p-value of ``t``.
+        values: of the added columns, fitted to all blocks, in units of their scale.
     """
 
     gain: float
@@ -32,11 +32,11 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of numbers beforehand, in units of their columns' scale: normal, one by one.
+    """Independent normal prior of k parameters, in units of their columns' scale.
 
     Attributes:
-        center: (k,).
-        precision: (k,).
+        center: (k,) means.
+        precision: (k,) inverse variances.
     """
 
     center: np.ndarray
@@ -44,18 +44,18 @@ class Prior:
 
     @classmethod
     def weak(cls, count: int) -> Prior:
-        """A step not too long, whatever the numbers are now."""
+        """A weak prior on the step from the current values, which keeps it from becoming too long."""
         return cls(np.zeros(count), np.full(count, RIDGE))
 
     def pulled(self, at: int, value: float, precision: float) -> Prior:
-        """The same with more known of one number."""
+        """The prior combined with one more normal prior for the parameter at position ``at``."""
         center, both = self.center.copy(), self.precision.copy()
         both[at] += precision
         center[at] = (self.precision[at] * center[at] + precision * value) / both[at]
         return Prior(center, both)
 
     def of(self, positions: list[int]) -> Prior:
-        """Of some of the numbers."""
+        """The prior of the parameters at these positions."""
         return Prior(self.center[positions], self.precision[positions])
 
     def __add__(self, other: Prior) -> Prior:
@@ -64,7 +64,14 @@ class Prior:
 
 
 def solve(total: np.ndarray, columns: list[int], scale: np.ndarray, prior: Prior | None = None) -> np.ndarray:
-    """Values of some columns (units of their scale) that explain the residual best; ``total`` is (c, c)."""
+    """Least-squares values of some columns, in units of their scale.
+
+    Args:
+        total: (c, c) inner products summed over blocks; index 0 is the residual.
+        columns: positions of the k columns to fit.
+        scale: (c,) unit of each column.
+        prior: of the k values; weak by default.
+    """
     prior = prior or Prior.weak(len(columns))
     s = scale[columns]
     a = total[np.ix_(columns, columns)] * np.outer(s, s) + np.diag(prior.precision)
@@ -72,13 +79,13 @@ def solve(total: np.ndarray, columns: list[int], scale: np.ndarray, prior: Prior
 
 
 def alike(effects: Sequence[str], correlation: np.ndarray, name: str, limit: float) -> list[str]:
-    """Effects of which a number goes with one of this effect's.
+    """Names of the effects that have a parameter strongly correlated with one of the given effect.
 
     Args:
-        effects: of each number.
-        correlation: (n, n) of the numbers; NaN for those that go with none.
-        name: of the effect.
-        limit: correlation from which on two go together.
+        effects: (n,) effect to which each parameter belongs.
+        correlation: (n, n) correlation of the parameters; NaN counts as zero.
+        name: of the given effect.
+        limit: absolute correlation above which two parameters count as strongly correlated.
     """
     every = np.array(effects)
     most = np.nan_to_num(np.abs(correlation))[every == name].max(axis=0)
@@ -88,7 +95,15 @@ def alike(effects: Sequence[str], correlation: np.ndarray, name: str, limit: flo
 def covariance(
     blocks: np.ndarray, columns: list[int], scale: np.ndarray, values: np.ndarray, prior: Prior | None = None
 ) -> np.ndarray:
-    """(k, k) covariance of `solve`'s values, from the scatter of the blocks' gradients where that is larger."""
+    """Covariance (k, k) of the values of `solve`, inflated to the sandwich estimate over blocks if that is larger.
+
+    Args:
+        blocks: (b, c, c) inner products; index 0 is the residual.
+        columns: positions of the k fitted columns.
+        scale: (c,) unit of each column.
+        values: (k,) result of `solve`.
+        prior: as for `solve`.
+    """
     prior = prior or Prior.weak(len(columns))
     s = scale[columns]
     a = blocks.sum(0)[np.ix_(columns, columns)] * np.outer(s, s) + np.diag(prior.precision)
@@ -102,10 +117,10 @@ def covariance(
 
 
 def dealt(counts: Sequence[int]) -> np.ndarray:
-    """The fold of every block of flights with so many blocks each.
+    """Assign every block to a cross-validation fold, given the number of blocks of each flight.
 
-    A fold leaves out some of every flight, and of each flight another part of the way: dealt one after the other, what
-    only the same few blocks of alike flights show could end up in one fold.
+    Each fold leaves out blocks of every flight. The assignment is offset from flight to flight: otherwise corresponding
+    blocks of similar flights, which may be the only ones that show an effect, could all end up in the same fold.
     """
     return np.concatenate([(np.arange(count) - i) % FOLDS for i, count in enumerate(counts)])
 
@@ -118,15 +133,15 @@ def evidence(
     prior: Prior | None = None,
     fold: np.ndarray | None = None,
 ) -> Evidence:
-    """Compare a fit of ``base`` with one of ``base`` and ``added`` columns, on blocks left out.
+    """Compare a fit of ``base`` with a fit of ``base`` and ``added`` by cross-validation over blocks.
 
     Args:
-        blocks: (b, c, c) inner products; column 0 is the residual.
-        base: columns that are free anyway.
-        added: columns in question.
+        blocks: (b, c, c) inner products; index 0 is the residual.
+        base: positions of the columns of the smaller fit.
+        added: positions of the columns to be tested.
         scale: (c,) unit of each column.
         prior: of ``base`` and ``added``, in this order.
-        fold: (b,) of each block, `dealt`; None where all are of one flight.
+        fold: (b,) fold of each block, from `dealt`; None if all blocks are of one flight.
     """
     prior = prior or Prior.weak(len(base) + len(added))
     few = prior.of(list(range(len(base))))
@@ -148,7 +163,7 @@ def evidence(
         score += float(np.sum(rz))
         noise += float(np.sum((rz - zz) ** 2))
         white += float(np.sum(zz))
-    # Innovations have unit variance; where they scatter more than that between blocks, the scatter counts.
+    # Innovations have unit variance; use the scatter between blocks if it is larger than that implies.
     t = score / np.sqrt(max(noise, white, 1e-30))
     return Evidence(gain, t, float(norm.sf(t)), solve(total, both, scale, prior)[len(base) :])
 

@@ -1,4 +1,4 @@
-"""A hypothesis fitted to the flights of a search: how well it predicts them, and whether others bear it out."""
+"""Fit a hypothesis to the flights of a search, predict with it, and compare hypotheses on held-out flights."""
 
 from __future__ import annotations
 
@@ -24,27 +24,30 @@ ERRORS = tuple(
     for h in ("0.2", "0.5")
     for q in ("position_rmse_m", "velocity_rmse_mps", "attitude_rmse_deg", "rate_rmse_radps")
 )
-"""Prediction errors an effect is judged by: four quantities, two horizons."""
+"""Prediction errors by which an effect is judged: four quantities at two horizons."""
 
 
 def predicted(search: Search, hypothesis: Hypothesis) -> Evaluation:
-    """The flights of the search, predicted."""
+    """Predictions of the search's flights by a hypothesis."""
     return evaluate(hypothesis.model(search.parameters), search.logs, faults=hypothesis.faults, keep_diverged=True)
 
 
 def errors_of(evaluation: Evaluation) -> np.ndarray:
-    """(8,) `ERRORS` over all flights."""
+    """Prediction errors `ERRORS` (8,) over all flights."""
     metrics = not_none(evaluation.metrics("commands_in"))
     return np.array([metrics[key] for key in ERRORS])
 
 
 def prediction_errors(search: Search, hypothesis: Hypothesis) -> np.ndarray:
-    """(8,) `ERRORS` on the flights of the search."""
+    """Prediction errors `ERRORS` (8,) on the flights of the search."""
     return errors_of(predicted(search, hypothesis))
 
 
 def beside_hold(evaluation: Evaluation) -> float:
-    """The larger of attitude and velocity error at the last horizon (means), over what hold errs there."""
+    """Mean attitude or velocity error at the last horizon, each divided by that of `hold`; the larger ratio of the two.
+
+    Infinite if the predictions diverged.
+    """
     model, still = (not_none(evaluation.metrics(variant)) for variant in ("commands_in", "hold"))
     keys = [f"{quantity}@{max(evaluation.horizons):g}s" for quantity in ("attitude_mean_deg", "velocity_mean_mps")]
     found = max(model[key] / still[key] for key in keys)
@@ -52,12 +55,12 @@ def beside_hold(evaluation: Evaluation) -> float:
 
 
 def fitted(search: Search, hypothesis: Hypothesis, whole: bool = True) -> Fit:
-    """Fit everything a hypothesis holds; derivatives by the catalogue only if ``whole``."""
+    """Fit the parameters of all present effects; linearise with respect to the whole catalogue only if ``whole``."""
     return as_it_is(search, search.settled(hypothesis), whole)
 
 
 def as_it_is(search: Search, hypothesis: Hypothesis, whole: bool = True) -> Fit:
-    """A hypothesis that is fitted already, with what it leaves."""
+    """The `Fit` of a hypothesis that is already fitted: its errors and, if ``whole``, its linearisation."""
     linear = search.whole(hypothesis) if whole else None
     evaluation = predicted(search, hypothesis)
     flights = [errors_of(one) for one in evaluation.each if len(one.logs[0].windows)]
@@ -65,23 +68,23 @@ def as_it_is(search: Search, hypothesis: Hypothesis, whole: bool = True) -> Fit:
 
 
 def completed(search: Search, fit: Fit) -> Fit:
-    """The fit with its derivatives by the whole catalogue."""
+    """The fit with its linearisation with respect to the whole catalogue, computed if it is missing."""
     return fit if fit.linear is not None else replace(fit, linear=search.whole(fit.hypothesis))
 
 
 TOGETHER = 64
-"""Blocks compared at a time: one program serves any number."""
+"""Number of blocks compared at once. It is fixed, so that one compiled program serves any number of blocks."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """How a richer hypothesis does beside a poorer one on held-out flights.
+    """Comparison of a richer hypothesis with a poorer one on held-out flights.
 
     Attributes:
-        gain: drop of half the sum of squared innovations, nats; None where predictions judged.
-        t: standard normal where the richer one explains nothing.
-        p_value: one-sided.
-        domains: the gain by `DOMAINS`.
+        gain: decrease of half the sum of squared innovations, nats; None if predictions were compared instead.
+        t: statistic that is standard normal if the richer hypothesis explains nothing more.
+        p_value: one-sided p-value of ``t``.
+        domains: the gain in each of `DOMAINS`.
     """
 
     gain: float | None
@@ -91,12 +94,18 @@ class Verdict:
 
 
 def confirm(search: Search, poorer: Hypothesis, richer: Hypothesis) -> Verdict:
-    """Compare two fitted hypotheses on the flights of ``search``, at the noise levels of the poorer one."""
+    """Compare the whitened innovations of two fitted hypotheses on the flights of ``search``.
+
+    Args:
+        search: flights on which to compare.
+        poorer: hypothesis without the effect to be tested; its noise levels are used for both.
+        richer: hypothesis with the effect.
+    """
     levels = levels_from(jnp.asarray(poorer.levels), search.noise)
     score, power, noise = np.zeros(CHANNELS + 3), np.zeros(CHANNELS + 3), 0.0
     alike = poorer.shift == richer.shift
     own, other = (None, None) if alike else zip(*_matched(search, poorer, richer), strict=True)
-    # The richer one first: its residuals stay while one poorer after another is compared with it.
+    # Compute the richer one first: its residuals stay cached while several poorer ones are compared with it.
     more = joined(blocks for blocks, _ in search.residuals(richer, other))
     less = joined(blocks for blocks, _ in search.residuals(poorer, own))
     signals = jax.tree.map(lambda a, b: np.stack([a, b], axis=-1), less.signals, more.signals)
@@ -116,14 +125,17 @@ def confirm(search: Search, poorer: Hypothesis, richer: Hypothesis) -> Verdict:
 
 @eqx.filter_jit
 def _products(both: Blocks, levels: Levels) -> tuple[Array, Array]:
-    """Of every block and channel (b, 13): what is left times what the richer one says more, and that squared."""
+    """Sums per block and channel (b, 13): poorer residual times its difference to the richer one, and the square."""
     e, _, _ = innovations(both, levels)
     said = e[..., 0] - e[..., 1]
     return jnp.sum(e[..., 0] * said, axis=1), jnp.sum(said**2, axis=1)
 
 
 def _matched(search: Search, poorer: Hypothesis, richer: Hypothesis) -> Iterator[tuple[Flight, Flight]]:
-    """Every flight as both read it, row by row: a shift of the motor columns costs rows at the ends and at gaps."""
+    """Every flight as prepared for both hypotheses, cut to their common rows.
+
+    A time shift of the motor columns removes rows at the ends and at gaps.
+    """
     for log in search.logs:
         logs = [hypothesis.faults.repaired(log) for hypothesis in (poorer, richer)]
         both = np.intersect1d(logs[0].time, logs[1].time)

@@ -1,4 +1,7 @@
-"""When the catalogue fails: a sparse formula for what is left, which must pass the same tests as any effect."""
+"""Sparse formula for a residual that the catalogue does not explain.
+
+Terms are selected from a library by cross-validation, and the formula must pass the same tests as any effect.
+"""
 
 from __future__ import annotations
 
@@ -17,18 +20,18 @@ from cfb_mjx.sysid.tracing.trace import Trace
 
 _QUADRATIC = ("n_roll^2", "n_pitch^2", "n_roll n_pitch")
 FAMILIES = {"body_terms": [_QUADRATIC], "place": [(p, f"{p}^2") for p in ("x", "y", "z")]}
-"""Terms that describe one thing only together: a force that grows towards a wall is badly told by its slope alone, and
-what one term describes badly does not stand against chance."""
+"""Groups of terms that describe something only together. A force that grows towards a wall, for instance, is badly
+described by its slope alone, and a single term that describes it badly is not significant."""
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Terms of the library that improve blocks left out.
+    """Terms of the library that explain the residual in cross-validation.
 
     Attributes:
-        sure: beyond chance.
-        rare: groups of terms that gain as much, but in so few blocks that these alone are no proof.
-        gains: of every term, nats on blocks left out, when it was chosen.
+        sure: significant terms.
+        rare: groups of terms that gain as much, but in so few blocks that they are not significant.
+        gains: gain of every term when it was chosen, nats.
     """
 
     sure: list[Column] = field(default_factory=list)
@@ -37,24 +40,24 @@ class Selection:
 
 
 def with_library(search: Search, hypothesis: Hypothesis) -> tuple[Search, Hypothesis]:
-    """The same search and hypothesis with the (empty) formula among the effects."""
+    """Add an empty formula to the effects of a search and of a hypothesis."""
     empty = ResidualFormula.neutral()
     widened = replace(search, names=(*search.names, FORMULA), _flights=search._flights)
     return widened, replace(hypothesis, effects=(*hypothesis.effects, empty), origin=(*hypothesis.origin, empty))
 
 
 def select(search: Search, hypothesis: Hypothesis, progress: Callable[[str], None] = lambda _: None) -> Selection:
-    """Choose terms beside everything found.
+    """Select terms beside the effects that are present, separately for each axis.
 
     Args:
-        search: with the library (`with_library`).
-        hypothesis: likewise.
-        progress: told what happens.
+        search: search with the library (`with_library`).
+        hypothesis: hypothesis with the library.
+        progress: called with a message at each step.
     """
     own = search.own_columns(hypothesis)
     tried = sum(len(term_columns(axis)) for axis in range(6))
     chosen, rules = Selection(), search.rules
-    progress("looking for structure in what is left")
+    progress("looking for structure in the residual")
     for linear in search.linearise_terms(hypothesis, own):
         library = [c for c in linear.columns if c.effect == FORMULA and c not in own]
         axis = _Axis(linear, linear.index(own), [[c] for c in library if not _square(c)] + _families(library), rules)
@@ -69,7 +72,7 @@ def select(search: Search, hypothesis: Hypothesis, progress: Callable[[str], Non
 
 @dataclass(frozen=True)
 class _Axis:
-    """Inner products along one axis: the ``base`` is free anyway, ``groups`` may be added."""
+    """Forward selection along one axis: the columns ``base`` are always free, ``groups`` of terms may be added."""
 
     linear: Linear
     base: list[int]
@@ -82,7 +85,7 @@ class _Axis:
         return evidence(linear.blocks, self.base + index(beside), index(columns), linear.scale, fold=linear.fold)
 
     def forward(self, picked: list[Column], stands: Callable[[Evidence], bool]):
-        """Groups added one after the other while one stands, and the gain of each of their terms."""
+        """Add groups one after another while one passes ``stands``; return them and the gain of each of their terms."""
         picked, added, gains = list(picked), [], {}
         for _ in range(self.rules.per_axis):
             rest = [[c for c in group if c not in picked] for group in self.groups]
@@ -101,7 +104,7 @@ class _Axis:
         return added, gains
 
     def pruned(self, picked: list[Column]) -> list[Column]:
-        """Without terms that gain next to nothing beside the others."""
+        """Remove terms that gain next to nothing beside the others."""
         for column in list(picked):
             others = [c for c in picked if c != column]
             squared = any(_square(c) and _coordinate(c) == _coordinate(column) for c in others)
@@ -111,13 +114,13 @@ class _Axis:
 
 
 def _place(column: Column) -> tuple[int, int]:
-    """Axis and signal of a term, as numbers."""
+    """Indices of axis and signal of a term."""
     assert isinstance(column.index, tuple), "every term of the library has an axis and a signal"
     return column.index
 
 
 def _square(column: Column) -> bool:
-    """Whether it is the square of a coordinate: alone it would say that the origin of the room means something."""
+    """Whether a term is the square of a coordinate; used alone, it would give the room's origin a meaning."""
     return column.field == "place" and list(PLACES)[_place(column)[1]].endswith("^2")
 
 
@@ -126,7 +129,7 @@ def _coordinate(column: Column) -> str | None:
 
 
 def _families(library: list[Column]) -> list[list[Column]]:
-    """`FAMILIES` among the terms of one axis."""
+    """The groups of `FAMILIES` whose terms are all in the library of one axis."""
     found = []
     for name, groups in FAMILIES.items():
         signals = list(TERMS if name == "body_terms" else PLACES)
@@ -137,7 +140,16 @@ def _families(library: list[Column]) -> list[list[Column]]:
 
 @dataclass(frozen=True)
 class Term:
-    """One term of a formula."""
+    """One term of a formula.
+
+    Attributes:
+        axis: component of force or torque.
+        signal: that the component is proportional to.
+        unit: of the coefficient.
+        value: of the coefficient.
+        std: its standard deviation.
+        gain: in cross-validation when the term was added, nats.
+    """
 
     axis: str
     signal: str
@@ -145,7 +157,6 @@ class Term:
     value: float
     std: float
     gain: float
-    """Nats on blocks left out, when it was added."""
 
     def __str__(self) -> str:
         return f"{self.axis} = ({self.value:.3g} +- {self.std:.1g} {self.unit}) {self.signal}"
@@ -166,7 +177,7 @@ def _per(unit: str, signal: str) -> str:
 
 
 def fit_formula(search: Search, hypothesis: Hypothesis, terms: list[Column]) -> tuple[Hypothesis, np.ndarray]:
-    """Fit the terms together with everything found; the hypothesis and the terms' standard deviations."""
+    """Fit the terms together with the present effects; return the hypothesis and the terms' standard deviations."""
 
     def step(at: Hypothesis) -> tuple[Hypothesis, list[Column], Linear, list[int], np.ndarray]:
         own = search.own_columns(at)
@@ -184,7 +195,13 @@ def fit_formula(search: Search, hypothesis: Hypothesis, terms: list[Column]) -> 
 
 
 def terms_of(hypothesis: Hypothesis, deviation: np.ndarray, gains: dict[Column, float]) -> list[Term]:
-    """The formula in words."""
+    """The terms of a hypothesis's formula, the largest gain first.
+
+    Args:
+        hypothesis: with the fitted formula.
+        deviation: (n,) standard deviations of its terms.
+        gains: gain of each term, nats.
+    """
     effect = hypothesis.effect(FORMULA)
     found = []
     for column, std in zip(hypothesis.terms, deviation, strict=True):
@@ -196,13 +213,13 @@ def terms_of(hypothesis: Hypothesis, deviation: np.ndarray, gains: dict[Column, 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A formula beside the effects found.
+    """A formula beside the effects that were found.
 
     Attributes:
-        terms: the formula, the largest gain first.
-        buys: largest share by which it lowers a prediction error of the fit flights.
+        terms: of the formula, the largest gain first.
+        buys: largest share by which the formula lowers a prediction error of the fit flights.
         hypothesis: with the formula, and without effects that only stood in for it.
-        without: the same without the formula.
+        without: the same hypothesis without the formula.
     """
 
     terms: list[Term]
@@ -212,9 +229,15 @@ class Proposal:
 
 
 def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Column]) -> bool:
-    """Whether the terms can say most of what an effect says: then the effect, which has a meaning, stays.
+    """Whether the terms can reproduce most of an effect; the effect, which has a physical meaning, is then kept.
 
-    An effect that the terms cannot say, but that nothing misses beside them, had only stood in for them.
+    An effect that the terms cannot reproduce, but that is needless beside them, only stood in for them.
+
+    Args:
+        search: with the library.
+        hypothesis: with the effect and the terms.
+        name: of the effect.
+        terms: columns of the formula.
     """
     own = search.own_columns(hypothesis)
     linear = search.linearise(hypothesis, own)
@@ -230,15 +253,15 @@ def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Colu
 def explain(
     found: Trace, progress: Callable[[str], None] = lambda _: None, held_out: Search | None = None
 ) -> tuple[Search, Proposal | None]:
-    """Look for a formula beside what was found, keep it if it is material, and drop effects it makes needless.
+    """Look for a formula beside the effects found, keep it if it is material, and remove effects it makes needless.
 
     Args:
-        found: what the search came to.
-        progress: told what happens.
-        held_out: over other flights. What the fit flights excite too little to matter may matter there.
+        found: result of the search.
+        progress: called with a message at each step.
+        held_out: search over other flights. Terms that are immaterial on the fit flights may be material there.
 
     Returns:
-        The search over the fit flights, widened by the formula if there is one, and the formula.
+        The search over the fit flights, with the formula among its effects if there is one, and the formula.
     """
     search, hypothesis = found.search, found.hypothesis
     widened, base = with_library(search, hypothesis)
@@ -250,13 +273,13 @@ def explain(
         return search, None
     richer, deviation = fit_formula(widened, base, terms)
     new = prediction_errors(widened, richer)
-    # A force that hangs on the place has a constant part, which looked like wind.
+    # A force that depends on the position has a constant part, which may have been fitted as wind.
     windy = "wind" in hypothesis.present and any(c.field == "place" for c in terms)
     for name in sorted(hypothesis.present, key=lambda name: not (windy and name == "wind")):
         instead = windy and name == "wind"
         if not instead and mimicked(widened, richer, name, terms):
             continue
-        progress(f"looking at {name} again, beside the formula")
+        progress(f"testing {name} again beside the formula")
         wider = terms + _constant_forces(terms) if instead else terms
         less, spread = fit_formula(widened, richer.without(name), wider)
         without = prediction_errors(widened, less)
@@ -271,14 +294,15 @@ def explain(
 
 
 def only_there(held_out: Search, hypothesis: Hypothesis) -> list[Term]:
-    """Structure in flights nothing was fitted to that the fitted ones do not show: terms fitted to those flights.
+    """Look for terms that only the held-out flights show, and fit them there.
 
-    They tell what is missing and what to fly; no model learns from them, for nothing is left to judge it by.
+    They indicate what is missing and what to fly. They never enter the model, because no flights would be left to judge
+    it on.
 
     Args:
-        held_out: over those flights.
-        hypothesis: what was found on the others. Its numbers are fitted anew, so that what they are wrong by there is
-            not taken for structure.
+        held_out: search over the held-out flights.
+        hypothesis: result of the fit flights. Its parameters are refitted, so that their errors on the held-out flights
+            are not mistaken for structure.
     """
     widened, base = with_library(held_out, hypothesis)
     chosen = select(widened, base)
@@ -294,7 +318,7 @@ def only_there(held_out: Search, hypothesis: Hypothesis) -> list[Term]:
 def _material(
     search: Search, base: Hypothesis, terms: list[Column], found: Trace, held_out: Search | None
 ) -> list[Column]:
-    """The terms, if they lower errors of the fit flights or else of the held-out ones; nothing if not."""
+    """The terms if they are material on the fit flights or else on the held-out ones; otherwise an empty list."""
     if not terms:
         return []
     richer, _ = fit_formula(search, base, terms)
@@ -309,9 +333,9 @@ def _material(
 def _with_rare(
     search: Search, base: Hypothesis, terms: list[Column], chosen: Selection, held_out: Search
 ) -> list[Column]:
-    """The terms, and those that few blocks of the fit flights excite, if flights nothing was fitted to bear them out.
+    """Add terms that few blocks of the fit flights excite, if the held-out flights confirm them.
 
-    What a drone rarely does in some flights may be what others consist of.
+    A motion that is rare in the fit flights may be common in the held-out ones.
     """
     judge, _ = with_library(held_out, held_out.nothing())
     poorer = fit_formula(search, base, terms)[0] if terms else base
@@ -329,6 +353,6 @@ def _with_rare(
 
 
 def _constant_forces(terms: list[Column]) -> list[Column]:
-    """Constant forces along the world's axes that are not among the terms."""
+    """Columns of the constant forces along the world axes that are not among the terms."""
     places = [c for axis in (3, 4, 5) for c in term_columns(axis) if c.field == "place"]
     return [c for c in places if _place(c)[1] == 0 and c not in terms]

@@ -1,4 +1,4 @@
-"""Effects somebody names, fitted to innovations: the search's last step without the search."""
+"""Fit named effects to innovations: the last step of the search, without the search."""
 
 from __future__ import annotations
 
@@ -18,16 +18,21 @@ from cfb_mjx.sysid.tracing.trace import deviations
 from cfb_mjx.sysid.velocity_band import with_band
 
 ROUNDS = 3
-"""Fits, each with the noise levels learned from the one before."""
+"""Number of fits; each uses the noise levels estimated from the residuals of the one before."""
 
 
 @dataclass(frozen=True)
 class Given:
-    """Outcome of `fit_given`."""
+    """Outcome of `fit_given`.
+
+    Attributes:
+        effects: declared effects that were not fitted, then the fitted ones.
+        uncertainty: standard deviations by effect and field.
+        faults: sensor faults that were found and taken out of the flights.
+    """
 
     effects: tuple[Effect, ...]
     uncertainty: dict[str, dict[str, float | list[float]]]
-    """Standard deviations by effect and field."""
     faults: SensorFaults
 
 
@@ -45,15 +50,15 @@ def fit_given(
     Args:
         logs: flights; run with x64 enabled.
         parameters: the declared drone.
-        names: of effects of the catalogue; all are taken to be there.
-        declared: effects the declared model has already; they start the fit.
+        names: effects of the catalogue to fit; all are assumed to be present.
+        declared: effects that the declared model already has; their values are the starting point.
         delay: declared age of pose and velocity in a row, s.
-        progress: told what happens.
-        as_logged: take no sensor fault out of the flights, only biases; a stretch of the velocity is
-            one of the attitude too (`SensorFaults.as_logged`).
+        progress: called with a message at each step.
+        as_logged: remove only biases from the flights and no sensor fault; a stretch of the velocity then applies to
+            the attitude too (`SensorFaults.as_logged`).
 
     Raises:
-        CfbError: an effect the catalogue does not have.
+        CfbError: a name is not in the catalogue.
     """
     for name in names:
         if name not in CATALOGUE:
@@ -65,7 +70,7 @@ def fit_given(
     search = Search.start(list(logs), parameters, delay, sensors, declared, names)
     progress("replaying the declared model")
     nothing = search.learned(search.nothing())
-    # Where nobody declared a wind, one is a force, as in a search.
+    # A wind that is not declared is fitted as a force, as in a search.
     new = Wind.name not in {type(effect).name for effect in declared}
     effects = tuple(replace(e, felt=jnp.zeros(())) if new and isinstance(e, Wind) else e for e in nothing.effects)
     hypothesis = search.settled(replace(nothing, effects=effects, present=tuple(names)))

@@ -1,6 +1,6 @@
-"""What a search may believe of a drone: the numbers it may change, and what a small change of each would explain.
+"""Hypotheses of the search and the parameters it may change.
 
-Strengths and shapes of every effect of the catalogue are one column each.
+Every component of a strength or shape field of an effect is one `Column` of the linearised residual.
 """
 
 from __future__ import annotations
@@ -23,30 +23,37 @@ from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.innovations import FIRST, Moved
 
 LEAD = COMMAND_LEAD
-"""Nuisance: commands sent between two rows are not in the log. Always free, never reported as an effect."""
+"""Nuisance parameter: commands sent between two rows are not in the log. Always free, never reported as an effect."""
 SHIFT = "sensor_time_shift"
-"""Not an effect of the catalogue but a fault of the recording: command and rotor-speed columns late or early."""
+"""Fault of the recording, not an effect of the catalogue: command and rotor-speed columns are late or early."""
 FORMULA = ResidualFormula.name
 TORQUE_UNIT, FORCE_UNIT = 3e-5, 4e-3
-"""What a term of a formula typically adds, N m and N: about 1 rad/s^2 and 0.1 m/s^2 on this drone."""
+"""Typical contribution of a term of a formula, N m and N: about 1 rad/s^2 and 0.1 m/s^2 on this drone."""
 LEAST_SIZE = 1e-4
-"""Signals smaller than this, in their units, were not excited."""
+"""A signal with a smaller rms than this, in its unit, counts as not excited."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """One number: a component of a field of an effect, with other fields at a probe's values."""
+    """One parameter: a component of a field of an effect, with other fields at the values of a probe.
+
+    Attributes:
+        effect: name of the effect.
+        field: of the effect.
+        index: component of the field; None for a scalar.
+        probe: values of the shape fields at which an absent effect is linearised.
+        scale: half the prior range, the unit of the search.
+    """
 
     effect: str
     field: str
     index: int | tuple[int, int] | None
     probe: tuple[tuple[str, float], ...] = ()
     scale: float = dataclasses.field(default=1.0, compare=False)
-    """Half the prior range: the unit in which the search counts."""
 
 
 def neutral_effects(names: tuple[str, ...]) -> tuple[Effect, ...]:
-    """The named effects of the catalogue where they vanish."""
+    """The named effects of the catalogue at their neutral values, where they vanish."""
     return tuple(KNOWN[name].neutral() for name in names)
 
 
@@ -64,16 +71,17 @@ def columns_of(name: str, fields: tuple[str, ...], probe: dict[str, float]) -> l
 
 
 def strengths(name: str, others: Collection[str] = ()) -> list[list[Column]]:
-    """Columns of an effect's strengths, one list for each probe of its shape; without what ``others`` say as well."""
+    """Columns of an effect's strengths, one list per probe of its shape, without fields redundant with ``others``."""
     kind = KNOWN[name]
     own = tuple(f for f in kind.strengths if kind.said_by.get(f) not in others)
     return [columns_of(name, own, probe) for probe in kind.probes]
 
 
 def shapes(effect: Effect, others: Collection[str] = ()) -> list[Column]:
-    """Columns of what describes the shape of an effect that is there: fitted once its strength is known.
+    """Columns of the shape of an effect that is present; they are fitted once its strength is known.
 
-    What no flight tells (`Effect.assumed`) is left as it is, and so is what ``others`` say as well.
+    Fields that no flight determines (`Effect.assumed`) and fields redundant with ``others`` (`Effect.said_by`) are left
+    out.
     """
     kind = type(effect)
     moving = {key for probe in kind.probes for key in probe} - set(kind.assumed)
@@ -82,20 +90,20 @@ def shapes(effect: Effect, others: Collection[str] = ()) -> list[Column]:
 
 
 def bounds(name: str, item: str) -> tuple[float, float]:
-    """Between which values a search moves a field of an effect."""
+    """Lower and upper bound of a field of an effect in a search."""
     kind = KNOWN[name]
     low, high = kind.prior[item]
     if item in kind.strengths:
-        # A strength may exceed what is plausible (the report will say so), but not change a meaningless sign.
+        # A strength may exceed the plausible range (the report says so), but must not take a meaningless sign.
         low, high = (0.0 if low >= 0 else 3 * low), 3 * high
     if item not in kind.limits:  # of a user's own effect
         return low, high
-    # Downwards what is unusual is out of reach as well: a lag or a gain of next to nothing is no motor.
+    # Unusually low values are excluded too: no motor has a lag or a gain of nearly zero.
     return max(low, kind.limits[item].soft_low), min(high, kind.limits[item].hard_high)
 
 
 def sensible(variant: list[Column], values: np.ndarray) -> bool:
-    """Whether strengths have a sign that makes sense."""
+    """Whether the strengths have a meaningful sign."""
     if variant[0].effect == SHIFT:
         return True
     low = KNOWN[variant[0].effect].prior[variant[0].field][0]
@@ -103,25 +111,25 @@ def sensible(variant: list[Column], values: np.ndarray) -> bool:
 
 
 def coarse(name: str) -> bool:
-    """Whether an effect's slope at zero says little of its strength."""
+    """Whether the derivative at zero strength says little about the effect's strength (`Effect.coarse`)."""
     return name in KNOWN and bool(KNOWN[name].coarse)
 
 
 def step_of(column: Column, present: bool) -> float:
-    """Step of the finite difference by which a column is found."""
+    """Step of the finite difference for a column."""
     share = 0.02 if present else _shares(column.effect).get(column.probe, 0.05)
-    # A step towards positive values: where zero is the lowest value possible there is nothing on the other side.
+    # The step is positive, because zero is the lower bound of some parameters.
     return share * 2 * column.scale
 
 
 def _shares(name: str) -> dict[tuple[tuple[str, float], ...], float]:
-    """Shares of the prior range at which an effect is looked for, by probe, where its slope at zero says little."""
+    """Finite-difference steps of a coarse effect as shares of its prior range, by probe."""
     kind = KNOWN.get(name)
     return {} if kind is None else {tuple(kind.probes[i].items()): share for i, share in kind.coarse.items()}
 
 
 def moved(effect: Effect, column: Column, by: float, present: bool) -> Effect:
-    """The effect with one number changed, and at the column's probe if it is not there yet."""
+    """The effect with one parameter changed by ``by``; its shape is set to the column's probe if it is not present."""
     if not present:
         for key, value in column.probe:
             effect = eqx.tree_at(lambda e, k=key: getattr(e, k), effect, jnp.full_like(getattr(effect, key), value))
@@ -131,9 +139,12 @@ def moved(effect: Effect, column: Column, by: float, present: bool) -> Effect:
 
 
 def term_columns(axis: int, sizes: np.ndarray | None = None) -> list[Column]:
-    """Every term of the library along one of the axes torque x, y, z, force x, y, z (0..5).
+    """Columns of every term of the formula library along one axis.
 
-    ``sizes`` are the rms of the signals, body terms then places: a number is counted in what makes its term matter.
+    Args:
+        axis: 0 to 5 for torque x, y, z, force x, y, z.
+        sizes: (c,) rms of the signals, body terms first, then places. A coefficient's scale is the value at which its
+            term has its typical size.
     """
     sizes = np.ones(len(TERMS) + len(PLACES)) if sizes is None else np.maximum(sizes, LEAST_SIZE)
     scale = (TORQUE_UNIT if axis < 3 else FORCE_UNIT) / sizes
@@ -144,7 +155,7 @@ def term_columns(axis: int, sizes: np.ndarray | None = None) -> list[Column]:
 
 
 def lead_column() -> Column:
-    """The column of `LEAD`, a share of an interval."""
+    """The column of `LEAD`, as a share of an interval."""
     return Column(LEAD, LEAD, None, (), 0.25)
 
 
@@ -154,9 +165,9 @@ def shift_column() -> Column:
 
 
 def moves(effects: tuple[Effect, ...], lead: float, columns: list[Column], present: set[str]) -> list[Moved]:
-    """The model with each of some columns moved, for finite differences."""
+    """The models of the finite differences: the effects with one column moved at a time."""
     order = {type(effect).name: i for i, effect in enumerate(effects)}
-    # NumPy's arrays are stacked ten times as fast as jax's.
+    # NumPy arrays are stacked ten times faster than JAX arrays.
     still = jax.tree.map(np.asarray, effects)
     found = []
     for column in columns:
@@ -173,47 +184,56 @@ def moves(effects: tuple[Effect, ...], lead: float, columns: list[Column], prese
 
 
 LEAD_STEP, SHIFT_STEP = 0.05, 0.002
-"""Moves of the two nuisances: a share of an interval, and s."""
+"""Finite-difference steps of the command lead, as a share of an interval, and of the time shift, s."""
 LEAD_RANGE, LEAD_USUAL, LEAD_SPREAD = (0.0, 0.5), 0.25, 0.1
-"""Share of the next command in the mean over an interval: a quarter if every second command is logged, half at most.
-Beyond this a lead would be a time shift, so what is known of it beforehand has to decide between the two."""
+"""Range, prior mean and prior standard deviation of the command lead.
+
+The lead is the share of the next row's command in the mean over an interval: a quarter if every second command is
+logged, at most a half. A larger lead would be a time shift, so the prior has to separate the two.
+"""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """A model: which effects are there, and the values of all."""
+    """A candidate model: the effects it adds to the declared model, and all parameter values.
+
+    Attributes:
+        effects: all effects of the search, most of them neutral.
+        present: names of the effects that are added.
+        lead: command lead, the share of the next row's command in the mean over an interval.
+        shift: delay of the command and rotor-speed columns, s.
+        terms: terms of a formula, if the catalogue does not explain the residual.
+        origin: effects of the declared model, to which an absent effect is reset.
+        levels: noise levels of this hypothesis's residuals, as the vector of `innovations.levels_from`.
+    """
 
     effects: tuple[Effect, ...]
     present: tuple[str, ...] = ()
     lead: float = LEAD_USUAL
     shift: float = 0.0
-    """How late the motor columns are, s."""
     terms: tuple[Column, ...] = ()
-    """Of a formula, where the catalogue has failed."""
     origin: tuple[Effect, ...] = ()
-    """The effects of the declared model: what an absent effect goes back to."""
     levels: np.ndarray = field(default_factory=lambda: FIRST, compare=False)
-    """Noise levels that fit what this hypothesis leaves (the vector of `innovations.levels_from`)."""
 
     def effect(self, name: str) -> Effect:
-        """The effect of that name."""
+        """The effect with this name."""
         return next(e for e in self.effects if type(e).name == name)
 
     def declared(self, name: str) -> Effect:
-        """The effect of that name as the declared model has it: neutral, where it has none."""
+        """The effect with this name in the declared model; neutral if the model does not have it."""
         return next(e for e in self.origin if type(e).name == name)
 
     def model(self, parameters: Parameters) -> Quadrotor:
-        """The drone of this hypothesis, with every effect of the catalogue (most of them neutral)."""
+        """The drone of this hypothesis, with every effect of the search (most of them neutral)."""
         return Quadrotor(parameters, self.effects)
 
     @property
     def faults(self) -> SensorFaults:
-        """What is wrong with the recording beyond what the sensors say of each other."""
+        """Faults of the recording that the hypothesis itself assumes: the time shift of the motor columns."""
         return SensorFaults(motor_shift=self.shift)
 
     def having(self, effect: Effect) -> Hypothesis:
-        """The same with an effect that was absent; what of the others it says as well is as declared again."""
+        """Add an absent effect; fields of other effects that are redundant with it return to their declared values."""
         name = type(effect).name
         present = (*self.present, name)
         effects = (effect if type(e).name == name else e for e in self.effects)
@@ -221,7 +241,7 @@ class Hypothesis:
         return replace(self, effects=tuple(_unsaid(e, declared, present) for e, declared in pairs), present=present)
 
     def without(self, name: str) -> Hypothesis:
-        """The same with one effect back at neutral."""
+        """Remove an effect: reset it to its declared value."""
         pairs = zip(self.effects, self.origin, strict=True)
         effects = tuple(declared if type(e).name == name else e for e, declared in pairs)
         shift = 0.0 if name == SHIFT else self.shift
@@ -229,7 +249,7 @@ class Hypothesis:
 
 
 def _unsaid(effect: Effect, declared: Effect, others: Collection[str]) -> Effect:
-    """The effect with what others say as well as it is declared."""
+    """The effect with its fields that are redundant with ``others`` (`Effect.said_by`) reset to ``declared``."""
     for item, by in effect.said_by.items():
         if by in others:
             effect = eqx.tree_at(lambda e, f=item: getattr(e, f), effect, getattr(declared, item))
@@ -238,13 +258,13 @@ def _unsaid(effect: Effect, declared: Effect, others: Collection[str]) -> Effect
 
 @dataclass
 class Linear:
-    """A residual and its derivatives at a hypothesis, as inner products.
+    """The whitened residual of a hypothesis and its derivatives, as inner products per block.
 
     Attributes:
-        columns: one fewer than c: the residual itself comes first. Of columns that occur twice the first counts.
-        blocks: (b, c, c).
-        fold: (b,) of each block (`evidence.dealt`); None where all are of one flight.
-        scale: (c,) unit of each.
+        columns: the c - 1 parameters of the derivatives; if a column occurs twice, the first is used.
+        blocks: (b, c, c) inner products; index 0 is the residual itself.
+        fold: (b,) cross-validation fold of each block (`evidence.dealt`); None if all blocks are of one flight.
+        scale: (c,) unit of each column; 1 for the residual.
     """
 
     columns: list[Column]
@@ -256,7 +276,7 @@ class Linear:
         self.scale = np.array([1.0] + [c.scale for c in self.columns])
 
     def index(self, wanted: list[Column]) -> list[int]:
-        """Positions of columns in the inner products."""
+        """Positions of the wanted columns in the inner products."""
         where = {c: i + 1 for i, c in reversed(list(enumerate(self.columns)))}
         return [where[c] for c in wanted]
 
@@ -266,11 +286,11 @@ class Fit:
     """A hypothesis fitted to the flights.
 
     Attributes:
-        hypothesis: with the values that fit.
-        linear: its derivatives by the whole catalogue; None for one among many, which may not be taken.
-        errors: (8,) `fits.ERRORS` over all flights.
-        by_flight: (L, 8) `fits.ERRORS` in each flight that has prediction windows.
-        beside_hold: `fits.beside_hold` of its predictions.
+        hypothesis: with the fitted values.
+        linear: linearisation with respect to the whole catalogue; None if it has not been computed yet.
+        errors: (8,) prediction errors `fits.ERRORS` over all flights.
+        by_flight: (L, 8) prediction errors of each flight that has prediction windows.
+        beside_hold: prediction error relative to `hold` (`fits.beside_hold`).
     """
 
     hypothesis: Hypothesis

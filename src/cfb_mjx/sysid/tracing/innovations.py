@@ -1,9 +1,9 @@
-"""Turning what a model misses into white noise: the filters that say how surprising a residual is, and to which levels.
+"""Kalman filters that whiten a model's residual, and the maximum-likelihood fit of their noise levels.
 
-Three domains, each a scalar filter per axis or motor with two states: the accumulated error of a quantity (body rate,
-velocity, rotor speed) and a wandering disturbance behind it (Ornstein-Uhlenbeck). Innovations of these filters are
-white where the model is right, whatever the controller does (see `cfb_mjx.sysid.identification.innovation`). The
-filters are linear, so the derivative of a residual by a parameter is whitened by the same filter as the residual.
+Each axis or motor of three domains has a scalar filter with two states: the accumulated error of a quantity (body rate,
+velocity, rotor speed) and a slowly varying disturbance that drives it (an Ornstein-Uhlenbeck process). If the model is
+right, the innovations of these filters are white for any controller (see `cfb_mjx.sysid.identification.innovation`).
+The filters are linear, so the derivative of a residual with respect to a parameter is whitened by the same filter.
 """
 
 from __future__ import annotations
@@ -34,43 +34,44 @@ from cfb_mjx.sysid.replay import Lane, Replay, between, replays, smoothed_rotor_
 
 CHANNELS = 10
 DOMAINS = {"rotor_speed": range(6, 10), "force": (*range(3, 6), *range(10, 13)), "torque": range(3)}
-"""Channels of the innovations by where an effect acts: commands to rotor speeds, these to forces, and to torques."""
+"""Channels of the innovations by where an effect acts: on rotor speeds, on forces, or on torques."""
 SIDE_BY_SIDE = 32, 16
-"""Blocks and columns that are whitened at a time: one program serves any number."""
+"""Number of blocks and of columns whitened at once. Fixed, so that one compiled program serves any number."""
 MOTOR_LAG = 0.05
+"""Lag with which the error of a rotor speed follows its disturbance, s."""
 
 
 class Levels(eqx.Module):
     """Noise levels of the filters, one per channel (body rate 3, velocity 3, rotor speed 4) unless said otherwise."""
 
     reading: Float[Array, "10"]
-    """White noise of a row: rad/s, m/s, rad/s."""
+    """White measurement noise per row: rad/s, m/s, rad/s."""
     accelerometer: Float[Array, ""]
-    """White noise of a row, m/s^2."""
+    """White measurement noise of the accelerometer per row, m/s^2."""
     walk: Float[Array, "10"]
-    """White noise driving the quantity, its unit per square root of a second."""
+    """White process noise of the quantity, in its unit per square root of a second."""
     disturbance: Float[Array, "10"]
-    """Of the wandering disturbance: rad/s^2, m/s^2, rad/s."""
+    """Standard deviation of the disturbance: rad/s^2, m/s^2, rad/s."""
     correlation_time: Float[Array, "10"]
-    """Of the disturbance, s."""
+    """Correlation time of the disturbance, s."""
 
 
 class Signals(NamedTuple):
-    """What the filters read, row by row; the last axis may hold a residual and its derivatives side by side."""
+    """Input of the filters, row by row. An optional last axis holds a residual and its derivatives side by side."""
 
     quantity: Float[np.ndarray, "n 10 *c"]
-    """Body rate, velocity and rotor speed minus what the model accumulates from its accelerations."""
+    """Body rate, velocity and rotor speed, minus the model's integrated accelerations and rotor speed."""
     acceleration: Float[np.ndarray, "n 3 *c"]
     """Accelerometer minus model, world axes."""
 
 
 def predicted(flight: Flight, said: Replay, gravity: float) -> Signals:
-    """What a model says the sensors read, accumulated from its accelerations (so only changes mean something).
+    """Sensor readings that a model predicts, integrated from its accelerations; constant offsets have no meaning.
 
     Args:
         flight: n rows.
-        said: of the model; or of several, along leading axes.
-        gravity: m/s^2; zero for what comes on top of others.
+        said: replay of the model; or of several models, along leading axes.
+        gravity: m/s^2; zero for an increment to other accelerations.
     """
     dt = flight.interval[:, None]
     middle = between(flight.quaternion)
@@ -89,22 +90,23 @@ def predicted(flight: Flight, said: Replay, gravity: float) -> Signals:
 
 
 def measured(flight: Flight) -> Signals:
-    """What the sensors read."""
+    """Measured sensor readings of a flight."""
     world = to_world(np.asarray(flight.quaternion), np.asarray(flight.specific_force))
     return Signals(np.concatenate([flight.body_rate, flight.velocity, flight.rotor_speed], axis=1), world)
 
 
 class Blocks(eqx.Module):
-    """Signals cut into B blocks of `ROWS` rows, with what the filters need to know of each row."""
+    """Signals cut into b blocks of `ROWS` rows, with the interval and validity of each row."""
 
     signals: Signals
     interval: Float[AnyArray, "b r"]
-    """From the row before, s."""
+    """Time since the previous row, s."""
     valid: Float[AnyArray, "b r 10"]
+    """1 where a channel's reading can be compared with the model."""
 
 
 def cut(flight: Flight, signals: Signals) -> Blocks:
-    """Blocks of a flight; a filter starts anew in every block."""
+    """Cut the signals of a flight into blocks; a filter starts anew in every block."""
     interval = np.concatenate([np.zeros(1), flight.interval[:-1]])
     rotor = flight.valid * flight.measured
     valid = np.concatenate([np.repeat(flight.valid[:, None], 6, 1), np.repeat(rotor[:, None], 4, 1)], axis=1)
@@ -113,14 +115,16 @@ def cut(flight: Flight, signals: Signals) -> Blocks:
 
 
 def joined(pieces: Iterable[Blocks]) -> Blocks:
-    """The blocks of several flights, one after the other."""
+    """Concatenate the blocks of several flights."""
     return jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x]), *pieces)
 
 
 def innovations(blocks: Blocks, levels: Levels) -> tuple[Array, Array, Array]:
-    """Whitened innovations (b, r, 13, c) of quantities and accelerometer, their log-variances, and where they count.
+    """Run the filters over blocks whose signals have their last axis (c).
 
-    Signals need their last axis (c).
+    Returns:
+        Whitened innovations (b, r, 13, c) of the ten quantities and the accelerometer, their log-variances (b, r, 13),
+        and the mask (b, r, 13) of the innovations that count.
     """
     return jax.vmap(lambda block: _walk(block, levels))(blocks)
 
@@ -142,7 +146,7 @@ def _walk(block: Blocks, levels: Levels):
         pxx = fade**2 * pxx + 2 * fade * gain * pxd + gain**2 * pdd + levels.walk**2 * dt
         pxd = keep * (fade * pxd + gain * pdd)
         pdd = keep**2 * pdd + levels.disturbance**2 * (1 - keep**2)
-        # The first row that counts only says where the quantity starts.
+        # The first valid row only initialises the quantity.
         new = valid * (1 - known)
         x = jnp.where(new[:, None] > 0, y, x)
         d = jnp.where(new[:, None] > 0, 0.0, d)
@@ -184,7 +188,13 @@ _LOWEST = np.array([1e-3] * 3 + [1e-4] * 3 + [1e-1] * 4)
 
 
 def levels_from(vector: Array, noise: dict[str, np.ndarray]) -> Levels:
-    """Levels from the numbers a likelihood is maximised in (23: walk, disturbance and time per domain and axis)."""
+    """Noise levels from the vector in which the likelihood is maximised, and the measured sensor noise.
+
+    Args:
+        vector: (17,) logarithms: walk (7: three body rates, three velocities, all rotor speeds), disturbance (7,
+            likewise) and correlation time (3, one per domain).
+        noise: white noise of the sensors, from `sensor_noise`.
+    """
     spread = jnp.array([0, 1, 2, 3, 4, 5, 6, 6, 6, 6])
     x = jnp.exp(vector)
     times = jnp.array([0, 0, 0, 1, 1, 1, 2, 2, 2, 2])
@@ -199,14 +209,15 @@ def levels_from(vector: Array, noise: dict[str, np.ndarray]) -> Levels:
 
 
 FIRST = np.log(np.array([0.1] * 3 + [0.02] * 3 + [10.0] + [0.5] * 3 + [0.1] * 3 + [10.0] + [0.4, 0.4, 0.5]))
+"""Initial noise levels, as the vector of `levels_from`; also the mean of their prior."""
 
 
 @eqx.filter_jit
 def surprise(vector, noise, blocks: Blocks) -> tuple[Array, Array]:
-    """Negative log-likelihood of a residual at noise levels, nats, and the number of readings that count."""
+    """Negative log-likelihood of a residual, nats, at the noise levels of ``vector``, and the number of readings."""
     wide = jax.tree.map(lambda x: x[..., None], blocks.signals)
     e, logs, use = innovations(Blocks(wide, blocks.interval, blocks.valid), levels_from(vector, noise))
-    # Very long tails (a gust, a glitch) must not set the level of everything.
+    # Huber loss: outliers (a gust, a glitch) must not determine the noise levels.
     size = jnp.abs(e[..., 0])
     squares = jnp.where(size < 4, size**2, 8 * size - 16)
     return 0.5 * jnp.sum(logs + squares * use), jnp.sum(use)
@@ -223,7 +234,7 @@ _slope = eqx.filter_jit(jax.value_and_grad(_loss))
 
 
 def fit_levels(blocks: Blocks, noise: dict[str, np.ndarray], start: np.ndarray = FIRST) -> np.ndarray:
-    """Noise levels of largest likelihood for a residual: the vector of `levels_from`."""
+    """Maximum-likelihood noise levels of a residual, as the vector of `levels_from`."""
     from scipy.optimize import minimize
 
     def both(x):
@@ -237,14 +248,14 @@ def fit_levels(blocks: Blocks, noise: dict[str, np.ndarray], start: np.ndarray =
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(low, high, strict=True)),
-        # From levels found before, a few steps are enough.
+        # A few iterations suffice from levels found earlier.
         options={"maxiter": 40 if start is FIRST else 15, "ftol": 1e-6},
     )
     return found.x
 
 
 def driven_by(model: Quadrotor, flights: Sequence[Flight], lead: float) -> list[np.ndarray]:
-    """Rotor speeds (n, 4) that drive the body along each flight: measured, or from commands."""
+    """Rotor speeds (n, 4), rad/s, that drive the body along each flight: measured (smoothed), or from commands."""
     pairs = zip(flights, speeds_along(model, flights, lead), strict=True)
     return [smoothed_rotor_speed(flight, speed) if flight.measured else speed for flight, speed in pairs]
 
@@ -252,7 +263,14 @@ def driven_by(model: Quadrotor, flights: Sequence[Flight], lead: float) -> list[
 def residual_blocks(
     model: Quadrotor, flights: Sequence[Flight], driven: Sequence[np.ndarray], lead: float
 ) -> list[Blocks]:
-    """What the model misses along each flight."""
+    """Residuals of a model along each flight: measured minus predicted sensor readings.
+
+    Args:
+        model: the drone.
+        flights: prepared flights.
+        driven: rotor speeds of each flight, from `driven_by`.
+        lead: command lead.
+    """
     gravity = float(model.parameters.gravity)
     lanes = (Lane(*pair, lead) for pair in zip(flights, driven, strict=True))
     found = []
@@ -263,31 +281,32 @@ def residual_blocks(
 
 
 class Moved(NamedTuple):
-    """A model with one number moved."""
+    """A model with one parameter moved, for a finite difference."""
 
     effects: tuple[Effect, ...]
     lead: float
-    """Of the commands."""
+    """Command lead."""
     shift: float
-    """By which the motor columns are taken to be late, s."""
+    """Assumed delay of the motor columns, s."""
     step: float
-    """Size of the move, in the unit of the number."""
+    """Size of the step, in the parameter's unit."""
 
 
 def with_slopes(
     model: Quadrotor, lead: float, moves: Sequence[Moved], flights: Sequence[Flight], driven: Sequence[np.ndarray]
 ) -> Iterator[Signals]:
-    """The residual of each flight and, side by side along the last axis (c), its derivatives.
+    """Residual of each flight and its finite-difference derivatives, side by side along the last axis (c).
 
     Args:
-        model: as it is.
-        lead: of its commands.
-        moves: c - 1 of them.
-        flights: one by one.
-        driven: of `driven_by`.
+        model: the unperturbed model.
+        lead: its command lead.
+        moves: the c - 1 perturbed models.
+        flights: prepared flights.
+        driven: rotor speeds of each flight, from `driven_by`.
 
     Returns:
-        Column 0 is the residual, the others are what the model would say more per unit of each number.
+        Iterator over flights. Column 0 is the residual; the others are the change of the model's prediction per unit
+        of each parameter.
     """
     steps = np.array([move.step for move in moves])
 
@@ -295,7 +314,7 @@ def with_slopes(
         for flight, speed in zip(flights, driven, strict=True):
             yield Lane(flight, speed, lead, model.effects)
             slope = np.gradient(speed, axis=0) / np.maximum(np.gradient(flight.time), 1e-4)[:, None]
-            # Late commands and late rotor speeds agree with each other; only what the body does comes too early.
+            # Late commands and late rotor speeds agree with each other; only the body's motion is then early.
             row = np.sum(flight.interval) / max(np.count_nonzero(flight.interval > 0), 1)
             for move in moves:
                 late, early = flight.measured * move.shift, (1 - flight.measured) * move.shift / row
@@ -314,7 +333,7 @@ def with_slopes(
 
 
 def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, Condition]:
-    """The parameters, and the flight condition in the middle of every interval."""
+    """Parameters of the model and flight condition in the middle of every interval."""
     prepared = prepare(model)
     read = (flight.position, flight.velocity, flight.quaternion, flight.body_rate, driven)
     at = unstack(State(*map(between, read)), Vec.unstack(prepared.parameters.center_of_gravity))
@@ -322,7 +341,7 @@ def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, 
 
 
 def term_squares(model: Quadrotor, flight: Flight, driven: np.ndarray) -> Float[np.ndarray, " c"]:
-    """Mean squares of the signals of the formulas' library over a flight: body terms, then places."""
+    """Mean squares of the signals of the formula library over a flight: body terms, then places."""
     return np.asarray(_term_squares(model, *lengthened(flight, driven)))
 
 
@@ -334,10 +353,10 @@ def _term_squares(model: Quadrotor, flight: Flight, driven: Array) -> Array:
 
 
 def term_slopes(model: Quadrotor, flight: Flight, driven: np.ndarray, axis: int) -> Signals:
-    """What each term of the formulas' library (c: body terms, then places) along one axis (0..5) adds.
+    """Predicted signals of each term of the formula library (c: body terms, then places) along one axis (0 to 5).
 
-    The same as the derivatives by a `ResidualFormula`'s numbers, without replaying the model for every one of them:
-    a wrench on the body does not change how the rotors run.
+    They equal the derivatives with respect to the coefficients of a `ResidualFormula`, but need no replay of the model
+    for every term, because a wrench on the body does not affect the rotors.
     """
     found = _term_accelerations(model, *lengthened(flight, driven), jnp.asarray(axis))
     spin, push = (np.asarray(x)[:, : len(flight.time)] for x in found)
@@ -347,7 +366,7 @@ def term_slopes(model: Quadrotor, flight: Flight, driven: np.ndarray, axis: int)
 
 @eqx.filter_jit
 def _term_accelerations(model: Quadrotor, flight: Flight, driven: Array, axis: Array) -> tuple[Array, Array]:
-    """(c, n, 3) angular accelerations, and specific forces."""
+    """Angular accelerations and specific forces (c, n, 3) of each term."""
     parameters, seen = _seen(model, flight, driven)
     along = jnp.arange(6) == axis
 
@@ -365,7 +384,7 @@ def _term_accelerations(model: Quadrotor, flight: Flight, driven: Array, axis: A
 
 
 def inner_products(blocks: Blocks, levels: Levels) -> Float[np.ndarray, "b c c"]:
-    """Inner products of whitened signals side by side, per block."""
+    """Inner products of the whitened columns (the residual and its derivatives) in each block."""
     count, columns = len(blocks.interval), blocks.signals.quantity.shape[-1]
     most, wide = SIDE_BY_SIDE
     groups = -(-columns // wide)
@@ -379,7 +398,7 @@ def inner_products(blocks: Blocks, levels: Levels) -> Float[np.ndarray, "b c c"]
     every = Blocks(signals, *(np.repeat(x, groups, axis=0) for x in (blocks.interval, blocks.valid)))
 
     def whitened(first: int) -> np.ndarray:
-        # The last ones are whitened more than once.
+        # The last batch is filled by repeating the last row.
         chosen = np.minimum(np.arange(first, first + most), count * groups - 1)
         return np.asarray(_whitened(jax.tree.map(lambda x: x[chosen], every), levels))
 
@@ -395,9 +414,12 @@ def _whitened(blocks: Blocks, levels: Levels) -> Array:
 
 
 def sensor_noise(logs: list[FlightLog], least_gyro: float = 1e-3) -> dict[str, np.ndarray]:
-    """White noise of gyro (3), velocity, accelerometer and rotor speed rows, medians over the logs.
+    """White noise per row of gyro (3,), velocity, accelerometer and rotor speed: medians over the logs.
 
-    ``least_gyro`` is the lowest level believed of a gyro, rad/s: behind a low-pass its rows look better than they are.
+    Args:
+        logs: flights.
+        least_gyro: lower limit of the gyro's level, rad/s. A low-pass filter makes a gyro's rows look less noisy than
+            they are.
     """
 
     def level(pick):

@@ -1,9 +1,9 @@
-"""Everything a drone lacks, from one look at its flights after another: all effects that stand beside each other.
+"""Selection of many missing effects at once, by stepwise regression on the linearised residual.
 
-The inner products of `Search.whole` hold what every effect of the catalogue would explain, and what it has in common
-with every other. So a set of effects is put together without a fit: the one that gains most beside those chosen is
-added, and what is no longer needed beside it taken out, until none gains beyond chance. Then all are fitted, what the
-fit shows to be needless goes, and the flights are looked at again from there.
+The inner products of `Search.whole` contain what every effect of the catalogue would explain, and what it shares with
+every other effect. So a set of effects can be selected without a fit: add the effect with the largest gain beside those
+already chosen, remove chosen ones that are no longer significant, and stop when no further effect is. Then fit all
+effects of the set, remove those that the fit shows to be needless, linearise again and repeat.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from cfb_mjx.sysid.tracing.search import Search
 
 @dataclass(frozen=True)
 class Chosen:
-    """One effect of a set.
+    """One effect of a selection.
 
     Attributes:
         variant: its columns.
-        found: for it beside those chosen before.
+        found: evidence for it beside the effects chosen before.
     """
 
     variant: list[Column]
@@ -35,14 +35,24 @@ class Chosen:
 
     @property
     def name(self) -> str:
-        """Of the effect."""
+        """Name of the effect."""
         return self.variant[0].effect
 
 
 def beside_each_other(
     search: Search, hypothesis: Hypothesis, linear: Linear, refused: Collection[str] = ()
 ) -> list[Chosen]:
-    """Absent effects that stand beside what is there and beside each other, the largest gain first."""
+    """Select the absent effects that are significant beside the present effects and beside each other.
+
+    Args:
+        search: over the flights.
+        hypothesis: the present effects.
+        linear: linearisation at the hypothesis by the whole catalogue.
+        refused: names of effects to pass over.
+
+    Returns:
+        The selected effects in the order in which they were chosen.
+    """
     own = search.own_columns(hypothesis)
     base, prior = linear.index(own), search.prior(hypothesis, own)
     absent = [v for v in search.candidates(hypothesis) if v[0].effect not in refused]
@@ -57,7 +67,7 @@ def beside_each_other(
     def stands(variant: list[Column], found: Evidence) -> bool:
         return search.stands(found) and sensible(variant, found.values)
 
-    # So many times: what pushed out others may in turn be pushed out by those that came after.
+    # The limit ends cycles: an effect that displaced others may be displaced by later ones.
     for _ in range(search.rules.a_look):
         names = {each.name for each in chosen}
         more = [(variant, beside(variant, chosen)) for variant in absent if variant[0].effect not in names]
@@ -74,11 +84,11 @@ def beside_each_other(
 
 
 def everything(search: Search, say: Callable[[str], None] = lambda _: None) -> Fit:
-    """All effects of the catalogue that the innovations ask for, fitted together, beginning with the declared model.
+    """Select and fit together all effects that the innovations require, starting from the declared model.
 
     Args:
         search: over the flights.
-        say: told what happens.
+        say: called with a message at each step.
     """
     fits = [as_it_is(search, search.learned(search.nothing()), whole=False)]
 
@@ -97,16 +107,19 @@ def look_by_look(
     better: Callable[[Hypothesis], bool] = lambda _: True,
     say: Callable[[str], None] = lambda _: None,
 ) -> tuple[Hypothesis, Linear]:
-    """A hypothesis with all effects that the innovations ask for, and its derivatives by the whole catalogue.
+    """Alternate selection and fit until the selection changes no more.
 
     Args:
         search: over the flights.
-        hypothesis: to begin with, with the noise levels of what it leaves.
-        never: effects to pass over.
-        better: whether what a look came to is to stay.
-        say: told what happens.
+        hypothesis: where to start, with the noise levels of its residuals.
+        never: names of effects to pass over.
+        better: predicate that decides whether a fitted hypothesis is kept.
+        say: called with a message at each step.
+
+    Returns:
+        The last hypothesis kept, and its linearisation by the whole catalogue.
     """
-    # Late motor columns look like every lag at once: only beside the motors' own lags can they be told.
+    # Late motor columns resemble every lag, so they are identifiable only once the motors' own lags are included.
     linear, refused, seen = search.whole(hypothesis), {SHIFT, *never}, {frozenset(hypothesis.present)}
     for _ in range(search.rules.looks):
         chosen = beside_each_other(search, hypothesis, linear, refused)
@@ -118,7 +131,7 @@ def look_by_look(
                 richer = _with(search, hypothesis, linear, chosen)
                 gain = not_none(confirm(search, hypothesis, richer).gain)
             if not gain > 0:
-                # Too far for slopes, if not beyond all numbers: those that matter most first.
+                # The linear fit went too far (possibly to infinity): try again with the more important half.
                 richer, chosen = None, chosen[: len(chosen) // 2]
         if richer is None or frozenset(richer.present) in seen or not better(richer):
             break
@@ -128,15 +141,15 @@ def look_by_look(
 
 
 def told_apart(search: Search, fit: Fit, say: Callable[[str], None] = lambda _: None) -> Fit:
-    """The fit with another effect in place of a field that says nearly the same, where that is better.
+    """Replace fields by the nearly equivalent effect (`Effect.said_by`) where that predicts better.
 
-    Beside a free field the other effect explains nothing, so no look takes it in (`Effect.said_by`). The innovations
-    must not refute it, and predictions be better by `Rules.same_errors`.
+    Beside the free field the other effect explains nothing, so the selection never chooses it. It replaces the field
+    if the innovations do not refute it and the predictions improve by `Rules.same_errors`.
     """
     for name in fit.hypothesis.present:
         said_by = {} if name == SHIFT else CATALOGUE[name].said_by
         for other in (set(said_by.values()) & set(search.names)) - set(fit.hypothesis.present):
-            say(f"telling {name} from {other}")
+            say(f"comparing {name} with {other}")
             rival = fit.hypothesis.having(fit.hypothesis.effect(other))
             rival = search.settled(rival, search.rules.look_steps, shrunk=True)
             if confirm(search, fit.hypothesis, rival).t > -search.rules.doubtful:
@@ -146,10 +159,11 @@ def told_apart(search: Search, fit: Fit, say: Callable[[str], None] = lambda _: 
 
 
 def borne_out(search: Search, fit: Fit, say: Callable[[str], None] = lambda _: None) -> Fit:
-    """What of many effects predictions miss: the others go one by one.
+    """Remove, one by one, the effects that the predictions do not need.
 
-    What goes is taken out to first order to see what the predictions say; of the two without which they are best each
-    is, with the rest fitted anew, for one of two that say nearly the same may stand in for the other.
+    The candidates for removal are found to first order: each effect is removed and the others are adjusted. For the two
+    without which predictions are best, the rest is refitted and the better fit is kept, because one of two nearly
+    equivalent effects may stand in for the other.
     """
     while len(fit.hypothesis.present) > 1:
         worth = {}
@@ -167,7 +181,7 @@ def borne_out(search: Search, fit: Fit, say: Callable[[str], None] = lambda _: N
 
 
 def one_by_one(search: Search, hypothesis: Hypothesis) -> dict[str, tuple[Evidence, Hypothesis]]:
-    """For each effect that is there, and the hypothesis without it, the others moved to make up: to first order."""
+    """Per present effect, to first order: the evidence for it, and the hypothesis without it, the others adjusted."""
     own = search.own_columns(hypothesis)
     linear = search.linearise(hypothesis, own)
     return {
@@ -180,13 +194,13 @@ def one_by_one(search: Search, hypothesis: Hypothesis) -> dict[str, tuple[Eviden
 
 
 def _total(fit: Fit) -> float:
-    """Sum of the logarithms of the prediction errors; infinite where predictions diverge."""
+    """Sum of the logarithms of the prediction errors; infinite if predictions diverge."""
     found = float(np.log(fit.errors).sum())
     return found if np.isfinite(found) else np.inf
 
 
 def needless(search: Search, hypothesis: Hypothesis) -> dict[str, Evidence]:
-    """What is there and does not stand beside the rest, by the slopes where it is; the least first."""
+    """Present effects that are not significant beside the rest, by the linearisation here; the smallest gain first."""
     own = search.own_columns(hypothesis)
     linear, gone = search.linearise(hypothesis, own), {}
     while True:
@@ -204,7 +218,7 @@ def needless(search: Search, hypothesis: Hypothesis) -> dict[str, Evidence]:
 
 
 def _with(search: Search, hypothesis: Hypothesis, linear: Linear, chosen: list[Chosen]) -> Hypothesis:
-    """The hypothesis with more effects, all fitted, less what the fit shows to be needless."""
+    """Add the chosen effects to the hypothesis, fit all, and remove those that the fit shows to be needless."""
     own = search.own_columns(hypothesis)
     columns = [column for each in chosen for column in each.variant]
     index = linear.index([*own, *columns])
@@ -223,7 +237,7 @@ def _with(search: Search, hypothesis: Hypothesis, linear: Linear, chosen: list[C
 def _for_what_is_there(
     search: Search, hypothesis: Hypothesis, linear: Linear, own: list[Column], name: str, gone: Collection[str]
 ) -> Evidence:
-    """For an effect as it is: the residual is what it would be, to first order, if the effect vanished."""
+    """Evidence for a present effect: the residual is extrapolated, to first order, to where the effect vanishes."""
     added = [c for c in own if c.effect == name and (name == SHIFT or c.field in CATALOGUE[name].strengths)]
     others = [c for c in own if c.effect != name and c.effect not in gone]
     blocks = _put_back(search, hypothesis, linear, [c for c in own if c in added or c.effect in gone])
@@ -232,7 +246,7 @@ def _for_what_is_there(
 
 
 def _taken_out(search: Search, hypothesis: Hypothesis, linear: Linear, own: list[Column], name: str) -> Hypothesis:
-    """The hypothesis without an effect, the others moved to make up for it to first order."""
+    """The hypothesis without an effect, with the others adjusted to compensate to first order."""
     away, others = [c for c in own if c.effect == name], [c for c in own if c.effect != name]
     total = _put_back(search, hypothesis, linear, away).sum(0)
     index = linear.index(others)
@@ -241,11 +255,12 @@ def _taken_out(search: Search, hypothesis: Hypothesis, linear: Linear, own: list
 
 
 def _put_back(search: Search, hypothesis: Hypothesis, linear: Linear, away: list[Column]) -> np.ndarray:
-    """(b, c, c) inner products with the residual that is left, to first order, where some numbers are as declared."""
+    """Inner products (b, c, c) with the residual extrapolated, to first order, to declared values of ``away``."""
     back, index = np.eye(linear.blocks.shape[1]), linear.index(away)
     back[index, 0] = -search.prior(hypothesis, away).center * linear.scale[index]
     return np.einsum("ki,bkl,lj->bij", back, linear.blocks, back, optimize=True)
 
 
 def _near_zero(count: int) -> Prior:
+    """Prior about zero with half the prior range as standard deviation."""
     return Prior(np.zeros(count), np.ones(count))

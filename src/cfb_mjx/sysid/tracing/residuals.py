@@ -1,7 +1,7 @@
-"""What a model misses along flights, in physical units and beside the signals that could drive it.
+"""Residuals of a model along flights in physical units, for plots, with the signals that could explain them.
 
-Made to be looked at: the search itself works with whitened residuals (`whitening`). Measurement and model pass through
-the same zero-phase Gaussian, so neither lags the other, and the driving signals pass through it too.
+The search itself uses whitened residuals (`innovations`). Here measurement, model and the candidate signals are
+smoothed with the same zero-phase Gaussian filter, so that none lags the others.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from cfb_mjx.sysid.tracing.rules import RULES
 from cfb_mjx.sysid.tracing.search import Search
 
 WIDTH = 0.02
-"""Standard deviation of the Gaussian, s: half of what moves at 6 Hz passes."""
+"""Standard deviation of the Gaussian filter, s; about half of the power at 6 Hz passes."""
 PATTERNS = {"mean": (1, 1, 1, 1), "roll": (-1, -1, 1, 1), "pitch": (-1, 1, 1, -1), "yaw": (-1, 1, -1, 1)}
-"""Combinations of the four rotors (M1 to M4), each divided by four: what lifts, rolls, pitches and yaws."""
+"""Combinations of the four rotors (M1 to M4), each divided by four, that produce thrust and the three torques."""
 UNITS = {
     **{f"velocity {axis}": "m/s" for axis in "xyz"},
     **{f"rate {axis}": "rad/s" for axis in "xyz"},
@@ -41,22 +41,23 @@ UNITS = {
     "voltage": "V",
     "time": "s",
 }
-"""The driving signals and their units: body axes; rotor speeds as they drive the model; slopes are time derivatives."""
+"""Candidate signals and their units, in body axes; rotor speeds as fed to the model; slopes are time derivatives."""
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Of one flight of n rows: measured minus modelled.
+    """Residuals (measured minus modelled) of one flight of n rows.
 
     Attributes:
         name: of the log.
         time: (n,) s.
-        angular_acceleration: (n, 3) body axes, rad/s^2: times the inertia, the torque the model misses.
-        specific_force: (n, 3) body axes, m/s^2: times the mass, the force it misses.
-        world_force: (n, 3) the same in world axes: what hangs on a place shows here.
-        rotor_speed: (n, 4) measured minus modelled from commands alone, rad/s; None where not measured.
-        valid: (n,) rows where a residual means something.
-        drivers: signals (n,) that could drive it, named and in the units of `UNITS`; NaN where not measured.
+        angular_acceleration: (n, 3) body axes, rad/s^2; times the inertia, the torque that the model misses.
+        specific_force: (n, 3) body axes, m/s^2; times the mass, the force that the model misses.
+        world_force: (n, 3) the same in world axes, which shows forces that depend on the position.
+        rotor_speed: (n, 4) measured minus modelled from commands alone, rad/s; None if not measured.
+        valid: (n,) rows with a meaningful residual.
+        drivers: candidate signals (n,) that could explain it, with the names and units of `UNITS`; NaN where not
+            measured.
     """
 
     name: str
@@ -69,7 +70,7 @@ class Residuals:
     drivers: dict[str, np.ndarray]
 
     def axes(self) -> dict[str, tuple[np.ndarray, str]]:
-        """Every residual axis (n,) by name, with its unit."""
+        """Residual axes by name: values (n,) and unit."""
         found = {f"torque {a}": (self.angular_acceleration[:, i], "rad/s^2") for i, a in enumerate("xyz")}
         found |= {f"force {a}": (self.specific_force[:, i], "m/s^2") for i, a in enumerate("xyz")}
         found |= {f"world force {a}": (self.world_force[:, i], "m/s^2") for i, a in enumerate("xy")}
@@ -77,7 +78,7 @@ class Residuals:
         return found | {f"rotor M{i + 1}": (speed[:, i], "rad/s") for i in range(4)}
 
     def rows(self, index: np.ndarray, valid: np.ndarray) -> Residuals:
-        """The rows ``index`` selects, of which ``valid`` count."""
+        """The rows at ``index``; ``valid`` marks those with a meaningful residual."""
         fields = ("time", "angular_acceleration", "specific_force", "world_force")
         return replace(
             self,
@@ -89,7 +90,7 @@ class Residuals:
 
 
 def residual_rows(search: Search, hypothesis: Hypothesis) -> list[Residuals]:
-    """What a hypothesis misses along every flight of a search."""
+    """Residuals of a hypothesis along every flight of a search."""
     flights = search.flights(hypothesis)
     found = search.residuals(hypothesis)
     return [
@@ -99,12 +100,12 @@ def residual_rows(search: Search, hypothesis: Hypothesis) -> list[Residuals]:
 
 
 def model_residuals(model: Quadrotor, log: FlightLog, delay: float | None = None) -> tuple[Residuals, np.ndarray]:
-    """What a model misses along one flight, and the rotor speeds (rows, 4) [rad/s] that drove it.
+    """Residuals of a model along one flight, and the rotor speeds (n, 4), rad/s, that drove the model.
 
     Args:
         model: the drone.
         log: the flight.
-        delay: age of pose and velocity in its rows, s; as the log or the model says by default.
+        delay: age of pose and velocity in its rows, s; by default the value in the log or, failing that, the model's.
     """
     delay = delay_of(log, model.parameters) if delay is None else delay
     flight = prepare_flight(log, delay, float(model.parameters.gyro_delay))
@@ -114,7 +115,7 @@ def model_residuals(model: Quadrotor, log: FlightLog, delay: float | None = None
 
 
 def _rows(blocks: Blocks, driven: np.ndarray, flight: Flight, name: str) -> Residuals:
-    # Blocks and padding only serve the compiler: the flight again, in one piece.
+    # Undo the division into blocks and the padding.
     n = int(np.sum(np.asarray(flight.interval) > 0)) + 1
     quantity = np.asarray(blocks.signals.quantity).reshape(-1, 10)[:n]
     world = np.asarray(blocks.signals.acceleration).reshape(-1, 3)[:n]
@@ -146,22 +147,22 @@ def _rows(blocks: Blocks, driven: np.ndarray, flight: Flight, name: str) -> Resi
 
 
 def _heading(quaternion: np.ndarray) -> np.ndarray:
-    """Yaw (n,), rad, -pi to pi."""
+    """Yaw angle (n,), rad, from -pi to pi."""
     w, x, y, z = quaternion.T
     return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 class Smoother:
-    """The Gaussian along one flight, which never reaches across a gap.
+    """Gaussian filter along one flight that never reaches across a gap.
 
     Attributes:
-        inside: (n,) rows far enough from both ends of their stretch for the Gaussian to be whole.
+        inside: (n,) rows far enough from both ends of their gap-free stretch for the filter to be valid.
     """
 
     def __init__(self, time: np.ndarray, valid: np.ndarray, width: float = WIDTH):
         self.time, self.width = time, width
         edges = np.flatnonzero(np.diff(np.concatenate([[0], valid.astype(int), [0]])))
-        # Shorter stretches have nothing in their middle.
+        # In shorter stretches no row is far enough from the ends.
         self.stretches = [slice(a, b) for a, b in edges.reshape(-1, 2) if time[b - 1] - time[a] > 6 * width]
         self.inside = np.zeros(len(time), dtype=bool)
         for stretch in self.stretches:
@@ -169,7 +170,7 @@ class Smoother:
             self.inside[stretch] = (t >= t[0] + 2 * width) & (t <= t[-1] - 2 * width)
 
     def __call__(self, values: np.ndarray, order: int = 0) -> np.ndarray:
-        """Smoothed (n, ...) values, or with ``order`` 1 their slope per second; NaN outside the stretches."""
+        """Smoothed values (n, ...), or their time derivative (``order`` 1, per second); NaN outside the stretches."""
         from scipy.ndimage import gaussian_filter1d
 
         out = np.full(values.shape, np.nan)
@@ -186,7 +187,10 @@ class Smoother:
 
 
 def aligned(a: list[Residuals], b: list[Residuals]) -> tuple[list[Residuals], list[Residuals]]:
-    """The same flights twice, cut to the rows both have: taking a fault out of a recording costs rows at its ends."""
+    """Cut two sets of residuals of the same flights to their common rows.
+
+    Removing a fault from a recording removes rows at its ends.
+    """
     pairs = []
     for one, two in zip(a, b, strict=True):
         _, i, j = np.intersect1d(one.time, two.time, assume_unique=True, return_indices=True)
@@ -196,20 +200,23 @@ def aligned(a: list[Residuals], b: list[Residuals]) -> tuple[list[Residuals], li
 
 
 SPAN = 4.0
-"""Seconds of one spectrum; those of all flights are averaged."""
+"""Length of the data of one spectrum, s; the spectra of all flights are averaged."""
 HIGHEST = 12.0
-"""Hz: above, the Gaussian leaves nothing to see."""
+"""Highest frequency, Hz; above it the Gaussian filter leaves almost nothing."""
 
 
 def spectra(rows: list[Residuals]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Frequency (f,) Hz and power spectral density (f,), unit^2/Hz, by residual axis of the body; rotors together.
+    """Average power spectral density of every residual axis of the body; the four rotors are averaged.
 
-    Stretches shorter than `SPAN` are left out, and so are axes of which nothing is long enough.
+    Stretches shorter than `SPAN` are left out, and so are axes without a stretch that is long enough.
+
+    Returns:
+        By axis: frequency (f,), Hz, and density (f,), unit^2/Hz.
     """
     from scipy.signal import welch
 
     found: dict[str, list] = {}
-    # Flights are sampled at about the same rate; one grid lets them be averaged.
+    # A common grid, because the flights' sampling rates differ slightly.
     common = np.arange(1, HIGHEST * SPAN + 1) / SPAN
     for flight in rows:
         step = float(np.median(np.diff(flight.time)))
@@ -220,7 +227,7 @@ def spectra(rows: list[Residuals]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
             if len(grid) * step < SPAN:
                 continue
             for name, (values, _) in flight.axes().items():
-                # World axes would only repeat the body's.
+                # World axes would repeat those of the body.
                 if name.startswith("world") or not np.isfinite(values[begin:end]).all():
                     continue
                 even = np.interp(grid, time, values[begin:end])
@@ -234,11 +241,11 @@ def spectra(rows: list[Residuals]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 def sensor_spectra(frequency: np.ndarray, noise: dict[str, np.ndarray], interval: float) -> dict[str, np.ndarray]:
-    """Densities (f,) that white noise of the sensors leaves behind the Gaussian, by residual axis.
+    """Power spectral density (f,) of the smoothed white noise of the sensors, by residual axis.
 
     Args:
-        frequency: Hz.
-        noise: of a row, as from `sensor_noise`.
+        frequency: (f,) Hz.
+        noise: white noise per row, from `sensor_noise`.
         interval: between rows, s.
     """
     turn = 2 * np.pi * frequency
@@ -249,23 +256,24 @@ def sensor_spectra(frequency: np.ndarray, noise: dict[str, np.ndarray], interval
 
 
 LOWEST, SPACING = 0.4, 0.03
-"""Hz: where lines are looked for, up to `HIGHEST`."""
+"""Lowest frequency and spacing of the grid on which lines are searched, Hz; it ends at `HIGHEST`."""
 NEIGHBOURS = 41
-"""Frequencies whose median power is the background of a line."""
+"""Number of neighbouring frequencies whose median power is the background of a line."""
 RATE = 40.0
-"""Rows a second that are kept: residuals are smooth beyond."""
+"""Rate to which the smooth residuals are decimated, Hz."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of one residual axis.
+    """A spectral line of one residual axis.
 
     Attributes:
         axis: for instance ``torque x``.
         frequency: Hz.
-        amplitude: rms over the flights, in ``unit``.
+        amplitude: rms amplitude, the median over the flights, in ``unit``.
         unit: of the residual.
-        p_value: that so many flights have it by chance, times the number of places looked at.
+        p_value: probability that so many flights show it by chance, multiplied by the number of axes and frequencies
+            examined (Bonferroni).
     """
 
     axis: str
@@ -276,14 +284,19 @@ class Line:
 
     def __str__(self) -> str:
         return (
-            f"{self.axis} swings at {self.frequency:.2f} Hz by {self.amplitude:.2g} {self.unit} rms whatever is flown"
+            f"{self.axis} oscillates at {self.frequency:.2f} Hz, {self.amplitude:.2g} {self.unit} rms, in most flights"
         )
 
 
 def find_lines(rows: list[Residuals], alpha: float = RULES.line_alpha) -> list[Line]:
-    """Lines that two thirds of the flights or more share, the clearest first.
+    """Find spectral lines that at least two thirds of the flights share, the most significant first.
 
-    A manoeuvre has frequencies of its own, which an imperfect model shows too; so a line must stand in most flights.
+    A manoeuvre has its own frequencies, which also appear in the residual of an imperfect model. Therefore a line must
+    appear in most flights. Flights with at most 1000 valid rows are ignored, and at least three others are required.
+
+    Args:
+        rows: residuals of each flight.
+        alpha: largest p-value of a line.
     """
     rows = [r for r in rows if r.valid.sum() > 1000]
     if len(rows) < 3:
@@ -294,7 +307,7 @@ def find_lines(rows: list[Residuals], alpha: float = RULES.line_alpha) -> list[L
     names = [name for name in rows[0].axes() if not name.startswith("rotor")]
     for name in names:
         powers, sizes = zip(*(_spectrum(r, name, frequencies) for r in rows), strict=True)
-        # Of noise each is exponential; the weakest of the flights that must agree decides.
+        # The power of noise over its mean is exponentially distributed. Use the weakest of the flights that must agree.
         weakest = np.sort(np.array(powers), axis=0)[len(rows) - enough]
         best = int(np.argmax(weakest))
         chance = comb(len(rows), enough) * np.exp(-enough * weakest[best])
@@ -306,7 +319,7 @@ def find_lines(rows: list[Residuals], alpha: float = RULES.line_alpha) -> list[L
 
 
 def _spectrum(row: Residuals, name: str, frequencies: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Power over background, and squared amplitude, at each frequency."""
+    """Ratio of power to background, and squared amplitude, at each frequency."""
     step = max(1, round(1 / RATE / np.median(np.diff(row.time))))
     keep = np.flatnonzero(row.valid > 0)[::step]
     values = row.axes()[name][0][keep]

@@ -1,4 +1,4 @@
-"""When an effect counts: the rules of a search in one place. Beyond chance, plausible, and worth something.
+"""Thresholds of the search: when an effect is significant, plausible and worth adding.
 
 For example:
 
@@ -18,141 +18,147 @@ from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Fit, Hypothesis
 
 @dataclass(frozen=True)
 class Rules:
-    """What is tried, what is taken in, and what is reported.
+    """Thresholds for trying, accepting and reporting effects.
 
-    Shares are of a prediction error unless said otherwise; *t* is a statistic that is standard normal by chance; nats
-    are of log-likelihood on blocks left out.
+    A share is a fraction of a prediction error unless stated otherwise. *t* is a statistic that is standard normal if
+    the effect explains nothing. Nats are units of log-likelihood on cross-validation blocks.
     """
 
-    # Any effect.
+    # All effects.
     alpha: float = 1e-2
-    """An effect's p-value, times the number of effects tried, must be below this."""
+    """An effect's p-value, multiplied by the number of effects tried (Bonferroni), must be below this."""
     least_gain: float = 5.0
-    """And it must gain so many nats."""
+    """An effect must gain more nats than this."""
     material: float = 0.05
-    """And lower at least one prediction error (four quantities, two horizons) by this share."""
+    """An effect must lower at least one prediction error (four quantities, two horizons) by this share."""
     of_first: float = 0.02
-    """And by this share of what the declared model scores, so that the last crumbs of a large error are not chased."""
+    """An effect must also lower an error by this share of the declared model's error, so that the search does not
+    pursue the small remainder of a large error."""
     clear: float = 8.0
-    """An effect whose t is above this need only be material in one flight: what few flights excite (yaw, most of all)
-    drowns in the errors of the others, and no chance brings such a t about."""
+    """An effect with a t above this needs to be material in one flight only. An effect that few flights excite (yaw
+    above all) is hidden by the errors of the other flights, and such a t cannot arise by chance."""
     implausible: float = 2.0
-    """An effect stretched to so many times its plausible strength stands in for another."""
+    """An effect fitted beyond this multiple of its plausible strength is rejected: it stands in for another one."""
     smallest_shift: float = 0.0015
-    """Motor columns less late or early than this, s, are commands between rows rather than a fault."""
+    """A time shift of the motor columns smaller than this, s, is due to commands between rows and is no fault."""
     doubtful: float = 2.3
-    """An effect whose t on held-out flights is below this is not reported."""
+    """An effect with a t on the held-out flights below this is not reported."""
 
-    # One effect after another.
+    # Adding one effect after another.
     largest: int = 6
-    """Effects at most."""
+    """Maximum number of effects."""
     contenders: int = 3
-    """So many effects of a ranking are fitted."""
+    """Number of effects at the top of a ranking that are fitted."""
     contender: float = 0.5
-    """If they gain this share of the first's nats."""
+    """Those effects must gain at least this share of the first one's nats."""
     parsimony: float = 0.02
-    """A rival with fewer numbers is preferred if it gains all but this share of the nats."""
+    """A rival with fewer parameters is preferred if its gain falls short of the largest by at most this share."""
     close: float = 0.1
-    """A rival that gains all but this share of the winner's nats is named as confusable with it."""
+    """A rival whose gain falls short of the winner's by at most this share is reported as confusable with it."""
     same_errors: float = 0.03
-    """Of such rivals those are tried first whose prediction errors (mean logarithm) are the lowest but for this."""
+    """Among such rivals, those whose prediction error (mean logarithm) exceeds the lowest by at most this are tried
+    first."""
     rivals: int = 3
-    """So many effects are tried alone in place of several."""
+    """Number of effects that are tried alone in place of several."""
     as_good: float = 0.03
-    """In place of several, if no error grows by more than this share."""
+    """One effect replaces several if no error grows by more than this share."""
     patience: int = 3
-    """Candidates in a row that stand against chance but lower no error: then the search ends."""
+    """The search ends after this many rounds in a row in which no significant candidate was accepted."""
 
-    # Much missing at once.
+    # Many effects missing at once.
     many: int = 3
-    """So many that stand clearly beside each other and what was found are taken in together."""
+    """If at least this many effects are clearly significant beside each other, they are added together."""
     far_off: float = 1 / 3
-    """A model lacks much if, after half a second, it errs by more than this share of what hold errs."""
+    """A model is far off if its error after half a second exceeds this share of the error of `hold`."""
     looks: int = 5
-    """Looks at the inner products at most."""
+    """Maximum number of linearisations in the selection of several effects."""
     look_steps: int = 12
-    """Of a fit at most: what is half way there makes others seem needless."""
+    """Limit of the iterations of a fit then. In a fit that has not converged, other effects seem needless."""
     a_look: int = 20
-    """Effects taken in at most in a look."""
+    """Maximum number of effects selected per linearisation."""
 
-    # What few blocks excite.
+    # Effects that few blocks excite.
     rare_gain: float = 8.0
-    """Nats from which such an effect is tried."""
+    """Such an effect is tried if it gains more nats than this."""
     rare_t: float = 2.0
-    """And t."""
+    """Such an effect is tried if its t is above this."""
     rare_tried: int = 2
-    """Tried at most, the largest gain first."""
+    """Maximum number of trials, the largest gain first."""
     rare_sure: float = 4.0
-    """t on flights nothing was fitted to: beyond chance after a search through the catalogue."""
+    """Required t on the held-out flights: significant after a search through the whole catalogue."""
 
-    # A formula, where the catalogue fails.
+    # A formula, if the catalogue does not explain the residual.
     structure: float = 0.06
-    """What a search did not find (a formula, a rarely excited effect) counts when it lowers an error by this share."""
+    """A formula or a rarely excited effect is accepted if it lowers an error by this share."""
     structure_of_first: float = 0.05
-    """And by this share of what the declared model scores: an effect of slightly another shape leaves crumbs."""
+    """It must also lower an error by this share of the declared model's error, because an effect of a slightly wrong
+    shape leaves a small residual."""
     term_alpha: float = 1e-3
-    """A term's p-value, times the number of terms, must be below this."""
+    """A term's p-value, multiplied by the number of terms (Bonferroni), must be below this."""
     term_gain: float = 8.0
-    """And it must gain so many nats."""
+    """A term must gain more nats than this."""
     term_rare: float = 2.0
-    """Least t of a term that few blocks excite."""
+    """A term that few blocks excite must have a t above this."""
     term_needless: float = 2.0
-    """A term that gains fewer nats beside the others is left out again."""
+    """A term that gains fewer nats than this beside the others is removed."""
     per_axis: int = 3
-    """Terms or families along one axis at most."""
+    """Maximum number of terms or families of terms along one axis."""
     of_family: float = 0.9
-    """A single term is preferred if it gains this share of what a family gains."""
+    """A single term is preferred to a family if it gains at least this share of the family's gain."""
     formula_sure: float = 3.0
-    """A formula counts when its t on flights nothing was fitted to is above this."""
+    """A formula is accepted if its t on the held-out flights is at least this."""
     there_alone: float = 0.2
-    """Terms that only those flights show must lower an error by this share, and by as much of the declared model's."""
+    """Terms that only the held-out flights show must lower an error by this share, and by this share of the declared
+    model's error."""
     line_alpha: float = 1e-4
-    """A spectral line's p-value, times the number of places looked at, must be below this."""
+    """A spectral line's p-value, multiplied by the number of frequencies and axes examined, must be below this."""
     line_flights: int = 3
-    """Held-out flights from which lines are looked for there too."""
+    """With at least this many held-out flights, a line must appear in these too."""
     same_line: float = 0.1
-    """Hz by which the two may differ."""
+    """Maximum difference of the two frequencies, Hz."""
 
-    # All at once, by predictions; shares of the loss, an error over what hold errs.
+    # All effects fitted together, judged by predictions. Here shares are of the loss: errors divided by those of hold.
     better: float = 0.2
-    """The whole must lower a search's error beside hold by this share, or the search's own findings stand."""
+    """The joint fit must lower the search's error relative to `hold` by this share; otherwise the search's result is
+    kept."""
     steps: int = 12
-    """Of a fit at most."""
+    """Maximum number of iterations of the fit."""
     tried: int = 2
-    """Absent effects tried at a time, the likeliest first."""
+    """Number of absent effects tried per round, the likeliest first."""
     rounds: int = 3
-    """Of trials at most."""
+    """Maximum number of rounds of trials."""
     trial_steps: int = 5
-    """Of a trial at most."""
+    """Maximum number of iterations of a trial."""
     motor_rows: int = 12_000
-    """That the motors are fitted to, about: the middles of flights."""
+    """Approximate number of rows to which the motor constants are fitted, from the middle of each flight."""
     motor_searched: int = 12_000
-    """Rows in which effects of the motors are looked for, about: whole flights."""
+    """Approximate number of rows in which effects of the motors are searched for, in whole flights."""
     motor_looks: int = 2
-    """Looks for them at most."""
+    """Maximum number of linearisations in that search."""
     motor_piece: float = 3.0
-    """Seconds of a flight at least, of so many flights evenly spread as that allows."""
+    """Minimum duration of the piece used of each flight, s; it limits the number of flights (evenly spread)."""
     windows: int = 400
-    """Predicted at most in a fit."""
+    """Maximum number of prediction windows in a fit."""
     gain: float = 0.05
-    """A candidate must lower the loss by this share, half of it in its first step."""
+    """A candidate must lower the loss by this share, and its first Gauss-Newton step must predict half of it."""
     worth: float = 0.005
-    """An effect must lower it by this share beside all others."""
+    """An effect must lower the loss by this share beside all others."""
     confused: float = 0.9
-    """Correlation of two effects' numbers from which they are hardly told apart."""
+    """Two effects are confusable if parameters of theirs have at least this correlation."""
     spreads: float = 2.0
-    """Standard deviations between drones that a declared number may move."""
+    """Number of standard deviations between drones by which a declared parameter may move."""
     contradicts: float = 4.0
-    """Standard deviations from which innovations contradict predictions, if they differ by ``differs`` at least."""
+    """Innovations contradict predictions if the two values of a parameter differ by more than this many standard
+    deviations and by more than ``differs``."""
     differs: float = 0.5
-    """As a share of the larger of both."""
+    """Required difference, as a share of the larger of the two values."""
 
     def significant(self, found: Evidence, tried: int) -> bool:
-        """Whether evidence stands after so many tries."""
+        """Whether evidence is significant, corrected for the number of effects ``tried``."""
         return found.p_value * tried < self.alpha and found.gain > self.least_gain
 
     def stretched(self, hypothesis: Hypothesis, name: str) -> bool:
-        """Whether an effect had to be stretched beyond what is plausible: then it stands in for another."""
+        """Whether a strength of the effect is implausible; the effect then stands in for another one."""
         if name == SHIFT:
             return False
         effect, kind = hypothesis.effect(name), KNOWN[name]
@@ -161,14 +167,14 @@ class Rules:
         return any(np.any((v > ranges[f][1]) | (v < ranges[f][0])) for f, v in values.items())
 
     def worth_it(self, name: str, fit: Fit, richer: Fit, nothing: Fit, clear: bool) -> bool:
-        """Whether an effect that stands against chance also predicts better, and is no other one in disguise.
+        """Whether a significant effect is plausible and improves predictions.
 
         Args:
-            name: the effect.
-            fit: without it.
-            richer: with it.
-            nothing: the declared model.
-            clear: whether its t is above `clear`.
+            name: of the effect.
+            fit: fit without the effect.
+            richer: fit with the effect.
+            nothing: fit of the declared model.
+            clear: whether the effect's t is above `clear`.
         """
         if not np.isfinite(richer.errors).all() or self.stretched(richer.hypothesis, name):
             return False
@@ -177,28 +183,35 @@ class Rules:
         return np.log(richer.errors / fit.errors).sum() <= 0 and self.lowers(fit, richer, nothing, clear)
 
     def lowers(self, fit: Fit, richer: Fit, nothing: Fit, clear: bool) -> bool:
-        """Whether the richer fit lowers an error by a share that matters, of all flights or, if ``clear``, of one."""
+        """Whether the richer fit lowers an error materially, over all flights or, if ``clear``, in one of them."""
         shares = self.material, self.of_first
         if enough(fit.errors, richer.errors, nothing.errors, *shares):
             return True
         return clear and enough(fit.by_flight, richer.by_flight, nothing.by_flight, *shares)
 
     def missed(self, poorer: Fit, richer: Fit, clear: bool) -> bool:
-        """Whether one effect of many matters beside all others, in all flights or, if ``clear``, twice as much in one.
+        """Whether one of many effects lowers an error materially beside all others.
 
-        What the declared model scores, far off with many effects missing, is no measure of that.
+        It must do so over all flights or, if ``clear``, by twice the share in one flight. The declared model's error is
+        not a useful reference here, because with many effects missing it is very large.
         """
         if np.max(1 - richer.errors / poorer.errors) >= self.material:
             return True
         return clear and bool(np.max(1 - richer.by_flight / poorer.by_flight) >= 2 * self.material)
 
     def lowered(self, old: np.ndarray, new: np.ndarray, first: np.ndarray) -> bool:
-        """Whether what a search did not find lowers an error by a share that matters, and errors on the whole."""
+        """Whether a formula or a rarely excited effect lowers an error materially and does not raise the mean error.
+
+        Args:
+            old: errors without it.
+            new: errors with it.
+            first: errors of the declared model.
+        """
         return enough(old, new, first, self.structure, self.structure_of_first) and np.log(new / old).sum() <= 0
 
 
 def enough(poorer: np.ndarray, better: np.ndarray, first: np.ndarray, share: float, of_first: float) -> bool:
-    """Whether an error is lowered by a share, and an error by a share of what the declared model (``first``) scores."""
+    """Whether an error drops by ``share`` of itself, and one by ``of_first`` of the declared model's (``first``)."""
     return bool(np.max(1 - better / poorer) >= share and np.max((poorer - better) / first) >= of_first)
 
 

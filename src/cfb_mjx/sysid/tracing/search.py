@@ -1,4 +1,9 @@
-"""The search for what is missing: propose, fit together, test on blocks left out, look again at what was found."""
+"""State and elementary operations of the search for missing effects.
+
+A `Search` holds the flights, the sensors' noise and the names of the effects to look for. Its methods replay a
+`Hypothesis` along the flights, linearise the whitened residual, fit the parameters of the effects that are present
+(Gauss-Newton) and score each absent effect by cross-validation. `trace` decides which effect to add or to remove.
+"""
 
 from __future__ import annotations
 
@@ -60,37 +65,49 @@ from cfb_mjx.sysid.tracing.rules import RULES, Rules
 from cfb_mjx.sysid.tracing.sensors import SensorCheck
 
 STILL = 0.3
-"""Steps below this share of a standard deviation end a fit."""
+"""A fit has converged when every step is below this fraction of a standard deviation."""
 GUESSED = 2
-"""Steps of a fit in which strengths that slopes at zero say little of come near, before their shapes are free."""
+"""Number of first iterations in which the shape parameters of coarse effects (`Effect.coarse`) stay fixed.
+
+Their strength is a rough guess at first, because the derivative at zero strength says little about it.
+"""
 SAME_LEVELS = 0.5
-"""Noise levels that change by less (their logarithms) do not make it worth while to fit again."""
+"""A fit is not repeated if no noise level changed by more than this (difference of logarithms)."""
 FILTERED_GYRO = 0.1
-"""Level given to a low-pass filtered gyro, rad/s: only what it shows slowly is believed."""
+"""Noise level assumed for a low-pass filtered gyro, rad/s. Only its low frequencies are trusted."""
 SAMPLE = 32
-"""Blocks from which noise levels are learned: about a minute, many times longer than what wanders."""
+"""Number of blocks from which noise levels are estimated: about a minute, far longer than the disturbances'
+correlation time."""
 KNOWN = 2
-"""Hypotheses whose residuals are kept."""
+"""Number of hypotheses whose residuals are cached."""
 
 
 @dataclass
 class Search:
-    """One campaign under search."""
+    """The search on the flights of one campaign.
+
+    Attributes:
+        parameters: the declared drone.
+        logs: flights, corrected for sensor faults and biases.
+        delay: age of pose and velocity in a row, s.
+        noise: white noise of each sensor, from `sensor_noise`.
+        names: effects to look for.
+        declared: effects that the declared model already has.
+        rules: thresholds.
+        rotors_only: use rotor speeds only and ignore the motion of the body.
+    """
 
     parameters: Parameters
     logs: list[FlightLog]
-    """With what the sensors say of each other taken out."""
     delay: float
     noise: dict[str, np.ndarray]
     names: tuple[str, ...]
     declared: tuple[Effect, ...] = ()
-    """Effects the declared model has already."""
     rules: Rules = RULES
     rotors_only: bool = False
-    """Look at rotor speeds alone, not at what the body does."""
     _flights: dict[float, list[Flight]] = field(default_factory=dict)
     _known: list[tuple[Hypothesis, list]] = field(default_factory=list, init=False)
-    """The last `residuals`; a search that replaces another knows nothing of them."""
+    """Cache of `residuals`, newest first; not copied by `dataclasses.replace`."""
 
     @classmethod
     def start(
@@ -103,9 +120,17 @@ class Search:
         named: Sequence[str] = (),
         rules: Rules = RULES,
     ) -> Search:
-        """Prepare flights, with what is known of their sensors taken out, for a search over the catalogue.
+        """Create a search over the catalogue.
 
-        Effects that no search looks for (`Effect.searched`) take part if they are declared or ``named``.
+        Args:
+            logs: flights as recorded; the faults and biases found by ``sensors`` are removed.
+            parameters: the declared drone.
+            delay: age of pose and velocity in a row, s.
+            sensors: result of `check_sensors` on the same flights.
+            declared: effects that the declared model already has.
+            named: effects to look for even if they are excluded from searches (`Effect.searched`). Declared effects
+                always take part.
+            rules: thresholds.
         """
         logs = [sensors.corrected(log) for log in logs]
         noise = sensor_noise(logs, FILTERED_GYRO if sensors.faults.gyro_lag else 1e-3)
@@ -115,11 +140,11 @@ class Search:
 
     @property
     def delays(self) -> tuple[float, float]:
-        """Age of pose and of gyro in a row, s."""
+        """Age of the pose and of the gyro reading in a row, s."""
         return self.delay, float(self.parameters.gyro_delay)
 
     def flights(self, hypothesis: Hypothesis) -> list[Flight]:
-        """The flights as a hypothesis reads them."""
+        """The prepared flights, with the time shift of the motor columns that the hypothesis assumes removed."""
         key = round(hypothesis.shift, 5)
         if key not in self._flights:
             faults = SensorFaults(motor_shift=key)
@@ -129,9 +154,14 @@ class Search:
     def residuals(
         self, hypothesis: Hypothesis, flights: Sequence[Flight] | None = None
     ) -> list[tuple[Blocks, np.ndarray]]:
-        """What a hypothesis misses along `flights` (or others), and the rotor speeds (n, 4) that drove the body."""
+        """Compute the residual blocks of each flight and the rotor speeds (n, 4), rad/s, that drove the body.
+
+        Args:
+            hypothesis: model to replay.
+            flights: flights to replay; by default those of the search, whose result is cached.
+        """
         if flights is None:
-            # One after another is compared with the same corrected model.
+            # Several hypotheses in turn are compared with the same one, so its residuals are reused.
             kept = self._kept(hypothesis)
             if kept is not None:
                 self._keep(hypothesis, kept)
@@ -153,32 +183,32 @@ class Search:
         self._known = [(hypothesis, found), *others[: KNOWN - 1]]
 
     def beside(self, logs: list[FlightLog], sensors: SensorCheck) -> Search:
-        """The same search on other flights of the drone."""
+        """The same search on other flights of the drone, corrected by ``sensors``."""
         return replace(self, logs=[sensors.corrected(log) for log in logs], _flights={})
 
     def nothing(self) -> Hypothesis:
-        """The declared model."""
+        """The hypothesis that adds nothing: the declared model."""
         given = {type(e).name: e for e in self.declared}
         effects = tuple(given.get(type(e).name, e) for e in neutral_effects(self.names))
         return Hypothesis(effects, origin=effects)
 
     def learned(self, hypothesis: Hypothesis) -> Hypothesis:
-        """The hypothesis with the noise levels that fit what it leaves."""
+        """The hypothesis with the maximum-likelihood noise levels of its residuals."""
         blocks = joined(blocks for blocks, _ in self.residuals(hypothesis))
         return replace(hypothesis, levels=fit_levels(_sample(blocks), self.noise, hypothesis.levels))
 
     def surprise(self, hypothesis: Hypothesis) -> float:
-        """Negative log-likelihood of what a hypothesis leaves at its noise levels, nats, on the blocks of `learned`."""
+        """Negative log-likelihood of a hypothesis's residuals at its noise levels, nats, on the blocks of `learned`."""
         blocks = joined(blocks for blocks, _ in self.residuals(hypothesis))
         return float(surprise(jnp.asarray(hypothesis.levels), self.noise, _sample(blocks))[0])
 
     def linearise(self, hypothesis: Hypothesis, wanted: list[Column]) -> Linear:
-        """Residual and derivatives by the lead of the commands and by ``wanted`` at a hypothesis."""
+        """Linearise the residual at a hypothesis, with respect to the command lead and the ``wanted`` columns."""
         columns = [lead_column(), *wanted]
         return self._linear(hypothesis, columns, self._slopes(hypothesis, columns))
 
     def linearise_terms(self, hypothesis: Hypothesis, own: list[Column]) -> list[Linear]:
-        """`linearise` by ``own`` and the library of formulas, for each axis (`formula.AXES`)."""
+        """`linearise` with respect to ``own`` and the library of formula terms, for each axis of `formula.AXES`."""
         model, driven = hypothesis.model(self.parameters), self._driven(hypothesis)
         flights, columns = self.flights(hypothesis), [lead_column(), *own]
         beside = list(self._slopes(hypothesis, columns, driven))
@@ -206,7 +236,7 @@ class Search:
         for pair in zip(self.flights(hypothesis), signals, strict=True):
             waiting.append(self._looked_at(cut(*pair)))
             counts.append(len(waiting[-1].interval))
-            # Short flights together, so that they fill what is whitened at a time.
+            # Pool short flights to fill the fixed batch that is whitened at once.
             if sum(len(blocks.interval) for blocks in waiting) >= SIDE_BY_SIDE[0]:
                 found.append(inner_products(joined(waiting), levels))
                 waiting = []
@@ -215,7 +245,7 @@ class Search:
         return Linear(columns, np.concatenate(found), dealt(counts))
 
     def _looked_at(self, blocks: Blocks) -> Blocks:
-        """The same, valid in the channels this search looks at."""
+        """The blocks with the channels that this search ignores marked as invalid."""
         if not self.rotors_only:
             return blocks
         return replace(blocks, valid=blocks.valid * np.isin(np.arange(CHANNELS), DOMAINS["rotor_speed"]))
@@ -223,7 +253,7 @@ class Search:
     def _slopes(
         self, hypothesis: Hypothesis, columns: list[Column], driven: list[np.ndarray] | None = None
     ) -> Iterator[Signals]:
-        """Residual and derivatives of every flight."""
+        """Residual and its derivatives with respect to ``columns``, for every flight."""
         changes = moves(hypothesis.effects, hypothesis.lead, columns, set(hypothesis.present))
         driven = self._driven(hypothesis) if driven is None else driven
         model, flights = hypothesis.model(self.parameters), self.flights(hypothesis)
@@ -232,18 +262,23 @@ class Search:
     # -- one hypothesis -------------------------------------------------------------------------------------------
 
     def stands(self, found: Evidence) -> bool:
-        """Whether evidence for an effect is beyond chance after a look at all of them."""
+        """Whether evidence for an effect is significant, corrected for the number of effects in the search."""
         return self.rules.significant(found, len(self.names))
 
     def candidates(self, hypothesis: Hypothesis) -> list[list[Column]]:
-        """Columns of every effect that is not there, at each probe."""
+        """Strength columns of every absent effect, one list per probe of its shape."""
         there = hypothesis.present
         absent = [name for name in self.names if name not in there]
         shift = [] if SHIFT in there else [[shift_column()]]
         return shift + [variant for name in absent for variant in strengths(name, there)]
 
     def own_columns(self, hypothesis: Hypothesis, guessed: bool = False) -> list[Column]:
-        """Columns of what is there: strengths and shapes, but no shapes where the strength may be a mere guess."""
+        """Columns of the effects that are present: their strengths and shapes, and the terms of a formula.
+
+        Args:
+            hypothesis: model whose columns to list.
+            guessed: the strengths may still be rough guesses; leave out the shapes of coarse effects.
+        """
         found = []
         for name in hypothesis.present:
             if name == SHIFT:
@@ -255,25 +290,29 @@ class Search:
         return [replace(c, probe=()) for c in found] + list(hypothesis.terms)
 
     def whole(self, hypothesis: Hypothesis) -> Linear:
-        """Derivatives by what is there and by the rest of the catalogue."""
+        """Linearise with respect to the effects that are present and to all absent effects of the catalogue."""
         absent = [c for variant in self.candidates(hypothesis) for c in variant]
         return self.linearise(hypothesis, self.own_columns(hypothesis) + absent)
 
     def refine(self, hypothesis: Hypothesis, rounds: int = 5) -> tuple[Hypothesis, Linear]:
-        """Fit everything that is there together; derivatives by the whole catalogue come with the result."""
+        """Fit all present effects together; return the hypothesis and its linearisation by the whole catalogue."""
         hypothesis = self.settled(hypothesis, rounds)
         return hypothesis, self.whole(hypothesis)
 
     def settled(
         self, hypothesis: Hypothesis, rounds: int = 5, lead_free: bool = True, shrunk: bool = False
     ) -> Hypothesis:
-        """Fit everything that is there together, the lead of the commands too unless it is to stay.
+        """Fit the parameters of all present effects together, by Gauss-Newton.
 
-        If ``shrunk``, towards the declared model, by half the range of what is plausible: of effects that say the same
-        none runs away then.
+        Args:
+            hypothesis: where to start.
+            rounds: maximum number of iterations plus one.
+            lead_free: fit the command lead too; otherwise it is kept.
+            shrunk: add a normal prior centred on the declared values, with half the prior range as its standard
+                deviation. It keeps collinear effects from diverging.
         """
         for attempt in range(rounds - 1):
-            # With half a limit's strength another shape of it seems to be what is missing.
+            # While a strength is far from its optimum, the fit would distort the shape to make up for it.
             own = self.own_columns(hypothesis, guessed=attempt < GUESSED)
             linear = self.linearise(hypothesis, own)
             index = [1, *linear.index(own)]
@@ -283,7 +322,7 @@ class Search:
             values = solve(linear.blocks.sum(0), index, linear.scale, prior)
             kept = np.clip(hypothesis.lead + lead_free * values[0] * lead, *LEAD_RANGE)
             if kept != hypothesis.lead + values[0] * lead:
-                # What the lead may not take the others have to explain.
+                # The lead is at its bound: solve again with the lead fixed there.
                 fixed = known.pulled(0, (kept - hypothesis.lead) / lead, 1e9)
                 values = solve(linear.blocks.sum(0), index, linear.scale, fixed)
             deviation = np.sqrt(np.diag(covariance(linear.blocks, index, linear.scale, values, prior)))
@@ -292,14 +331,14 @@ class Search:
                 break
             hypothesis = self.moved(hypothesis, own, values * linear.scale[index])
             if attempt == 0:
-                # Noise levels come from a poorer model: they are learned anew even where the values stay.
+                # The noise levels come from a poorer model, so estimate them again even if the values are unchanged.
                 before, hypothesis = hypothesis.levels, self.learned(hypothesis)
                 if still and np.max(np.abs(hypothesis.levels - before)) < SAME_LEVELS:
                     break
         return hypothesis
 
     def prior(self, hypothesis: Hypothesis, columns: list[Column]) -> Prior:
-        """Of steps: that numbers are not far, by half the range of what is plausible, from the declared ones."""
+        """Prior for a step of ``columns``: normal about the declared values, with half the prior range as deviation."""
         away = []
         for column in columns:
             if column.effect == SHIFT:
@@ -313,7 +352,13 @@ class Search:
         return Prior(np.array(away), np.ones(len(columns)))
 
     def moved(self, hypothesis: Hypothesis, own: list[Column], by: np.ndarray) -> Hypothesis:
-        """The hypothesis after a step: the lead's first, then one for each of its columns."""
+        """Apply a step to a hypothesis, clipped to the bounds.
+
+        Args:
+            hypothesis: before the step.
+            own: columns to move.
+            by: (1 + len(own),) change of the command lead, then of each column, in the parameters' units.
+        """
         effects = {type(e).name: e for e in hypothesis.effects}
         shift = hypothesis.shift
         for column, change in zip(own, by[1:], strict=True):
@@ -331,14 +376,14 @@ class Search:
         return replace(hypothesis, effects=found, lead=lead, shift=shift)
 
     def adding(self, hypothesis: Hypothesis, linear: Linear, variant: list[Column]) -> Evidence | None:
-        """Evidence for a candidate beside what is there; None where its sign makes no sense."""
-        # Not beside a free lead: late commands would look like one.
+        """Evidence for adding a candidate to a hypothesis; None if a fitted strength has a meaningless sign."""
+        # The lead is not free here: it would absorb delayed commands.
         base = linear.index(self.own_columns(hypothesis))
         found = evidence(linear.blocks, base, linear.index(variant), linear.scale, fold=linear.fold)
         return found if sensible(variant, found.values) else None
 
     def probes(self, hypothesis: Hypothesis, linear: Linear) -> dict[str, tuple[Evidence, list[Column]]]:
-        """Every absent effect whose sign makes sense, at the probe that gains most."""
+        """Evidence for every absent effect with a meaningful sign, at the probe of its shape with the largest gain."""
         best: dict[str, tuple[Evidence, list[Column]]] = {}
         for variant in self.candidates(hypothesis):
             name = variant[0].effect
@@ -348,7 +393,7 @@ class Search:
         return best
 
     def with_candidate(self, hypothesis: Hypothesis, variant: list[Column], found: Evidence) -> Hypothesis:
-        """The hypothesis with a candidate at the values the linear fit gives it."""
+        """The hypothesis with a candidate effect added, at the values of the linear fit ``found``."""
         name = variant[0].effect
         if name == SHIFT:
             shift = hypothesis.shift + float(found.values[0]) * variant[0].scale
@@ -360,16 +405,16 @@ class Search:
 
 
 def _alike(a: Hypothesis, b: Hypothesis) -> bool:
-    """Whether they miss the same, whatever their noise levels are."""
+    """Whether two hypotheses have the same residuals; noise levels may differ."""
     return a.effects is b.effects and (a.lead, a.shift) == (b.lead, b.shift)
 
 
 def _sample(blocks: Blocks) -> Blocks:
-    """`SAMPLE` of the blocks, spread evenly over those in flight: one compiled program serves every campaign."""
+    """`SAMPLE` of the valid blocks, evenly spread. The fixed number lets one compiled program serve every campaign."""
     share = np.asarray(blocks.valid).max(axis=2).mean(axis=1)
     good = np.flatnonzero(share > 0.5 * share.max())
     chosen = good[np.linspace(0, len(good) - 1, SAMPLE).round().astype(int)]
     picked = jax.tree.map(lambda x: x[chosen], blocks)
-    # Where there are fewer than that, none counts twice.
+    # If there are fewer blocks than that, each counts once.
     first = np.concatenate([[True], np.diff(chosen) > 0])
     return Blocks(picked.signals, picked.interval, picked.valid * first[:, None, None])

@@ -1,8 +1,8 @@
-"""What the sensors say about each other, without any model of the drone: biases, lags and scales.
+"""Comparison of the sensors with each other, without a model of the drone: biases, lags and scales.
 
-A gyro integrated over a while must turn the attitude as far as the pose says it turned, an accelerometer integrated
-must change the velocity as it changed, and velocity must move the position. Where they do not, a sensor is at fault,
-not the physics; and what is found here is taken out before any effect is looked for.
+The integrated gyro must match the change of the attitude, the integrated accelerometer the change of the velocity, and
+the integrated velocity the change of the position. A mismatch is a sensor fault, not physics. Faults found here are
+removed before the search for effects.
 """
 
 from __future__ import annotations
@@ -21,24 +21,25 @@ from cfb_mjx.sysid.flight import with_gyro_in_time
 from cfb_mjx.sysid.sensor_faults import ATTRIBUTES, SensorFaults
 
 SHORT, LONG = 0.12, 0.6
-"""Spans of the comparisons, s: short ones show lags, long ones biases and scales."""
+"""Time spans of the comparisons, s: short ones for lags, long ones for biases and scales."""
 LAGS = np.arange(-0.024, 0.0681, 0.004)
+"""Lags that are tried, s."""
 
 
 @dataclass(frozen=True)
 class Kinematics:
-    """Of one log.
+    """Result of `compare_sensors` for one log.
 
     Attributes:
         gyro_bias: (3,) rad/s.
         accelerometer_bias: (3,) m/s^2, body axes.
-        attitude_lag: pose behind gyro beyond the declared delay, s.
-        velocity_lag: velocity behind accelerometer beyond the declared delay, s.
-        velocity_scale: velocity over slope of position.
-        horizontal_scale: the same of the horizontal components alone.
-        vertical_scale: the same of the vertical component alone.
-        gyro_scale: gyro over the turning of the pose.
-        weight: how much motion there was to tell each of the six from (inverse variances), for pooling.
+        attitude_lag: lag of the attitude behind the gyro beyond the declared delay, s.
+        velocity_lag: lag of the velocity behind the accelerometer beyond the declared delay, s.
+        velocity_scale: velocity over the derivative of the position.
+        horizontal_scale: the same for the horizontal components only.
+        vertical_scale: the same for the vertical component only.
+        gyro_scale: gyro over the angular rate of the attitude.
+        weight: (6,) inverse variances of the two lags and the four scales, in this order, for pooling over logs.
     """
 
     gyro_bias: np.ndarray
@@ -91,7 +92,7 @@ def compare_sensors(log: FlightLog, delay: float, gyro_delay: float, gravity: fl
     gained = (velocity[short:] - velocity[:-short]) / scale
 
     def unexplained(lag):
-        # Attitude and velocity come late together; only the accelerometer is moved to meet them.
+        # Attitude and velocity have the same lag, so only the accelerometer is shifted in time.
         force = at(log.specific_force, -lag) - accelerometer_bias
         return gained - _span(_integral(rotate(quaternion, force) - [0, 0, gravity], step), short, 0.0, step)
 
@@ -104,14 +105,14 @@ def compare_sensors(log: FlightLog, delay: float, gyro_delay: float, gravity: fl
         scale,
         horizontal,
         vertical,
-        # The attitude is the noisier of the two: its slope on the gyro's turn is unbiased, not the other way round.
+        # The attitude is noisier than the gyro, so regress the attitude on the gyro and invert the slope.
         1 / gyro_scale,
         np.array([attitude_weight, velocity_weight, scale_weight, horizontal_weight, vertical_weight, gyro_weight]),
     )
 
 
 def _covered(log: FlightLog, grid: np.ndarray) -> np.ndarray:
-    """Whether an instant lies in no gap."""
+    """Whether each instant lies outside all gaps."""
     inside = np.ones(len(grid), dtype=bool)
     for i in log.gaps():
         inside &= ~((grid > log.time[i] - 0.02) & (grid < log.time[i + 1] + 0.02))
@@ -119,7 +120,7 @@ def _covered(log: FlightLog, grid: np.ndarray) -> np.ndarray:
 
 
 def _spans(covered: np.ndarray, rows: int, margin: float, step: float) -> np.ndarray:
-    """Starts (len - rows) of spans that touch no gap, with a margin on both sides."""
+    """Mask (n - rows,) of the starts of spans that touch no gap, with ``margin`` seconds on both sides."""
     reach = int(np.ceil(margin / step))
     bad = np.concatenate([[0], np.cumsum(~covered)])
     starts = np.arange(len(covered) - rows)
@@ -134,14 +135,17 @@ def _integral(values: np.ndarray, step: float) -> np.ndarray:
 
 
 def _span(total: np.ndarray, rows: int, lag: float, step: float) -> np.ndarray:
-    """Differences of an integral over spans that begin ``lag`` seconds earlier."""
+    """Differences of an integral over spans of ``rows`` rows, shifted ``lag`` seconds earlier."""
     index = np.arange(len(total))
     moved = interpolate(index, total, index - lag / step)
     return moved[rows:] - moved[:-rows]
 
 
 def _turned(quaternion: np.ndarray, rows: int) -> np.ndarray:
-    """Rotation vectors over spans, body axes of the middle (a gyro integral without commutator to second order)."""
+    """Rotation vectors over spans of ``rows`` rows, in body axes at the middle.
+
+    To second order they equal the integral of the gyro, without a commutator term.
+    """
     p, q = quaternion[:-rows], quaternion[rows:]
     w = np.sum(p * q, axis=1)
     vector = p[:, :1] * q[:, 1:] - q[:, :1] * p[:, 1:] - np.cross(p[:, 1:], q[:, 1:])
@@ -152,7 +156,7 @@ def _turned(quaternion: np.ndarray, rows: int) -> np.ndarray:
 
 
 def _gyro_bias(quaternion, gyro, rows, step, ok) -> np.ndarray:
-    # Short spans chained: over long ones rotation vectors do not add up.
+    # Chain short spans, because rotation vectors do not add up over long ones.
     short = max(2, rows // 8)
     missing = _span(_integral(gyro, step), short, 0.0, step) - _turned(quaternion, short)
     ok = np.append(ok, np.zeros(rows - short, dtype=bool)) if len(ok) < len(missing) else ok[: len(missing)]
@@ -167,17 +171,17 @@ def _accelerometer_bias(quaternion, velocity, world, rows, step, ok) -> np.ndarr
         return np.zeros(3)
     pick = np.flatnonzero(ok)[:: max(1, rows // 8)]
     a, b = columns[pick].reshape(-1, 3), missing[pick].reshape(-1)
-    # Plausible biases are below 0.2 m/s^2; level flight alone cannot tell the scale of gravity from a bias along z.
+    # Plausible biases are below 0.2 m/s^2. Level flight cannot separate the magnitude of gravity from a bias along z.
     return np.linalg.solve(a.T @ a + np.eye(3) * 1e-9, a.T @ b)
 
 
 def _scale(position, velocity, rows, step, ok) -> tuple[float, float]:
-    """Velocity over slope of position, and the inverse variance of that number."""
+    """Ratio of the velocity to the derivative of the position, and its inverse variance."""
     return _ratio(position[rows:] - position[:-rows], _span(_integral(velocity, step), rows, 0.0, step), ok, rows)
 
 
 def _ratio(moved, said, ok, rows) -> tuple[float, float]:
-    """What is said over how it moved, over spans of so many rows, and the inverse variance of that number."""
+    """Slope of ``said`` on ``moved`` over spans of ``rows`` rows, and its inverse variance."""
     pick = np.flatnonzero(ok)[:: max(1, rows // 4)]
     if len(pick) < 8:
         return 1.0, 0.0
@@ -188,7 +192,7 @@ def _ratio(moved, said, ok, rows) -> tuple[float, float]:
 
 
 def _lag(missing, ok) -> tuple[float, float]:
-    """The lag with the smallest sum of squares, between grid points by a parabola, and its inverse variance."""
+    """Lag with the smallest mean square of ``missing``, interpolated by a parabola, and its inverse variance."""
     if ok.sum() < 50:
         return 0.0, 0.0
     losses = np.array([np.mean(missing(lag)[ok] ** 2) for lag in LAGS])
@@ -207,17 +211,24 @@ SMALLEST = {
     "sensor_velocity_scale": 0.01,
     "sensor_gyro_scale": 0.08,
 }
-"""Faults below this are left alone: every estimator and filter has some. An estimated attitude turns up to 6 % further
-than a sound gyro says; motion capture of the same flights shows that it is not the gyro."""
+"""Faults smaller than this are ignored, because every estimator and filter has some. An estimated attitude rotates up
+to 6 % further than a healthy gyro measures; motion capture of the same flights shows that the gyro is right."""
 SURE = 5.0
-"""Standard deviations a fault must be away from nothing."""
+"""Significance that a fault needs, in standard deviations."""
 _BIAS_NOISE = 0.008
-"""Of an accelerometer bias found from one flight, m/s^2: biases that scatter no more are taken as one."""
+"""Standard error of an accelerometer bias from one flight, m/s^2. Biases that scatter no more than this are pooled."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One sensor fault: its number, and of a velocity column stretched differently along the vertical that one's."""
+    """One sensor fault.
+
+    Attributes:
+        name: of the fault, as in `SENSOR_FAULTS`.
+        value: of its parameter.
+        std: standard deviation of the value.
+        vertical: vertical scale of the velocity and its standard deviation, if it differs from the horizontal one.
+    """
 
     name: str
     value: float
@@ -226,19 +237,19 @@ class Finding:
 
     @property
     def p_value(self) -> float:
-        """Two-sided, of no fault."""
+        """Two-sided p-value of the hypothesis that there is no fault."""
         pairs = [(self.value, self.std)] + ([self.vertical] if self.vertical else [])
         healthy = SENSOR_FAULTS[self.name].healthy
         return min(float(2 * norm.sf(abs(value - healthy) / std)) for value, std in pairs)
 
     @property
     def parameters(self) -> dict[str, float]:
-        """As in a model file."""
+        """Values by name, as in a model file."""
         return self._by_name(0)
 
     @property
     def uncertainty(self) -> dict[str, float]:
-        """Standard deviations, by the same names."""
+        """Standard deviations by the same names."""
         return self._by_name(1)
 
     def _by_name(self, which: int) -> dict[str, float]:
@@ -248,18 +259,24 @@ class Finding:
 
 @dataclass(frozen=True)
 class SensorCheck:
-    """What a campaign says about its sensors."""
+    """Result of `check_sensors` for a campaign.
+
+    Attributes:
+        faults: of the recording chain.
+        findings: the faults, one by one, with their uncertainty.
+        measured: value and standard deviation of every quantity examined.
+        gyro_bias: (3,) rad/s, by log name.
+        accelerometer_bias: (3,) m/s^2, by log name.
+    """
 
     faults: SensorFaults
     findings: list[Finding]
     measured: dict[str, tuple[float, float]]
-    """Every quantity looked at: value and standard deviation."""
     gyro_bias: dict[str, np.ndarray]
     accelerometer_bias: dict[str, np.ndarray]
-    """Per log name, rad/s and m/s^2."""
 
     def corrected(self, log: FlightLog) -> FlightLog:
-        """A flight of this campaign with faults and biases taken out."""
+        """A flight of this campaign with faults and biases removed."""
         log = self.faults.repaired(log)
         return log.replace(
             body_rate=log.body_rate - self.gyro_bias.get(log.name, 0.0),
@@ -268,7 +285,7 @@ class SensorCheck:
 
 
 def check_sensors(logs: list[FlightLog], delay: float, gyro_delay: float) -> SensorCheck:
-    """Compare the sensors of a campaign's flights with each other.
+    """Compare the sensors of a campaign's flights with each other, and find their faults and biases.
 
     Args:
         logs: flights of one drone.
@@ -278,7 +295,7 @@ def check_sensors(logs: list[FlightLog], delay: float, gyro_delay: float) -> Sen
     kinematics = [compare_sensors(log, delay, gyro_delay) for log in logs]
     vertical = _own_vertical_scale(kinematics)
     if vertical is not None:
-        # Stretched alike along all axes first, so that all else is compared as in any other flight.
+        # First make the scale equal along all axes, so that the other comparisons are valid.
         ratio = vertical[0] / _pooled(kinematics, "horizontal_scale", 3)[0]
         even = SensorFaults(vertical_scale=ratio)
         kinematics = [compare_sensors(even.unstretched(log), delay, gyro_delay) for log in logs]
@@ -302,7 +319,7 @@ def check_sensors(logs: list[FlightLog], delay: float, gyro_delay: float) -> Sen
         findings.append(Finding("sensor_gyro_scale", *gyro_scale))
     faults = SensorFaults(**{ATTRIBUTES[f.name][key]: x for f in findings for key, x in f.parameters.items()})
     if not faults.healthy:
-        # Biases again, from repaired flights.
+        # Estimate the biases again, from the repaired flights.
         kinematics = [compare_sensors(faults.repaired(log), delay, gyro_delay) for log in logs]
     names = [log.name for log in logs]
     return SensorCheck(
@@ -315,12 +332,12 @@ def check_sensors(logs: list[FlightLog], delay: float, gyro_delay: float) -> Sen
 
 
 def lags(turn: tuple[float, float], gain: tuple[float, float]) -> list[Finding]:
-    """Lags of the pose, beyond the declared one, and of the gyro, which cannot be ahead of what it measures.
+    """Attribute the measured lags to the pose, the gyro, or both; a gyro's own lag cannot be negative.
 
     Args:
-        turn: by how much the attitude is behind the gyro, s, and its deviation: the pose's lag less the gyro's.
-        gain: by how much the velocity is behind the accelerometer: the pose's lag. Knocks too short for the
-            accelerometer make it far less exact than ``turn``.
+        turn: lag of the attitude behind the gyro (the pose's lag minus the gyro's) and its standard deviation, s.
+        gain: lag of the velocity behind the accelerometer (the pose's lag) and its standard deviation, s. It is far
+            less accurate than ``turn``, because of shocks too short for the accelerometer.
     """
     gyro = _gyro_lag(turn, gain)
     late, slow = _away("sensor_delay", *gain), _away("sensor_gyro_lowpass", *gyro) and gyro[0] > 0
@@ -329,27 +346,27 @@ def lags(turn: tuple[float, float], gain: tuple[float, float]) -> list[Finding]:
     if not (late or _away("sensor_delay", *turn)):
         return [Finding("sensor_gyro_lowpass", *gyro)] if slow else []
     if not late and turn[0] < 0 and abs(gain[0]) < abs(gyro[0]):
-        # Of the two, a slow gyro and a pose younger than declared, the velocity is nearer to the first.
+        # Either the gyro lags or the pose is younger than declared; the velocity is closer to the former.
         return [Finding("sensor_gyro_lowpass", -turn[0], turn[1])]
-    # With a healthy gyro both comparisons show the same delay; the turn tells it more exactly.
+    # With a healthy gyro both comparisons measure the same delay; combine them by inverse variance.
     weight = np.array([1 / turn[1] ** 2, 1 / gain[1] ** 2])
     value = float(weight @ [turn[0], gain[0]] / weight.sum())
     return [Finding("sensor_delay", value, float(weight.sum() ** -0.5))]
 
 
 def _gyro_lag(turn: tuple[float, float], gain: tuple[float, float]) -> tuple[float, float]:
-    """The accelerometer has its own clockwork beside the pose's; the gyro's lag is what is left between the two."""
+    """Lag of the gyro and its standard deviation, s: the pose's lag minus that of the attitude behind the gyro."""
     return gain[0] - turn[0], float(np.hypot(turn[1], gain[1]))
 
 
 def _away(name: str, value: float, std: float, healthy: float | None = None) -> bool:
-    """Whether a fault is worth taking out, and surely one."""
+    """Whether a fault is large enough to be removed, and significant."""
     away = abs(value - (SENSOR_FAULTS[name].healthy if healthy is None else healthy))
     return away > SMALLEST[name] and away > SURE * std
 
 
 def _own_vertical_scale(kinematics: list[Kinematics]) -> tuple[float, float] | None:
-    """Vertical velocity over slope of height, where that is surely another than horizontally."""
+    """Vertical scale of the velocity and its standard deviation if it differs from the horizontal one, else None."""
     (across, across_std), (up, up_std) = (
         _pooled(kinematics, "horizontal_scale", 3),
         _pooled(kinematics, "vertical_scale", 4),
@@ -360,7 +377,7 @@ def _own_vertical_scale(kinematics: list[Kinematics]) -> tuple[float, float] | N
 
 
 def _pooled(kinematics: list[Kinematics], name: str, index: int) -> tuple[float, float]:
-    """Weighted mean over the flights, with a deviation that covers their scatter too."""
+    """Weighted mean over the flights, with a standard deviation that also covers their scatter."""
     values = np.array([getattr(k, name) for k in kinematics])
     weights = np.array([k.weight[index] for k in kinematics])
     total = weights.sum()
@@ -373,7 +390,7 @@ def _pooled(kinematics: list[Kinematics], name: str, index: int) -> tuple[float,
 
 
 def _shrunk(biases: np.ndarray) -> np.ndarray:
-    """Biases of the flights drawn to their common value as far as their scatter is that of the method."""
+    """Shrink the flights' biases to their median, as far as their scatter is explained by the estimation error."""
     common = np.median(biases, axis=0)
     scatter = np.var(biases, axis=0)
     share = np.maximum(0.0, 1 - _BIAS_NOISE**2 / np.maximum(scatter, 1e-12))

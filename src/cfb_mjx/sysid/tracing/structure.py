@@ -1,4 +1,4 @@
-"""What a residual holds: how much of it follows a signal, and what the sensors' noise alone would leave."""
+"""Structure of residuals: how much of their variance depends on a signal, and the noise floor of the sensors."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ from cfb_mjx.sysid.tracing.innovations import Levels
 from cfb_mjx.sysid.tracing.residuals import Residuals
 
 BLOCK = 2.0
-"""Seconds that stay together: neighbouring rows are not independent."""
+"""Length of a cross-validation block, s; neighbouring rows are not independent."""
 BINS, FOLDS = 8, 5
 PREDICTION_BINS = 4
-"""Bins of a signal where there is one value per window only."""
+"""Number of bins of a signal if there is only one value per window."""
 OFFSET = "offset"
-"""In the place of a signal: the residual's mean."""
+"""Stands for the residual's mean in place of a signal."""
 
 
 @dataclass(frozen=True)
 class Pooled:
-    """Rows of several flights one after the other.
+    """Concatenated rows of several flights.
 
     Attributes:
-        axes: residual axes (N,) by name; NaN where there is none.
+        axes: residual axes (N,) by name; NaN where not measured.
         units: of the axes.
-        drivers: signals (N,) by name; NaN where not measured.
-        block: (N,) number of the stretch of `BLOCK` seconds a row belongs to.
+        drivers: candidate signals (N,) by name; NaN where not measured.
+        block: (N,) number of the block of `BLOCK` seconds to which a row belongs.
     """
 
     axes: dict[str, np.ndarray]
@@ -42,7 +42,7 @@ class Pooled:
 
 
 def pool(rows: list[Residuals]) -> Pooled:
-    """The valid rows of all flights."""
+    """Concatenate the valid rows of all flights."""
     parts, first = [], 0
     for flight in rows:
         own = np.floor((flight.time - flight.time[0]) / BLOCK).astype(int)
@@ -57,11 +57,11 @@ def pool(rows: list[Residuals]) -> Pooled:
 
 @dataclass(frozen=True)
 class Binned:
-    """Means in bins of a signal; arrays (bins,).
+    """Means of a residual in bins of a signal; arrays (bins,).
 
     Attributes:
-        center: mean of the signal.
-        mean: of the residual.
+        center: mean of the signal in the bin.
+        mean: mean of the residual in the bin.
         error: standard error of that mean, from the scatter between blocks.
     """
 
@@ -71,7 +71,7 @@ class Binned:
 
 
 def edges_of(signal: np.ndarray, bins: int = BINS) -> np.ndarray:
-    """Edges of bins that hold equally many rows, (bins + 1,) or fewer where values repeat."""
+    """Edges of bins with equal numbers of rows, (bins + 1,), or fewer if values repeat."""
     return np.unique(np.nanquantile(signal, np.linspace(0, 1, bins + 1)))
 
 
@@ -88,7 +88,7 @@ def binned(residual: np.ndarray, signal: np.ndarray, block: np.ndarray, edges: n
         if len(count) < 3:
             continue
         mean = total.sum() / count.sum()
-        # Of a ratio of sums over blocks, which differ in how much they hold.
+        # Standard error of a ratio of sums over blocks of different size.
         error = np.sqrt(np.sum((total - mean * count) ** 2) * len(count) / (len(count) - 1)) / count.sum()
         out.append((signal[here].mean(), mean, error))
     return Binned(*np.array(out).reshape(-1, 3).T)
@@ -97,17 +97,17 @@ def binned(residual: np.ndarray, signal: np.ndarray, block: np.ndarray, edges: n
 def explained(
     residual: np.ndarray, signal: np.ndarray | None, block: np.ndarray, bins: int = BINS
 ) -> tuple[float, float]:
-    """Share of a residual's mean square that bins of a signal explain beyond its mean, on blocks left out.
+    """Cross-validated share of a residual's mean square that a binned signal explains beyond the residual's mean.
 
     Args:
         residual: (n,).
-        signal: (n,); None asks for what the mean alone explains.
+        signal: (n,); None: the share that the mean alone explains.
         block: (n,) number of the block of each row.
-        bins: how finely the signal is cut.
+        bins: number of bins of the signal.
 
     Returns:
-        The share, about zero or below where the signal says nothing, and how many standard errors it is above zero
-        (from the scatter between blocks).
+        The share (zero or negative if the signal explains nothing), and the share divided by its standard error, which
+        comes from the scatter between blocks.
     """
     good = np.isfinite(residual) & (True if signal is None else np.isfinite(signal))
     y, block = residual[good], block[good]
@@ -136,14 +136,14 @@ def explained(
 
 @dataclass(frozen=True)
 class Structure:
-    """Which residual follows which signal.
+    """Table of which residual depends on which signal.
 
     Attributes:
         axes: names of the residual axes (a).
         signals: names of the signals (s), `OFFSET` first.
-        share: (a, s) `explained` shares of each axis's own mean square; NaN where a column was not measured.
-        sigma: (a, s) standard errors above zero.
-        rms: (a,) size of each axis in its unit.
+        share: (a, s) explained share of each axis's mean square (`explained`); NaN where a column was not measured.
+        sigma: (a, s) shares divided by their standard errors.
+        rms: (a,) rms of each axis in its unit.
     """
 
     axes: list[str]
@@ -153,12 +153,18 @@ class Structure:
     rms: np.ndarray
 
     def __add__(self, other: Structure) -> Structure:
-        """Axes of both, of the same signals."""
+        """Combine the axes of two tables with the same signals."""
         rows = {key: np.concatenate([getattr(self, key), getattr(other, key)]) for key in ("share", "sigma", "rms")}
         return Structure(self.axes + other.axes, self.signals, **rows)
 
     def strongest(self, count: int, least_share: float = 0.05, least_sigma: float = 3.0) -> list[tuple[int, int]]:
-        """Axis and signal of what follows a signal most, at most one signal per axis, the largest share first."""
+        """Indices (axis, signal) of the largest shares, at most one signal per axis, the largest share first.
+
+        Args:
+            count: maximum number of pairs.
+            least_share: smallest share to consider.
+            least_sigma: smallest ratio of a share to its standard error to consider.
+        """
         sure = np.where((self.sigma > least_sigma) & (self.share > least_share), self.share, 0.0)
         best = np.nanargmax(np.nan_to_num(sure), axis=1)
         pairs = [(axis, int(signal)) for axis, signal in enumerate(best) if sure[axis, signal] > 0]
@@ -166,7 +172,7 @@ class Structure:
 
 
 def structure(pooled: Pooled, bins: int = BINS) -> Structure:
-    """Shares of every axis by every signal."""
+    """Explained share of every residual axis by every signal."""
     axes, signals = list(pooled.axes), [OFFSET, *pooled.drivers]
     share, sigma = np.full((2, len(axes), len(signals)), np.nan)
     for i, axis in enumerate(axes):
@@ -182,7 +188,14 @@ def structure(pooled: Pooled, bins: int = BINS) -> Structure:
 
 
 def where_it_shows(less: Pooled, more: Pooled, bins: int = BINS, count: int = 3) -> list[tuple[str, str]]:
-    """Residual axes in which two models differ most, with the signal the difference follows best."""
+    """Residual axes in which two models differ most, each with the signal that best explains the difference.
+
+    Args:
+        less: residuals of one model.
+        more: residuals of the other model in the same rows.
+        bins: number of bins of a signal.
+        count: maximum number of axes.
+    """
     sizes = {}
     for axis, after in more.axes.items():
         difference = less.axes[axis] - after
@@ -197,20 +210,21 @@ def where_it_shows(less: Pooled, more: Pooled, bins: int = BINS, count: int = 3)
         difference = less.axes[axis] - more.axes[axis]
         shares = {name: explained(difference, signal, less.block, bins)[0] for name, signal in less.drivers.items()}
         best = max(shares, key=shares.__getitem__)
-        # A constant follows nothing; over time it shows as well as over any other signal.
+        # If no signal explains the difference (a constant, for instance), show it over time.
         found.append((axis, best if shares[best] > 0.1 else "time"))
     return found
 
 
 def pool_predictions(evaluation: Evaluation, rows: list[Residuals], horizon: float = 0.2) -> Pooled:
-    """Prediction errors in the place of residuals: measured minus predicted, one row per window.
+    """Prediction errors as pooled residuals: measured minus predicted, one row per window.
 
-    Velocity in body axes of the window's start and body rate, against the mean of every signal over the window.
+    The axes are the velocity, in body axes at the window's start, and the body rate. The signals are averaged over the
+    window.
 
     Args:
         evaluation: of some flights.
         rows: `residual_rows` of the same flights, in the same order.
-        horizon: one of the evaluation's, s.
+        horizon: one of the evaluation's horizons, s.
     """
     index = evaluation.horizons.index(horizon)
     found, drivers, blocks, first = [], [], [], 0
@@ -233,7 +247,7 @@ def pool_predictions(evaluation: Evaluation, rows: list[Residuals], horizon: flo
 
 
 def _means(values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Means over [begin, end) of what is known there; NaN where nothing is."""
+    """Means of the finite values in rows [begin, end); NaN if there are none."""
     known = np.isfinite(values)
     total = np.concatenate([[0.0], np.cumsum(np.where(known, values, 0.0))])
     count = np.concatenate([[0], np.cumsum(known)])
@@ -242,15 +256,15 @@ def _means(values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray
 
 
 def noise_floor(evaluation: Evaluation, levels: Levels | None = None) -> dict[str, float]:
-    """Floor of the RMS errors, ``<quantity>_rmse_<unit>@<horizon>s``, over all windows of all logs.
+    """Lower bound of the RMS prediction errors, ``<quantity>_rmse_<unit>@<horizon>s``, over all windows of all logs.
 
-    White noise of each column is carried forward to first order: a wrong body rate turns
-    the attitude, a wrong attitude tilts the thrust, a wrong velocity moves the position. Commands between two rows and
-    what an estimator smoothed are not in it, so it is a lower bound.
+    White noise of each column is propagated to first order: an error of the body rate rotates the attitude, an error of
+    the attitude tilts the thrust, an error of the velocity moves the position. Commands between two rows and errors
+    that an estimator has smoothed are not included.
 
     Args:
-        evaluation: whose windows and horizons count.
-        levels: random forces and torques to carry along with the sensors' noise; None for the sensors alone.
+        evaluation: supplies windows and horizons.
+        levels: random forces and torques to propagate in addition to the sensors' noise; None: sensors only.
     """
     weights = np.array([len(log.windows) for log in evaluation.logs], dtype=float)
     squares = np.array([_squares(log, evaluation.horizons, levels) for log in evaluation.logs])
@@ -263,15 +277,15 @@ def noise_floor(evaluation: Evaluation, levels: Levels | None = None) -> dict[st
 
 
 def sensor_levels(log: FlightLog) -> dict[str, np.ndarray]:
-    """White noise of a row: position (3) m, velocity (3) m/s, angle () rad, gyro (3) rad/s."""
-    # Noise of three angles is twice that of the quaternion's vector part, and leaves its norm alone.
+    """White noise per row: position (3,) m, velocity (3,) m/s, attitude angle (), rad, gyro (3,) rad/s."""
+    # The noise of the three angles is twice that of the quaternion's vector part; the norm has no noise.
     angle = 2 * np.sqrt(np.sum(white_noise(log.quaternion, log.time) ** 2) / 3)
     columns = {"position": log.position, "velocity": log.velocity, "gyro": log.body_rate}
     return {key: white_noise(values, log.time) for key, values in columns.items()} | {"angle": angle}
 
 
 def _squares(evaluated: LogEvaluation, horizons: tuple[float, ...], levels: Levels | None) -> np.ndarray:
-    """(4, H) mean squared errors of one log, in the order of `QUANTITIES`."""
+    """Mean squared errors (4, H) of one log, in the order of `QUANTITIES`."""
     log, starts = evaluated.log, evaluated.windows.start
     if not len(starts):
         return np.zeros((4, len(horizons)))
@@ -280,7 +294,7 @@ def _squares(evaluated: LogEvaluation, horizons: tuple[float, ...], levels: Leve
     force = float(np.sqrt(np.mean(np.sum(log.specific_force**2, axis=1))))
     out = np.zeros((4, len(horizons)))
     for axis in range(3):
-        # An angle about x or y tilts the thrust sideways; one about z moves nothing.
+        # A rotation about x or y tilts the thrust sideways; one about z does not move the drone.
         turn = {0: 1, 1: 0, 2: 2}[axis]
         start = [pose * noise["position"][axis] ** 2, pose * noise["velocity"][axis] ** 2]
         start += [pose * noise["angle"] ** 2, gyro * noise["gyro"][turn] ** 2]
@@ -301,10 +315,19 @@ def _averaging(time: np.ndarray, at: np.ndarray) -> float:
 
 
 def _carried(start: np.ndarray, horizon: float, force: float, levels: Levels | None, axis: int, turn: int):
-    """(4,) variances of position, velocity, angle and rate along one axis after ``horizon`` seconds."""
+    """Variances (4,) of position, velocity, angle and rate along one axis after ``horizon`` seconds.
+
+    Args:
+        start: (4,) variances at the start.
+        horizon: s.
+        force: acceleration per angle, m/s^2.
+        levels: random forces and torques; None: none.
+        axis: of position and velocity.
+        turn: axis of angle and rate.
+    """
     from scipy.linalg import expm
 
-    # Position, velocity, angle, rate, and a wandering acceleration and angular acceleration.
+    # States: position, velocity, angle, rate, and correlated random acceleration and angular acceleration.
     slope = np.zeros((6, 6))
     slope[0, 1] = slope[2, 3] = slope[1, 4] = slope[3, 5] = 1.0
     slope[1, 2] = force

@@ -1,17 +1,19 @@
-"""All that a drone lacks at once: for real drones, on which no effect alone makes predictions better.
+"""Joint fit of all missing effects, for real drones, on which no single effect improves predictions.
 
-A search that takes in one effect after another asks of each whether half a second of flight is predicted better with
-it. Where ten effects are missing the answer is no ten times. Here every effect is judged where it acts, and only the
-whole set by predictions:
+A search that adds one effect after another asks of each effect whether half a second of flight is predicted better with
+it. If ten effects are missing, the answer is "no" for each of the ten. Therefore predictions judge the whole set:
 
-1. commands to rotor speeds: the motors on their own, from measured rotor speeds (`cfb_mjx.sysid.tracing.motors`);
-2. what a drone in one piece usually lacks (`PLANT`), all at once, by predictions;
-3. what only some drones have (a load, wind): absent effects in the order of what the innovations say for them, each
-   tried beside the rest, kept where predictions gain;
-4. what does not earn its place beside the others goes, the least first.
+1. Commands to rotor speeds: the motors are fitted on their own, from measured rotor speeds
+   (`cfb_mjx.sysid.tracing.motors`).
+2. The effects that an undamaged drone usually has beside the paper's model (`PLANT`) are fitted together, to
+   predictions.
+3. Effects that only some drones have (a load, wind) are tried beside the rest, in the order of their evidence in the
+   innovations, and kept if predictions improve.
+4. Effects that contribute too little beside the others are removed, the least important first.
 
-Effects the model declares already are what is known of the type of drone: they stay as they are, but for those that are
-a drone's own (`OWN`). Where the model says how far drones of the type differ (``spread``), they move within that.
+Effects that the model already declares belong to the type of drone. They stay as they are, except those that differ
+from drone to drone (`OWN`). If the model states how far drones of the type differ (``spread``), they may move within
+that range.
 """
 
 from __future__ import annotations
@@ -44,24 +46,27 @@ from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.trace import line_of
 
 OWN = ("cog_offset", "thrust_tilt", "torque_scale", "command_delay", "motor_asymmetry", "battery_sag")
-"""Of `PLANT`, what differs from one drone of a type to the next."""
+"""Effects of `PLANT` that differ between drones of the same type."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """One effect of the whole.
+    """One effect of the joint fit.
 
     Attributes:
         name: of the effect.
-        parameters: its numbers by field, and their standard deviations; NaN where one stands at a bound.
-        at_bound: names of numbers that do.
-        without: the drone without it, the others shifted to make up for it.
-        buys: by which share it lowers the mean error of the fit flights' predictions: attitude and velocity, at all
-            horizons, commands and rotor speeds in, each over what hold errs.
-        confusable: effects whose numbers make up for its own.
-        t, p_value: of the fit flights' errors with it against those without; of one that the rotor speeds tell, of
-            its number against nothing.
-        told: whether the rotor speeds tell it: then it need not make predictions better, only not worse.
+        parameters: values by field.
+        uncertainty: standard deviations by field; None if the parameter is at a bound.
+        at_bound: names of the parameters at a bound.
+        without: the drone without the effect, with the others adjusted to compensate.
+        buys: share by which the effect lowers the mean prediction error on the fit flights (attitude and velocity, at
+            all horizons, from commands and from measured rotor speeds, each divided by the error of `hold`).
+        confusable: names of effects with parameters strongly correlated with its own.
+        t: statistic of the comparison of the fit flights' errors with and without the effect; for an effect identified
+            from rotor speeds, of its evidence there.
+        p_value: one-sided p-value of ``t``.
+        told: whether rotor speeds identify the effect. It then need not improve predictions, but must not make them
+            worse.
     """
 
     name: str
@@ -81,12 +86,13 @@ class Together:
     """Outcome of `fit_together`.
 
     Attributes:
-        model: the drone with everything that stays.
-        fit: of its effects.
+        model: the drone with all effects that were kept.
+        fit: fit of its effects.
         motors: entries of the model file that the motors' fit replaces.
-        parts: its effects, what buys most first.
-        tried: what was looked at, as in a search.
-        evaluation: of its predictions of the fit flights.
+        parts: its effects, the largest improvement first.
+        tried: candidates of every round, as in a search.
+        evaluation: predictions of the fit flights.
+        typical: names of declared effects that were moved within the spread of the type; they are not parts.
     """
 
     model: Quadrotor
@@ -96,15 +102,14 @@ class Together:
     tried: list[dict]
     evaluation: Evaluation
     typical: frozenset[str] = frozenset()
-    """Declared effects that moved within the spread of the type: no parts."""
 
     @property
     def beside_hold(self) -> float:
-        """Of its predictions of the fit flights."""
+        """Prediction error on the fit flights relative to `hold` (`fits.beside_hold`)."""
         return beside_hold(self.evaluation)
 
     def without(self, names: Collection[str]) -> Quadrotor:
-        """The drone without some of its parts, the others moved to make up for them."""
+        """The drone without some of its parts, with the others adjusted to compensate."""
         fitted = set(_fitted(self.fit))
         model = _bare(self.fit, self.fit.without([name for name in names if name in fitted]).model)
         for name in set(names) - fitted:
@@ -118,13 +123,13 @@ def fit_together(
     search: Search,
     say: Callable[[str], None] = lambda _: None,
 ) -> Together:
-    """Fit all that a drone lacks at once.
+    """Fit all missing effects of a drone together.
 
     Args:
         logs: flights to fit, as recorded; run with x64 enabled.
         base: the declared model.
-        search: over the same flights, for what the innovations say; its rules count.
-        say: told what happens.
+        search: over the same flights, for the evidence in the innovations; supplies the rules.
+        say: called with a message at each step.
     """
     rules = search.rules
     motors = motors_of(logs, base, search, say)
@@ -139,7 +144,7 @@ def fit_together(
     tried: list[dict] = []
     refused: set[str] = {SHIFT, *(MOTORS if motors.known else ())}
     if "thrust_scale" in names:
-        # No flight tells more mass from less thrust.
+        # Flights cannot distinguish a larger mass from a smaller thrust.
         refused.add("payload")
     for _ in range(rules.rounds):
         ranking = ranked(search, found.model, refused)
@@ -155,7 +160,7 @@ def fit_together(
                 beside = [n.held_at_neutral if n.said_by(name) else n for n in found.numbers]
                 richer = fit(model, (*beside, *numbers), rules.trial_steps, found.trims)
                 reached = richer.cost[1]
-                # What drives another number out of what is plausible stands in for something else.
+                # A candidate that drives another parameter to its bound stands in for something else.
                 pressed = set(richer.pressed) - set(found.pressed)
                 better = richer if reached < (1 - rules.gain) * found.cost[1] and not pressed else None
             tried[-1] |= {"tried": name, "drop": {"loss": 1 - reached / found.cost[1]}}
@@ -166,8 +171,8 @@ def fit_together(
             break
         found = better
     if known:
-        # Last: free from the start, they would make up for what only this drone has.
-        say("moving what the type declares within its spread")
+        # Done last: if free from the start, they would absorb the effects that only this drone has.
+        say("fitting declared effects within the spread of the type")
         found = fit(found.model, (*found.numbers, *known), rules.trial_steps, found.trims)
     found = _lean(found, fit, rules, say, typical)
     found, motors = _motors_that_matter(found, motors, rules, say)
@@ -177,16 +182,24 @@ def fit_together(
 
 
 def names_to_fit(base: ModelFile, motors_told: bool) -> list[str]:
-    """Effects to fit together: what a model declares is known of the type, but for what is a drone's own."""
+    """Names of the effects to fit together.
+
+    Args:
+        base: the declared model. Effects it declares are not fitted, unless they differ between drones (`OWN`).
+        motors_told: leave out the effects that rotor speeds have identified.
+    """
     declared = {mapping["name"] for mapping in base.effects}
     told = MOTORS if motors_told else ()
     return [name for name in PLANT if name not in told and (name in OWN or name not in declared)]
 
 
 def of_type(base: ModelFile, spreads: float) -> tuple[Number, ...]:
-    """Numbers of declared effects that have a ``spread`` between drones, within so many of it about the declared value.
+    """Parameters of declared effects that may move within the spread between drones of the type.
 
-    How far the type's own value is unsure (``uncertainty``) counts too. A drone's own effects are free of it.
+    Args:
+        base: the declared model. Only effects with a ``spread`` count, and not those of `OWN`.
+        spreads: range about the declared value, in standard deviations. The deviation combines the ``spread`` and the
+            ``uncertainty`` of the type's value.
     """
     model = Quadrotor.from_file(base)
     items = {item["name"]: item for item in base.effects if item.get("spread") and item["name"] not in OWN}
@@ -194,7 +207,7 @@ def of_type(base: ModelFile, spreads: float) -> tuple[Number, ...]:
     def said(number: Number, what: str) -> float:
         value = (items[number.effect].get(what) or {}).get(number.field)
         each = np.nan_to_num(np.atleast_1d(np.asarray(0.0 if value is None else value, dtype=float)))
-        # One number stands for all components.
+        # A single value holds for all components.
         return float(each[(number.index or 0) % len(each)])
 
     found = []
@@ -207,7 +220,7 @@ def of_type(base: ModelFile, spreads: float) -> tuple[Number, ...]:
 
 
 def hypothesis_of(search: Search, model: Quadrotor, absent: Collection[str] = ()) -> Hypothesis:
-    """A model as a search has it: every effect of the catalogue, most of them neutral, as are those ``absent``."""
+    """Convert a model to a hypothesis of a search; effects named in ``absent`` become neutral."""
     neutral = neutral_effects(search.names)
     nothing = Hypothesis(neutral, origin=neutral)
     own = {type(e).name: e for e in model.effects if type(e).name not in absent}
@@ -217,7 +230,7 @@ def hypothesis_of(search: Search, model: Quadrotor, absent: Collection[str] = ()
 
 
 def ranked(search: Search, model: Quadrotor, refused: set[str]) -> list[tuple[Evidence, list[Column]]]:
-    """Absent effects by what the innovations say for each beside the others, the largest gain first."""
+    """Evidence in the innovations for each absent effect that is not ``refused``, the largest gain first."""
     search = replace(search, parameters=model.parameters, _flights={})
     hypothesis = search.learned(hypothesis_of(search, model))
     best = search.probes(hypothesis, search.whole(hypothesis))
@@ -225,22 +238,22 @@ def ranked(search: Search, model: Quadrotor, refused: set[str]) -> list[tuple[Ev
 
 
 ASKED_STEPS = 3
-"""Steps towards what the innovations ask for: one from far off goes too far for what divides (inertia)."""
+"""Number of Gauss-Newton steps in `asked`. A single long step overshoots for parameters that divide (inertia)."""
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What the innovations make of one number: accelerations from row to row, beside a disturbance that wanders.
+    """Value of one parameter according to the innovations, to compare with its fit to predictions.
 
-    Predictions fly on the commands alone, and under a controller these answer what the model does not feel: inertia and
-    damping come out too large. The innovations are free of that. Where both tell, and differ, a number stands in for
-    something.
+    Predictions use the commands only. Under feedback the commands respond to disturbances that the model lacks, which
+    biases inertia and damping upwards. One-step innovations do not have this bias. If both determine a parameter and
+    they differ, the parameter stands in for something else.
 
     Attributes:
-        name: of the number.
-        value: that they ask for.
+        name: of the parameter.
+        value: according to the innovations.
         std: its standard deviation.
-        contradicts: whether that is not what predictions ask for.
+        contradicts: whether it contradicts the fit to predictions (`Rules.contradicts`, `Rules.differs`).
     """
 
     name: str
@@ -250,7 +263,16 @@ class Asked:
 
 
 def asked(search: Search, model: Quadrotor, names: Collection[str]) -> dict[str, list[Asked]]:
-    """What the innovations ask of the strengths of some effects of a model, all together, by effect."""
+    """Fit the strengths of some effects of a model to the innovations, all together.
+
+    Args:
+        search: over the flights.
+        model: the drone, fitted to predictions.
+        names: of the effects.
+
+    Returns:
+        Values of the effects' strengths, by effect.
+    """
     search = replace(search, parameters=model.parameters, _flights={})
     hypothesis = search.learned(hypothesis_of(search, model))
     columns = [column for name in names for variant in strengths(name, names)[:1] for column in variant]
@@ -281,13 +303,13 @@ def asked(search: Search, model: Quadrotor, names: Collection[str]) -> dict[str,
 
 
 def paired(poorer: Evaluation, better: Evaluation) -> tuple[float, float]:
-    """How surely the second predicts the same flights better: t over blocks of windows, and its one-sided p."""
+    """Paired test of whether ``better`` predicts the same flights better: t over blocks of windows, one-sided p."""
     pairs = zip(poorer.logs, better.logs, strict=True)
     return _surely([_losses(less) - _losses(more) for less, more in pairs if len(less.windows)])
 
 
 def _surely(gains: Sequence[np.ndarray]) -> tuple[float, float]:
-    """t and p of gains (W,) of windows in the order they were flown, several flights or kinds of prediction."""
+    """t and one-sided p-value of gains (W,) per window in flown order, one array per flight or kind of prediction."""
     blocks = np.array([each[i : i + BLOCK].sum() for each in gains for i in range(0, len(each), BLOCK)])
     spread = np.sqrt(len(blocks) / max(len(blocks) - 1, 1) * np.sum((blocks - blocks.mean()) ** 2))
     t = float(blocks.sum() / max(spread, 1e-300))
@@ -295,7 +317,7 @@ def _surely(gains: Sequence[np.ndarray]) -> tuple[float, float]:
 
 
 def _losses(one: LogEvaluation) -> np.ndarray:
-    """(W,) of each window: errors of attitude and velocity at the last horizon over the flight's mean of hold."""
+    """Loss (W,) of each window: attitude and velocity error at the last horizon, over the flight's mean for `hold`."""
     errors, still = not_none(one.errors["commands_in"]), not_none(one.errors["hold"])
     parts = [errors[q][:, -1] / still[q][:, -1].mean() for q in ("attitude", "velocity")]
     return np.minimum(np.nan_to_num(np.sum(parts, axis=0), nan=1e3), 1e3)
@@ -322,9 +344,9 @@ def _fit(
 
 
 def _with(found: Refinement, variant: list[Column], evidence: Evidence) -> tuple[Quadrotor, tuple[Number, ...]]:
-    """The model with one more effect at a tenth of what the innovations give it, and the effect's numbers.
+    """The model with one more effect, at a tenth of its strength in the innovations, and the effect's parameters.
 
-    All of it at once might be far off, for what they see of an effect and what predictions ask of it may differ.
+    The full strength might be a poor starting point, because predictions may require another value.
     """
     kind = CATALOGUE[variant[0].effect]
     effect: Effect = kind.neutral()
@@ -343,9 +365,9 @@ def _lean(
     say: Callable[[str], None],
     typical: Collection[str] = (),
 ) -> Refinement:
-    """The fit with what does not earn its place held at neutral, the least first, fitted anew until all else does.
+    """Hold effects that contribute too little at neutral, the least important first, and refit, until none is left.
 
-    What is ``typical`` stays.
+    Effects in ``typical`` are kept.
     """
     while True:
         gone: list[str] = []
@@ -365,9 +387,10 @@ def _lean(
 def _motors_that_matter(
     found: Refinement, motors: Motors, rules: Rules, say: Callable[[str], None]
 ) -> tuple[Refinement, Motors]:
-    """The fit without effects of the motors that predictions do not miss, the least first.
+    """Remove effects of the motors that predictions do not need, the least important first.
 
-    Rotor speeds tell of an effect long before it matters. What goes is left in the fit's model, at neutral.
+    Rotor speeds can show an effect that is far too small to matter. Removed effects stay in the fit's model, at
+    neutral.
     """
     while motors.effects:
         losses = [found.loss(_neutral(found.model, told.name, told.without)) for told in motors.effects]
@@ -384,12 +407,12 @@ def _motors_that_matter(
 
 
 def _fitted(found: Refinement) -> list[str]:
-    """Names of the effects whose numbers may move."""
+    """Names of the effects with free parameters."""
     return list(dict.fromkeys(n.effect for n in found.numbers if not n.held))
 
 
 def _bare(found: Refinement, model: Quadrotor) -> Quadrotor:
-    """A model without the effects that a fit held at neutral, and those of motors that do nothing."""
+    """The model without effects that the fit held at neutral, and without neutral effects of the motors."""
     held = {n.effect for n in found.numbers} - set(_fitted(found))
     effects = tuple(e for e in model.effects if type(e).name not in held and not _idle(e))
     return Quadrotor(model.parameters, effects, body=model.body)
@@ -425,7 +448,7 @@ def _parts(
 
 
 def _neutral(model: Quadrotor, name: str, others: Sequence[Effect] = ()) -> Quadrotor:
-    """A model with an effect at neutral, and others as they are without it."""
+    """The model with an effect at neutral, and other effects replaced by ``others``."""
     instead = {each.name: each for each in (*others, CATALOGUE[name].neutral())}
     effects = (instead.get(each.name, each) for each in model.effects)
     return Quadrotor(model.parameters, tuple(effects), body=model.body)
@@ -440,5 +463,5 @@ def _idle(effect: Effect) -> bool:
 
 
 def _mean(errors: list[np.ndarray]) -> float:
-    """Over all windows, horizons and quantities."""
+    """Mean over all windows, horizons and quantities."""
     return float(np.concatenate([each.ravel() for each in errors]).mean())

@@ -1,4 +1,8 @@
-"""Tracing: from a campaign of flights to the effects a model lacks, each tested on data it was not fitted on."""
+"""Tracing: search the flights of a campaign for the effects that a model lacks.
+
+Effects are added one after another (or several at once if many are missing). Each must be significant in blocked
+cross-validation and must lower a prediction error. After each addition the earlier effects are tested again.
+"""
 
 from __future__ import annotations
 
@@ -24,60 +28,79 @@ from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
 
 @dataclass
 class Found:
-    """One effect that is there."""
+    """One effect that the search found.
+
+    Attributes:
+        name: of the effect.
+        p_value: from cross-validation on the fit flights.
+        gain: nats in cross-validation; None if predictions were compared instead.
+        buys: largest relative decrease that the effect brings to a prediction error of the fit flights.
+        parameters: values by field.
+        uncertainty: standard deviations by field.
+        confusable: names of effects that explain the flights nearly as well.
+        without: best model without this effect, for testing it on other flights.
+        lowers: sum over the prediction errors of the fit flights of the decrease in their logarithm. Effects are
+            sorted by it, because ``buys`` reflects a single error.
+    """
 
     name: str
     p_value: float
     gain: float | None
-    """Nats on blocks left out; None where predictions judged."""
     buys: float
-    """Largest share by which a prediction error of the fit flights grows without it."""
     parameters: dict[str, float | list[float]]
     uncertainty: dict[str, float | list[float]]
     confusable: list[str]
     without: Hypothesis
-    """The best model without this effect, for judging it on other flights."""
     lowers: float = 0.0
-    """Sum of the logarithms by which the prediction errors of the fit flights grow without it: the order goes by that,
-    for the largest share is that of one error."""
 
 
 @dataclass
 class Trace:
-    """Outcome of a search."""
+    """Outcome of a search.
+
+    Attributes:
+        hypothesis: the corrected model.
+        sensors: result of the comparison of the sensors.
+        found: effects, the most helpful first.
+        tried: candidates of every round, for the report.
+        search: the search on the fit flights.
+        declared_errors: (8,) `prediction_errors` of the declared model.
+        errors: (8,) `prediction_errors` of the hypothesis.
+        fit: fit of the hypothesis, with its linearisation by the whole catalogue.
+    """
 
     hypothesis: Hypothesis
     sensors: SensorCheck
     found: list[Found]
     tried: list[dict]
-    """What was looked at in every round, for the report."""
     search: Search
     declared_errors: np.ndarray
-    """`prediction_errors` of the declared model."""
     errors: np.ndarray
-    """Of the hypothesis."""
     fit: Fit
-    """Of the hypothesis, with derivatives by the whole catalogue."""
 
     @property
     def faults(self) -> SensorFaults:
-        """Everything wrong with the recording."""
+        """All faults of the recording, the time shift of the motor columns included."""
         return replace(self.sensors.faults, motor_shift=self.hypothesis.shift)
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A fit without one of its effects, fitted anew."""
+    """A hypothesis refitted without one of its effects.
+
+    Attributes:
+        fit: the refitted hypothesis.
+        ranking: evidence for every absent effect, the one left out included.
+        own: evidence for the effect left out; None if its fitted sign is meaningless.
+    """
 
     fit: Fit
     ranking: list[tuple[Evidence, list[Column]]]
-    """Of everything that could come in its place."""
     own: Evidence | None
-    """For the effect itself; None if its best value makes no sense."""
 
 
 def leave_out(search: Search, hypothesis: Hypothesis, name: str, start: Hypothesis | None = None) -> LeftOut:
-    """Fit without an effect and see what would come in its place; the fit may ``start`` nearer to where it ends."""
+    """Refit without an effect and rank all absent effects; ``start`` is an initial guess without the effect."""
     less = fitted(search, start or hypothesis.without(name))
     ranking = rank(search, less, set())
     return LeftOut(less, ranking, next((e for e, v in ranking if v[0].effect == name), None))
@@ -93,18 +116,18 @@ def trace(
     brief: bool = False,
     rules: Rules = RULES,
 ) -> Trace:
-    """Search the catalogue for what a model lacks.
+    """Search the catalogue for the effects that a model lacks.
 
     Args:
         logs: flights to fit; run with x64 enabled.
         parameters: the declared drone.
         delay: declared age of pose and velocity in a row, s.
-        progress: told what happens.
-        declared: effects the declared model has already.
-        checkpoint: where the search is kept while it runs, and taken up from.
-        brief: leave a drone that lacks much to the caller: the first candidate that lowers no error ends the search
-            while the model predicts worse than `hold` does.
-        rules: what counts.
+        progress: called with a message at each step.
+        declared: effects that the declared model already has.
+        checkpoint: where the state is saved while the search runs, and from which an interrupted search continues.
+        brief: leave a drone that lacks many effects to the caller: while the model predicts worse than `hold`, the
+            search ends after the first round without an accepted candidate.
+        rules: thresholds.
     """
     checkpoint = checkpoint or Checkpoint()
     progress("comparing the sensors with each other")
@@ -114,13 +137,13 @@ def trace(
     nothing = fitted(search, search.learned(search.nothing()))
     saved = checkpoint.restore(nothing.hypothesis)
     fit, refused, tried, vain = nothing, set(), [], 0
-    # Without which effects was a model fitted (None: it can be again), and which.
+    # Fits without one effect each, of the model `judged`; None after a restart, they are then computed again.
     left_out: Mapping[str, LeftOut | None] = {}
     judged = nothing.hypothesis
-    # Of many taken in together: near to where a fit without one of them ends.
+    # If many effects were added together: initial guesses for the fits without one of them.
     starts: dict[str, Hypothesis] = {}
     if saved is not None:
-        progress(f"going on with {', '.join(saved.hypothesis.present) or 'no effect'} found before the interruption")
+        progress(f"continuing the interrupted search with {', '.join(saved.hypothesis.present) or 'no effect'} found")
         fit = as_it_is(search, saved.hypothesis)
         judged = fit.hypothesis if saved.judged is None else saved.judged
         refused, tried, vain, left_out = (
@@ -146,14 +169,14 @@ def trace(
         options, stretched = contenders(search, fit, passing, progress)
         refused |= stretched
         statistic = {v[0].effect: e.t for e, v in passing}
-        # The likeliest first. It may be too slight beside a large error of which another contender is the cause.
+        # Most promising first. It may be immaterial as long as another contender's larger error is not removed.
         for name, richer in options:
             drop = dict(zip(ERRORS, (1 - richer.errors / fit.errors).tolist(), strict=True))
             tried[-1] |= {"tried": name, "drop": drop}
             fit, seen = taken_in(search, nothing, fit, name, richer, statistic[name] >= rules.clear, progress)
             if seen is not None:
                 fit, vain = completed(search, fit), 0
-                # What was too slight beside a large error may matter now.
+                # Effects that were immaterial beside a larger error may be material now.
                 refused = set()
                 left_out, judged = seen, fit.hypothesis
                 break
@@ -177,9 +200,10 @@ def trace(
 
 
 def lacks_many(search: Search, fit: Fit, progress: Callable[[str], None]) -> Fit | None:
-    """All that a drone lacks, where that is much beside what was found; None where it is not, or predicts no better.
+    """Fit many missing effects together, if many more are clearly significant beside those found.
 
-    It begins with the declared model again, for what was taken in first has taken on what others explain.
+    The fit starts from the declared model again, because the effects added first have absorbed part of what others
+    explain. The result is None if few more are significant, or if the joint fit does not predict better.
     """
     standing = beside_each_other(search, fit.hypothesis, not_none(fit.linear))
     if sum(each.found.t > search.rules.clear for each in standing) < search.rules.many:
@@ -191,13 +215,13 @@ def lacks_many(search: Search, fit: Fit, progress: Callable[[str], None]) -> Fit
 
 
 def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, list[Column]]]:
-    """Every absent effect at its best probe, the largest gain first."""
+    """Evidence for every absent effect that is not ``refused``, at its best probe, the largest gain first."""
     best = search.probes(fit.hypothesis, not_none(fit.linear))
     return sorted((pair for name, pair in best.items() if name not in refused), key=lambda pair: -pair[0].gain)
 
 
 def needed(search: Search, less: LeftOut, fit: Fit, nothing: Fit) -> bool:
-    """Whether a fit without one of its effects shows that the effect is missed."""
+    """Whether an effect is needed: it is significant beside the others and lowers an error materially."""
     if less.own is None or not search.stands(less.own):
         return False
     return search.rules.lowers(less.fit, fit, nothing, less.own.t >= search.rules.clear)
@@ -212,23 +236,24 @@ def taken_in(
     clear: bool,
     progress: Callable[[str], None],
 ) -> tuple[Fit, dict[str, LeftOut] | None]:
-    """Take an effect in if it is worth it, and look at the others again.
+    """Add an effect if it passes the rules, and test the earlier effects again.
 
     Args:
         search: over the fit flights.
-        nothing: the declared model.
-        fit: without the effect.
-        name: the effect.
-        richer: with it.
-        clear: whether its t is above `Rules.clear`.
-        progress: told what happens.
+        nothing: fit of the declared model.
+        fit: fit without the effect.
+        name: of the effect.
+        richer: fit with the effect.
+        clear: whether the effect's t is above `Rules.clear`.
+        progress: called with a message at each step.
 
     Returns:
-        The fit, and what is left of it without each effect looked at; None for that where the effect does not stay.
+        The resulting fit, and the refits without one effect each that were made of it by name; None in place of these
+        if the effect is not kept.
     """
     if not search.rules.worth_it(name, fit, richer, nothing, clear):
         return fit, None
-    # Taken out again, for the newcomer's turn has also fitted the others anew, and that is not its merit.
+    # Remove it again and refit: refitting the other effects has improved the fit too, which is not the effect's merit.
     less = leave_out(search, richer.hypothesis, name)
     if not needed(search, less, richer, nothing):
         return less.fit, None
@@ -241,23 +266,23 @@ def taken_in(
 def re_examined(
     search: Search, nothing: Fit, poorer: Fit, richer: Fit, progress: Callable[[str], None]
 ) -> tuple[Fit, dict[str, LeftOut]]:
-    """Drop what the others explain as well by now, and swap what another effect explains better.
+    """Remove effects that are no longer needed, and replace effects that another effect explains better.
 
     Args:
         search: over the fit flights.
-        nothing: the declared model.
-        poorer: without the newest effect.
-        richer: with it.
-        progress: told what happens.
+        nothing: fit of the declared model.
+        poorer: fit without the newest effect.
+        richer: fit with the newest effect.
+        progress: called with a message at each step.
 
     Returns:
-        The fit, and what is left of it without each effect looked at since it last changed; ``poorer`` itself if the
-        newest effect and an older one explain the same, and the older one predicts better.
+        The resulting fit, and the refits without one effect each since its last change, by name. The fit is ``poorer``
+        itself if the newest effect and an older one explain the same and the older one predicts better.
     """
     fit = richer
     seen: dict[str, LeftOut] = {}
     for name in fit.hypothesis.present[:-1]:
-        progress(f"looking at {name} again")
+        progress(f"testing {name} again")
         less = leave_out(search, fit.hypothesis, name)
         if not needed(search, less, fit, nothing):
             if fit is richer and np.log(poorer.errors / less.fit.errors).sum() < 0:
@@ -276,14 +301,17 @@ def re_examined(
 def simplified(
     search: Search, nothing: Fit, fit: Fit, ranking: list[dict], progress: Callable[[str], None]
 ) -> Fit | None:
-    """One effect in place of several, where it does as well: the first steps of a search may have split it up.
+    """Find one effect that replaces all effects found, in case the search has split a single cause into several.
 
     Args:
         search: over the fit flights.
-        nothing: the declared model.
-        fit: what the search came to.
-        ranking: of the first round.
-        progress: told what happens.
+        nothing: fit of the declared model.
+        fit: result of the search.
+        ranking: candidates of the first round.
+        progress: called with a message at each step.
+
+    Returns:
+        Fit of the single effect if no error grows by more than `Rules.as_good`; None if there is no such effect.
     """
     candidates = search.probes(nothing.hypothesis, not_none(nothing.linear))
     rivals = [item["name"] for item in ranking if item["name"] not in fit.hypothesis.present][: search.rules.rivals]
@@ -299,13 +327,13 @@ def simplified(
 
 
 def deviations(search: Search, hypothesis: Hypothesis, linear: Linear) -> dict[Column, float]:
-    """Standard deviation of every number of the effects that are there, fitted together with the lead."""
+    """Standard deviation of every parameter of the present effects, which are fitted together with the lead."""
     columns, spread = spread_of(search, hypothesis, linear)
     return dict(zip(columns, np.sqrt(np.diag(spread)).tolist(), strict=True))
 
 
 def spread_of(search: Search, hypothesis: Hypothesis, linear: Linear) -> tuple[list[Column], np.ndarray]:
-    """The numbers of the effects that are there and their covariance (n, n), fitted together with the lead."""
+    """Columns of the present effects and the covariance (n, n) of their values, fitted together with the lead."""
     columns = search.own_columns(hypothesis)
     index = [1, *linear.index(columns)]
     values = solve(linear.blocks.sum(0), index, linear.scale)
@@ -316,7 +344,7 @@ def spread_of(search: Search, hypothesis: Hypothesis, linear: Linear) -> tuple[l
 
 
 def numbers_of(hypothesis: Hypothesis, stds: Mapping[Column, float], name: str) -> tuple[dict, dict]:
-    """Values and standard deviations of one effect, by field; ``stds`` are of all numbers (`deviations`)."""
+    """Values and standard deviations of one effect, by field; ``stds`` are those of all parameters (`deviations`)."""
     parameters: dict[str, float | list[float]] = {}
     uncertainty: dict[str, float | list[float]] = {}
     several: dict[str, list[float]] = {}
@@ -334,14 +362,14 @@ def numbers_of(hypothesis: Hypothesis, stds: Mapping[Column, float], name: str) 
 
 
 def summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
-    """What is reported of an effect, from a fit and what is left of it without the effect."""
+    """What is reported of an effect, from a fit and the refit without the effect."""
     stds = deviations(search, fit.hypothesis, not_none(fit.linear))
     parameters, uncertainty = numbers_of(fit.hypothesis, stds, name)
     gain, p_value = (less.own.gain, less.own.p_value) if less.own else (0.0, 1.0)
     close = 1 - search.rules.close
     rivals = {v[0].effect: e.gain for e, v in less.ranking if v[0].effect != name and e.gain > close * gain}
     if rivals:
-        # Slopes at neutral understate an effect whose shape was fitted; what it explains as it is counts.
+        # The linearisation at neutral understates an effect whose shape was fitted, so use the gain of the fit itself.
         explained = max(gain, not_none(confirm(search, less.fit.hypothesis, fit.hypothesis).gain))
         rivals = {rival: its for rival, its in rivals.items() if its > close * explained}
     buys = float(np.max(1 - fit.errors / less.fit.errors))
@@ -350,22 +378,21 @@ def summary(search: Search, fit: Fit, name: str, less: LeftOut) -> Found:
 
 
 def line_of(variant: list[Column], found: Evidence) -> dict:
-    """A candidate as reports list it."""
+    """A candidate as listed in reports."""
     return {"name": variant[0].effect, "gain": found.gain, "t": found.t, "p_value": found.p_value}
 
 
 def contenders(
     search: Search, fit: Fit, ranking: list[tuple[Evidence, list[Column]]], progress: Callable[[str], None]
 ) -> tuple[list[tuple[str, Fit]], set[str]]:
-    """The candidates that explain the flights best, fitted beside what is there.
+    """Fit the best candidates beside the present effects, and order them.
 
-    The ranking rests on slopes at neutral, which say little of effects whose shape is still to be fitted: those that
-    come near the best there are fitted too. Of those that gain nearly the same, the ones that predict best come first,
-    and of those the one with the fewest numbers.
+    The ranking uses linearisations at neutral values, which say little about effects whose shape is still to be
+    fitted. Therefore several of the best candidates are fitted. Among those with nearly the same gain, the ones that
+    predict best come first, and among these the one with the fewest parameters.
 
     Returns:
-        Their names and the fits with them, in the order to try them, and the names of those that would have to be
-        implausibly strong.
+        Names and fits of the plausible candidates in the order to try them, and the names of the implausible ones.
     """
     fits, rules = {}, search.rules
     for found, variant in ranking[: rules.contenders]:
@@ -388,7 +415,7 @@ def contenders(
     most = max(gains[name] for name in plausible)
     rivals = [name for name in plausible if _near(gains[name], most, rules.close)]
     if len(rivals) > 1:
-        # Innovations hardly tell a lag from a delay beside the unknown age of commands; half a second of flight does.
+        # With the age of commands unknown, innovations hardly separate a lag from a delay; half-second predictions do.
         errors = {name: _without_lead(search, fits[name].hypothesis) for name in rivals}
         rivals = [name for name in rivals if errors[name] <= min(errors.values()) + rules.same_errors]
     most = max(gains[name] for name in rivals)
@@ -396,23 +423,23 @@ def contenders(
     first = min(close, key=numbers.__getitem__)
     delayed = "command_delay"
     if first == SHIFT and fits[first].hypothesis.shift < 0 and delayed in plausible:
-        # Commands logged early and commands that act late look the same unless rotor speeds were logged: the
-        # physical cause comes first, and the report names both.
+        # Without logged rotor speeds, commands logged early and commands that act late are indistinguishable. Try the
+        # physical cause first; the report names both.
         first = delayed if gains[delayed] > (1 - rules.close) * gains[first] else first
     order = sorted(plausible, key=lambda name: (name != first, -gains[name]))
     return [(name, fits[name]) for name in order], stretched
 
 
 def _near(gain: float, most: float, share: float) -> bool:
-    """Whether a gain is the largest but for a share; all may be negative, where fits do not converge."""
+    """Whether a gain falls short of the largest by at most a share; gains may be negative if fits do not converge."""
     return gain >= most - share * abs(most)
 
 
 def _without_lead(search: Search, hypothesis: Hypothesis) -> float:
-    """Mean logarithm of the prediction errors, commands held until the next row in the fit as in predictions.
+    """Mean logarithm of the prediction errors after a refit without a command lead; infinite if predictions diverge.
 
-    A delay is longer by what a lead takes back, and a lag that wants no lead would seem to predict better.
-    Infinite where predictions diverge.
+    Predictions hold a command until the next row. A delay fitted with a lead is longer by that lead, so a lag, which
+    needs none, would seem to predict better.
     """
     held = search.settled(replace(hypothesis, lead=0.0), lead_free=False)
     found = float(np.log(prediction_errors(search, held)).mean())
@@ -420,12 +447,12 @@ def _without_lead(search: Search, hypothesis: Hypothesis) -> float:
 
 
 def with_rare(found: Trace, held_out: Search, progress: Callable[[str], None] = lambda _: None) -> Trace:
-    """What was found, and rarely excited effects that held-out flights bear out.
+    """Add rarely excited effects that the held-out flights confirm.
 
     Args:
-        found: what the search came to.
-        held_out: over flights nothing is fitted to.
-        progress: told what happens.
+        found: result of the search.
+        held_out: search over the held-out flights; nothing is fitted to them.
+        progress: called with a message at each step.
     """
     search, fit, rules = found.search, found.fit, found.search.rules
     before, tried, buys = fit.hypothesis, set(), {}
@@ -456,7 +483,7 @@ def with_rare(found: Trace, held_out: Search, progress: Callable[[str], None] = 
 
 
 def _share(held_out: Search, fit: Fit, richer: Fit, name: str) -> float | None:
-    """Largest share by which an effect lowers an error of the held-out flights; None where it does not stand there."""
+    """Largest relative decrease of a held-out error by an effect; None if the held-out flights do not confirm it."""
     if not np.isfinite(richer.errors).all() or held_out.rules.stretched(richer.hypothesis, name):
         return None
     if confirm(held_out, fit.hypothesis, richer.hypothesis).t < held_out.rules.rare_sure:
