@@ -1,4 +1,4 @@
-"""How fast are the fits? The library, and SciPy with finite differences, on a minute of flight in one run.
+"""Measure the speed of the fits, and of SciPy with finite differences, on a minute of flight.
 
     python benchmarks/fit_speed.py [-o docs/fit-speed.md]
 
@@ -37,7 +37,7 @@ from cfb_mjx.sysid.identification.shooting import shoot  # noqa: E402
 NOMINAL = load_model_file("cfb-guards").parameters()
 NAMES = ("inertia_xx", "inertia_yy", "inertia_zz", "rotor_inertia", "cog_x", "cog_y")
 TOLERANCE = 1e-8
-"""SciPy's default."""
+"""Tolerance of all optimisers: SciPy's default."""
 OPTIMISTIX = {
     "LevenbergMarquardt": optx.LevenbergMarquardt(rtol=TOLERANCE, atol=TOLERANCE),
     "Dogleg": optx.Dogleg(rtol=TOLERANCE, atol=TOLERANCE),
@@ -72,7 +72,7 @@ def main() -> None:
 
 
 def flights():
-    """One drone off the preset, five flights with an unmodelled torque."""
+    """Simulate five flights, with an unmodelled torque, of a drone that differs from the preset."""
     plant = Plant(
         mass=np.full(FLIGHTS, 0.044),
         inertia=np.tile([3.0e-5, 3.9e-5, 6.2e-5], (FLIGHTS, 1)),
@@ -84,7 +84,7 @@ def flights():
 
 
 def timings(call) -> dict:
-    """First call (with compilation) and the best of the following, s, with what the fit found."""
+    """Return the time of the first call (with compilation), the best of the next ones, and the estimates."""
     _, first = timed(call)
     later = []
     for _ in range(REPEATS):
@@ -98,7 +98,7 @@ def timings(call) -> dict:
 
 
 def compare_optimisers(problem) -> dict:
-    """The library's optimiser and SciPy on one compiled residual, each alone."""
+    """Time the library's optimiser, optimistix and SciPy on the same compiled residual."""
     problem.solve()
     solved = [timed(problem.solve) for _ in range(REPEATS)]
     start = np.asarray(problem.unknowns.start)
@@ -131,12 +131,12 @@ def compare_optimisers(problem) -> dict:
 
 
 def values(problem, vector) -> dict[str, float]:
-    """By name, SI."""
+    """Return the values of the unknowns by name, SI units."""
     return dict(zip(problem.unknowns.names, np.asarray(problem.unknowns.values(vector)).tolist(), strict=True))
 
 
 def innovation(logs) -> dict:
-    """The default fit."""
+    """Measure the default fit."""
     found = []
 
     def call():
@@ -148,14 +148,14 @@ def innovation(logs) -> dict:
 
 
 def shooting(logs) -> dict:
-    """Multiple shooting from measured starts, driven by commands: the residual a user can write in NumPy in an hour."""
+    """Measure multiple shooting from measured starts, driven by commands, which is easy to write in NumPy as well."""
     whole = timings(lambda: shoot(logs, NOMINAL, NAMES, use_measured=False, free_start=False))
     problem = of_shooting(logs, NOMINAL, NAMES, use_measured=False)
     both = whole | compare_optimisers(problem)
     own = OwnResidual(logs)
     start = np.asarray(problem.unknowns.start)
     ours = problem.residual(start)
-    # The library pads its batch with windows that count nothing; the rest must be the same numbers.
+    # The library pads its batch with windows of weight zero; the other residuals must be equal.
     theirs = own(physical(start))
     both["numpy_agrees"] = float(np.max(np.abs(ours[: len(theirs)] - theirs)))
     numpy = by_scipy(lambda x: own(physical(x)), start)
@@ -174,14 +174,14 @@ def shooting(logs) -> dict:
 
 
 def physical(vector: np.ndarray) -> np.ndarray:
-    """SI values of the optimiser's vector: the inertia through its second moments, offsets in cm."""
+    """Return SI values of the optimiser's vector, which has the inertia as second moments and offsets in cm."""
     inertia = np.array([3.3e-5, 3.6e-5, 5.9e-5])
     moments = (0.5 * inertia.sum() - inertia) * np.exp(vector[:3])
     return np.concatenate([moments.sum() - moments, [5e-8 * np.exp(vector[3])], 0.01 * vector[4:]])
 
 
 class OwnResidual:
-    """What someone without the library writes: all windows at once in NumPy, RK4 at 4 ms."""
+    """The residual as a user without the library would write it: all windows at once in NumPy, RK4 at 4 ms."""
 
     def __init__(self, logs):
         windows = []
@@ -219,7 +219,7 @@ class OwnResidual:
         return self._errors(values, np.stack(path, axis=1)).ravel()
 
     def by_solve_ivp(self, values: np.ndarray, windows: int) -> np.ndarray:
-        """The first windows, one `solve_ivp` each."""
+        """Predict the first windows, with one `solve_ivp` each."""
         initial, path = self._initial(values), []
         for i in range(windows):
 
@@ -227,7 +227,7 @@ class OwnResidual:
                 return self.rate(values, x[None], self.command[i, min(int(t / ROW + 1e-9), 49)][None])[0]
 
             times = np.arange(5, 51, 5) * ROW
-            # Steps no longer than a row, or the solver would step over changes of the command.
+            # Steps of at most one row, so that the solver does not skip changes of the command.
             path.append(solve_ivp(rate, (0, 0.2), initial[i], t_eval=times, max_step=ROW, rtol=1e-6, atol=1e-8).y.T)
         return np.array(path)
 
@@ -244,7 +244,7 @@ class OwnResidual:
         return x
 
     def rate(self, values, x, u):
-        """Of the state of the centre of gravity; the plant's equations and the moment of the offset thrust."""
+        """Derivative of the state of the centre of gravity, with the moment of the offset thrust."""
         count = len(x)
         plant = Plant(
             np.full(count, 0.044),
@@ -281,7 +281,7 @@ def _matrix(q):
 
 
 def page(results: dict) -> str:
-    """The Markdown page."""
+    """Return the page as Markdown."""
     env, a, b = results["environment"], results["innovation"], results["shooting"]
     packages = ", ".join(f"{name} {env[name]}" for name in ("cfb_mjx", "jax", "numpy", "scipy"))
     load = f"{results['load_average_before']:.1f} before and {results['load_average_after']:.1f} after"
@@ -381,7 +381,7 @@ def page(results: dict) -> str:
 
 
 def verdict(a: dict, b: dict, free: dict) -> list[str]:
-    """The targets, as measured."""
+    """Compare the measurements with the targets."""
     slowest = max(x["compiled_s"] for x in (a, b, free))
 
     def said(seconds, base):

@@ -1,7 +1,7 @@
-"""The residuals the library minimises, as functions other optimisers can call.
+"""The residuals that the library minimises, as functions for other optimisers.
 
-The only place outside the library that reaches into `cfb_mjx.sysid`'s private functions: a comparison of optimisers on
-*the same* residual cannot do without. Each function returns a `Problem`.
+This is the only module outside the library that uses private functions of `cfb_mjx.sysid`: a comparison of optimisers
+on the same residual needs them.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class Problem:
 
     unknowns: Unknowns
     residual: Callable[[np.ndarray], np.ndarray]
-    """Compiled: the optimiser's vector to all residuals, flat NumPy."""
+    """Compiled function from the optimiser's vector to all residuals, a flat NumPy array."""
     solve: Callable[..., np.ndarray]
-    """A solver of optimistix (none: the library's own) on this residual, compiled, from the start."""
+    """Minimise this residual from the start with a solver of optimistix (none: the library's own), compiled."""
 
 
 def of_shooting(logs: list[FlightLog], nominal: Parameters, names, use_measured: bool = True) -> Problem:
-    """Multiple shooting from the measured starts, whose weights are constant."""
+    """Return the problem of multiple shooting from measured starts, with constant weights."""
     unknowns, body = choose(names, nominal), RigidBody()
     data = shooting_data.batches(logs, None, float(nominal.pose_delay), use_measured)
     whiten = shooting._whitening(unknowns, unknowns.start, data, body, False)
@@ -54,7 +54,7 @@ def of_shooting(logs: list[FlightLog], nominal: Parameters, names, use_measured:
 
 
 def of_innovations(logs: list[FlightLog], found: fitting.Fit, nominal: Parameters) -> Problem:
-    """Whitened innovations with the noise levels of a finished fit held fixed."""
+    """Return the problem of whitened innovations, with the noise levels of a finished fit."""
     unknowns = choose(found.names, nominal)
     segments = jax.tree.map(jnp.asarray, flight_data.prepare(list(logs)).segments)
 
@@ -72,7 +72,7 @@ def of_innovations(logs: list[FlightLog], found: fitting.Fit, nominal: Parameter
 
 
 def by_scipy(residual: Callable[[np.ndarray], np.ndarray], start: np.ndarray) -> dict:
-    """`scipy.optimize.least_squares` with its defaults: 2-point differences, trust region, tolerances 1e-8."""
+    """Minimise with the defaults of `scipy.optimize.least_squares` (2-point differences, trust region, 1e-8)."""
     calls = [0]
 
     def counted(x):
@@ -86,7 +86,7 @@ def by_scipy(residual: Callable[[np.ndarray], np.ndarray], start: np.ndarray) ->
 
 
 def timed(function: Callable[[], object]) -> tuple[object, float]:
-    """What it returned, and how long it took, s."""
+    """Call ``function``; return its result and the time, s."""
     begin = time.perf_counter()
     result = function()
     return result, time.perf_counter() - begin

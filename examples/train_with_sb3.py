@@ -3,7 +3,8 @@
     pip install '.[gymnasium]' stable-baselines3
     python examples/train_with_sb3.py [--commands 2000000] [--drones 256] [--seed 0] [--write FILE.json]
 
-Stable-Baselines3 has vector environments of an interface of its own, older than Gymnasium's: `Drones` is the adapter.
+Stable-Baselines3 has its own interface of vector environments, which is older than Gymnasium's. `Drones` is the
+adapter.
 """
 
 from __future__ import annotations
@@ -24,24 +25,24 @@ from cfb_mjx.runtime import environment
 
 
 class Drones(VecEnv):
-    """A `TargetVectorEnv` for Stable-Baselines3."""
+    """Adapter from `TargetVectorEnv` to the `VecEnv` of Stable-Baselines3."""
 
     def __init__(self, many: TargetVectorEnv):
         self.many, self.actions = many, None
         super().__init__(many.num_envs, many.single_observation_space, many.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Begin all episodes, with the seed that `seed` has left."""
+        """Start all episodes, with the seed that `seed` has set."""
         seed = self._seeds[0]
         self._reset_seeds()
         return self.many.reset(seed=seed)[0]
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions for `step_wait`."""
+        """Store the actions for `step_wait`."""
         self.actions = actions
 
     def step_wait(self):
-        """Fly them."""
+        """Simulate one control step with the stored actions."""
         seen, reward, failed, timed_out, info = self.many.step(self.actions)
         infos = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(failed | timed_out):
@@ -53,24 +54,24 @@ class Drones(VecEnv):
         self.many.close()
 
     def get_attr(self, attr_name, indices=None) -> list:
-        """The same for all drones."""
+        """Return an attribute, which is the same for all drones."""
         return [getattr(self.many, attr_name, None)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name, value, indices=None) -> None:
-        """No drone has attributes of its own."""
+        """Not supported: the drones have no separate attributes."""
         raise NotImplementedError
 
     def env_method(self, method_name, *args, indices=None, **kwargs) -> list:
-        """No drone has methods of its own."""
+        """Not supported: the drones have no separate methods."""
         raise NotImplementedError
 
     def env_is_wrapped(self, wrapper_class, indices=None) -> list[bool]:
-        """No."""
+        """Return False: no drone is wrapped."""
         return [False] * len(list(self._get_indices(indices)))
 
 
 def hover_error_m(model: PPO, seconds: float = 6.0) -> np.ndarray:
-    """Mean distance to the target after the first second, of 64 drones that begin within 0.7 m of it."""
+    """Mean distance to the target after the first second, for 64 drones that start within 0.7 m of it."""
     task = TargetTask(starts=Starts(near=1.0), episode_s=seconds)
     many = TargetVectorEnv(64, task)
     seen, _ = many.reset(seed=1)
@@ -83,15 +84,15 @@ def hover_error_m(model: PPO, seconds: float = 6.0) -> np.ndarray:
 
 
 def main() -> None:
-    """Train and measure."""
+    """Train the policy and measure its hover error."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--commands", type=int, default=2_000_000, help="flown in all")
-    parser.add_argument("--drones", type=int, default=256, help="flown side by side")
+    parser.add_argument("--commands", type=int, default=2_000_000, help="total number of commands")
+    parser.add_argument("--drones", type=int, default=256, help="number of drones simulated in parallel")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--write", type=Path, metavar="FILE.json", help="keep time and hover error")
+    parser.add_argument("--write", type=Path, metavar="FILE.json", help="write time and hover error to this file")
     arguments = parser.parse_args()
-    # Rewards are divided by their spread: the usual price of a failure, 300, would leave little of all the others. Most
-    # episodes begin near the target: not to fall is learnt first otherwise, for millions of commands.
+    # Rewards are divided by their standard deviation; with the usual penalty of a failure, 300, others would vanish.
+    # Most episodes start near the target; otherwise the policy learns only not to fall for millions of commands.
     task = TargetTask(reward=TargetReward(failure=30.0), starts=Starts(near=0.8))
     many = TargetVectorEnv(arguments.drones, task)
     drones = VecNormalize(VecMonitor(Drones(many)), norm_obs=False, gamma=0.995)

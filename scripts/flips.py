@@ -38,27 +38,40 @@ class Wanted:
 
 # About 1000 deg/s is 17.5 rad/s; the drone overshoots the commanded rate by a tenth.
 FLIPS = {
-    "flip": Wanted(1, "margin", "One turn, for the most drones.", {"rate_radps": 17.0}, magnitude=1.2),
-    "double-flip": Wanted(2, "margin", "Two turns, for the most drones.", {"rate_radps": 17.1}),
+    "flip": Wanted(
+        1,
+        "margin",
+        "One turn, completed by as many randomised drones as possible.",
+        {"rate_radps": 17.0},
+        magnitude=1.2,
+    ),
+    "double-flip": Wanted(
+        2, "margin", "Two turns, completed by as many randomised drones as possible.", {"rate_radps": 17.1}
+    ),
     "double-flip-ppo": Wanted(
-        2, "within", "Two turns within 1.8 m, for the most drones, with both policies trained by PPO.", holder="target"
+        2,
+        "within",
+        "Two turns within 1.8 m for as many randomised drones as possible, with policies trained by PPO.",
+        holder="target",
     ),
     "double-flip-paper": Wanted(
         2,
         "margin",
-        "Two turns as the paper flew them: 1000 deg/s, and 3.5 m/s to be stopped.",
+        "Two turns as in the paper: 1000 deg/s, and a fall of 3.5 m/s to stop.",
         {"rate_radps": 15.7},
         {"fall_mps": 3.5},
     ),
-    "double-flip-low": Wanted(2, "height", "Two turns within the least height."),
-    "triple-flip": Wanted(3, "margin", "Three turns, for the most drones.", {}, {"extent_m": 3.0}, 0.8),
-    "triple-flip-low": Wanted(3, "height", "Three turns within the least height."),
-    "flip-low": Wanted(1, "height", "One turn within the least height."),
+    "double-flip-low": Wanted(2, "height", "Two turns in the least height."),
+    "triple-flip": Wanted(
+        3, "margin", "Three turns, completed by as many randomised drones as possible.", {}, {"extent_m": 3.0}, 0.8
+    ),
+    "triple-flip-low": Wanted(3, "height", "Three turns in the least height."),
+    "flip-low": Wanted(1, "height", "One turn in the least height."),
     "flip-fast": Wanted(1, "height", "One fast turn.", {"rate_radps": 21.0, "climb_mps": 2.5, "climb_s": 1.2}),
     "flip-wide": Wanted(
         1,
         "height",
-        "One slow turn, thrusting all the while.",
+        "One slow turn with thrust throughout.",
         {"rate_radps": 8.5, "speed_mps": 5.0, "climb_mps": 3.5, "climb_s": 1.2},
     ),
     "flip-high": Wanted(

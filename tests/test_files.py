@@ -83,7 +83,7 @@ def test_a_file_that_cannot_take_its_place_takes_the_others_back(tmp_path, monke
         return rename(self, target)
 
     monkeypatch.setattr(Path, "rename", full)
-    with pytest.raises(CfbError, match="Nothing that was there before has changed"):
+    with pytest.raises(CfbError, match="Earlier files are unchanged"):
         write_texts(tmp_path, dict.fromkeys(NAMES, "new"))
     assert {path.name: path.read_text() for path in tmp_path.iterdir()} == dict.fromkeys(NAMES, "old")
 

@@ -1,6 +1,6 @@
 """Simulate, identify and train controllers for the Crazyflie 2.1 Brushless in JAX and MJX.
 
-Everything that one usually needs is here, imported on first use, so that ``import cfb_mjx`` costs milliseconds::
+The names that most programs need are here. They are imported on first use, so ``import cfb_mjx`` takes milliseconds::
 
     import cfb_mjx as cfb
 
@@ -8,8 +8,8 @@ Everything that one usually needs is here, imported on first use, so that ``impo
     flown = cfb.rollout(drone, drone.hover_state(), commands)       # jit, vmap and grad work on it
     errors = cfb.Evaluate("flight.mcap", model="my_drone.yaml").run()
 
-Functions work on arrays; commands (`Evaluate`, `Fit`, `CloseLoop`, `Train` ...) on files, as ``cfb`` does. What is
-rarer is in the packages: ``cfb.model``, ``cfb.sysid`` and so on.
+Functions work on arrays. Commands (`Evaluate`, `Fit`, `CloseLoop`, `Train` ...) work on files, as ``cfb`` does. Less
+common functions are in the packages ``cfb.model``, ``cfb.sysid`` and so on.
 """
 
 from __future__ import annotations

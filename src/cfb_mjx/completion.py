@@ -1,4 +1,4 @@
-"""Completion of ``cfb`` lines in bash, zsh and fish: commands, their options, and choices; file names otherwise."""
+"""Completion of ``cfb`` in bash, zsh and fish: commands, options and choices, otherwise file names."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _PLACES = {
     "fish": ("XDG_CONFIG_HOME", ".config", "fish/completions/cfb.fish"),
 }
 _HINTS = {
-    "bash": "it works in new shells that have bash-completion",
-    "zsh": "put 'fpath+=~/.zfunc; autoload -Uz compinit; compinit' into ~/.zshrc, and start a new shell",
+    "bash": "it works in new shells with bash-completion",
+    "zsh": "add 'fpath+=~/.zfunc; autoload -Uz compinit; compinit' to ~/.zshrc and start a new shell",
     "fish": "it works in new shells",
 }
 
 
 def install(shell: str) -> str:
-    """Write the completion of a shell where it looks for them, and say where that is.
+    """Install the completion of a shell in the user's folders, and return a message with its path.
 
     Raises:
-        CfbError: another shell, or the file cannot be written.
+        CfbError: the shell is not supported, or the file cannot be written.
     """
     if shell not in _PLACES:
         raise CfbError(f"--install-completion {shell}: choose from {', '.join(_PLACES)}.")
@@ -40,12 +40,12 @@ def install(shell: str) -> str:
 
 
 def script(shell: str) -> str:
-    """The completion of a shell, as its source."""
+    """Return the source of a shell's completion."""
     return {"bash": _bash, "zsh": _zsh, "fish": _fish}[shell](_options())
 
 
 def _options() -> dict[str, dict[str, tuple[str, ...]]]:
-    """Every command's options, with the words to choose from (none: anything)."""
+    """Return the options of every command, with their choices (empty: any word)."""
     found = {}
     for name in COMMANDS:
         hints = get_type_hints(load(name), include_extras=True)

@@ -1,4 +1,4 @@
-"""What the library does, shown on a flight: predictions, randomised drones, a real flight."""
+"""The demo: predictions of a flight, a batch of randomised drones, and predictions of a real flight."""
 
 from __future__ import annotations
 
@@ -29,35 +29,35 @@ from cfb_mjx.view.spread import tilt_deg
 MODEL = "cfb-guards"
 LOG = "figure8"
 ORIGIN = (
-    "A simulated flight that comes with the project: another program integrated the same equations of motion and added "
-    "sensor noise (data/flight_logs). What the model misses here is mostly that noise."
+    "A simulated flight that is part of the project: an independent program integrated the same equations of motion "
+    "and added sensor noise (data/flight_logs). The prediction errors here are mostly this noise."
 )
 REAL_MASS = 0.045
-"""The vehicle of the IDSIA flights carries two decks, kg."""
+"""Mass of the drone of the IDSIA flights, which carries two decks, kg."""
 DRONES = 4096
 SECONDS = 0.5
-"""How long a randomised rollout lasts, s."""
+"""Duration of a randomised rollout, s."""
 KEPT = 5
-"""Every so many steps a state is kept for the figure."""
+"""Steps between states that are kept for the figure."""
 
 
 def demonstrate(folder: Path, real: Path | None, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """Evaluate a flight, fly randomised drones, evaluate a real flight if there is one. Call it with x64 enabled.
+    """Evaluate a flight, fly randomised drones, and evaluate a real flight if there is one. Needs 64-bit jax.
 
     Args:
-        folder: where prediction.png, spread.png and real.png are drawn.
-        real: folder with ``validation/*.parquet``.
-        progress: told what happens.
+        folder: folder for prediction.png, spread.png and real.png.
+        real: folder with ``validation/*.parquet``; None skips the real flight.
+        progress: called with a line of progress.
 
     Returns:
-        ``model``, ``flight``, ``rollouts`` and ``real`` with their numbers.
+        JSON values under ``model``, ``flight``, ``rollouts`` and ``real``.
 
     Raises:
         CfbError: a flight cannot be read.
     """
     model = load_model_file(MODEL)
     with ThreadPoolExecutor(1) as thread:
-        # The evaluation leaves a core free.
+        # Compile while the evaluation leaves a core free.
         program = thread.submit(_compile_rollouts, model)
         progress(f"1/3 evaluating {MODEL} on a flight")
         log = read_log(shipped("data", "flight_logs", f"{LOG}.mcap"))
@@ -80,11 +80,11 @@ def _evaluated(model: ModelFile, log: FlightLog, figure: Path, title: str | None
 
 
 def evaluate_real(model: ModelFile, folder: Path | None, figure: Path) -> dict[str, Any]:
-    """How well a model predicts one of the real flights in a folder; why it is skipped where there is none."""
+    """Evaluate a model on one of the real flights in a folder, or return the reason why it is skipped."""
     paths = [] if folder is None else sorted((folder / "validation").glob("*.parquet"))
     if not paths:
         lack = "" if folder is None else f"{folder} has no validation/*.parquet; "
-        return {"skipped": f"{lack}give --real FOLDER with real flights (the IDSIA nano-drone benchmark fits)."}
+        return {"skipped": f"{lack}give --real FOLDER with real flights, for instance the IDSIA nano-drone benchmark."}
     path = next((path for path in paths if path.stem.startswith("random1")), paths[0])
     heavier = model.with_values("weighed, with two decks", mass=REAL_MASS)
     result = _evaluated(heavier, read_log(path), figure, title=f"real flight {path.stem}")
@@ -92,14 +92,14 @@ def evaluate_real(model: ModelFile, folder: Path | None, figure: Path) -> dict[s
 
 
 def verdict_of(result: dict) -> str:
-    """Whether the model is better than knowing no physics, from the numbers."""
+    """Say whether the model predicts better than `hold`, with the numbers."""
     parts, worse = [], 0
     for quantity, unit, label in QUANTITIES:
         key = f"{quantity}_rmse_{unit}@0.5s"
         model, hold = result["commands_in"][key], result["hold"][key]
         worse += model > hold
         parts.append(f"{quantity} {model:.3g} against {hold:.3g} {label}")
-    numbers = f"After 0.5 s its RMS errors against those of hold are: {', '.join(parts)}."
+    numbers = f"RMS errors after 0.5 s, model against hold: {', '.join(parts)}."
     if worse == len(QUANTITIES):
         return f"The declared model is worse than hold on this real flight. {numbers}"
     if worse:
@@ -109,12 +109,12 @@ def verdict_of(result: dict) -> str:
 
 
 def _steps(dt: float) -> int:
-    """Of a randomised rollout: as many as are kept, times `KEPT`."""
+    """Number of steps of a randomised rollout, a multiple of `KEPT`."""
     return KEPT * round(SECONDS / dt / KEPT)
 
 
 def _compile_rollouts(model: ModelFile) -> tuple[Callable, float]:
-    """The program that flies `DRONES` drones, and how long it took to compile [s]; float32."""
+    """Compile the rollout of `DRONES` drones in float32; return it with the compile time, s."""
 
     def shaped(tree, *lead: int):
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct((*lead, *x.shape), jnp.float32), tree)
@@ -153,7 +153,7 @@ def _fly_randomised(model: ModelFile, log: FlightLog, program: tuple[Callable, f
 
     compiled, compile_s = program
     seconds, last = [], None
-    for _ in range(4):  # The first run also touches memory for the first time.
+    for _ in range(4):  # The first run also allocates memory.
         begin = time.perf_counter()
         last = jax.block_until_ready(compiled(single, state, commands, drones))
         seconds.append(time.perf_counter() - begin)

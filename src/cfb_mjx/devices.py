@@ -1,8 +1,8 @@
-"""Work divided over devices: those of this process, or those of several processes that run as one (`cfb_mjx.hosts`).
+"""Divide work over the devices of this process, or of several processes that run as one (`cfb_mjx.hosts`).
 
-What is divided is always a batch: drones, windows, segments of flights. Each device runs the program of its own share
-(`jax.shard_map`), which is the program one device would run on a smaller batch; dividing a program compiled for the
-whole batch is left to the compiler only where it is little more than matrix products and sums.
+The work is always a batch: drones, windows, segments of flights. Each device runs the program for its share of the
+batch (`jax.shard_map`). The compiler divides a program for the whole batch only where that is mostly matrix products
+and sums.
 """
 
 from __future__ import annotations
@@ -28,16 +28,20 @@ AXIS = "devices"
 
 
 def over_cores(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
-    """``map(function, items)``, several at a time, each on a core: for compiled programs that use one.
+    """Yield ``map(function, items)``, computed in parallel on all cores, for compiled programs that use one core.
 
-    The first goes alone, so that what it compiles is compiled once; of the rest no more are begun than there are cores.
+    The first item runs alone, so that its programs are compiled once. At most as many others run as there are cores.
+
+    Args:
+        function: function of one item.
+        items: inputs.
     """
     items = iter(items)
     yield from map(function, islice(items, 1))
     if cores() == 1:
         yield from map(function, items)
         return
-    # Set for a thread by a context, this would not hold in others.
+    # A context manager may have set this for one thread; the other threads need it too.
     x64 = bool(cast(Any, jax.config).jax_enable_x64)
 
     def alike(item: Any) -> Any:
@@ -56,78 +60,86 @@ def over_cores(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator
 
 @dataclass(frozen=True)
 class Devices:
-    """Devices that share a batch. Methods that place or fetch are called by every process, in the same order."""
+    """Devices that share a batch. All processes must call methods that place or fetch arrays, in the same order."""
 
     mesh: Mesh
 
     @classmethod
     def take(cls, count: int = 1) -> Devices:
-        """The first ``count`` devices of this process, or of every process where several run as one.
+        """Return the first ``count`` devices of this process, or of every process if several run as one.
 
         Raises:
-            CfbError: there are fewer.
+            CfbError: there are fewer devices.
         """
         if count < 1:
             raise CfbError(f"--devices must be at least 1, found {count}.")
         if count > jax.local_device_count():
-            raise CfbError(f"{count} devices were asked for, {jax.local_device_count()} are here; ask for fewer.")
+            raise CfbError(f"--devices {count}: only {jax.local_device_count()} are available; give a smaller number.")
         chosen = [d for process in range(jax.process_count()) for d in jax.local_devices(process)[:count]]
         return cls(Mesh(np.array(chosen), (AXIS,)))
 
     @property
     def count(self) -> int:
-        """Of all processes together."""
+        """Number of devices of all processes together."""
         return self.mesh.size
 
     @property
     def several(self) -> bool:
-        """Whether there is anything to divide."""
+        """Whether there is more than one device."""
         return self.count > 1
 
     def require(self, examples: int, what: str) -> None:
         """Refuse a batch that cannot be divided evenly.
 
+        Args:
+            examples: size of the batch.
+            what: name of the examples in the message.
+
         Raises:
-            CfbError: naming ``what`` there are so many of.
+            CfbError: the batch cannot be divided evenly.
         """
         if examples % self.count:
             raise CfbError(
-                f"{examples} {what} cannot be spread over {self.count} devices evenly; change how many they are."
+                f"{examples} {what} cannot be divided evenly over {self.count} devices; change one of the numbers."
             )
 
     def along(self, tree: Any, axis: int = 0) -> Any:
-        """``tree`` with this axis of every array divided; every process gives the same whole arrays.
+        """Return ``tree`` with one axis of every array divided over the devices.
 
-        Within a compiled function the arrays are asked to be divided so; outside of one they are placed so. The axis
-        must divide by `count`: see `require` and `padded`.
+        Within a compiled function this constrains the sharding of the arrays, elsewhere it places them. The length of
+        the axis must be a multiple of `count`: see `require` and `padded`.
+
+        Args:
+            tree: pytree of whole arrays, the same in every process.
+            axis: axis to divide.
         """
         return self._as(tree, _spec(axis))
 
     def whole(self, tree: Any) -> Any:
-        """``tree`` with every array on every device; as `along`, within a compiled function or outside."""
+        """Return ``tree`` with every array on every device, within a compiled function or outside."""
         return self._as(tree, PartitionSpec())
 
     def here(self, tree: Any) -> Any:
-        """The whole of divided arrays as numpy arrays, in every process."""
+        """Return divided arrays as whole numpy arrays, in every process."""
         arrays, rest = eqx.partition(tree, eqx.is_array)
         if any(not x.is_fully_addressable and not x.is_fully_replicated for x in jax.tree.leaves(arrays)):
             arrays = jax.jit(lambda x: x, out_shardings=NamedSharding(self.mesh, PartitionSpec()))(arrays)
         return eqx.combine(jax.tree.map(np.asarray, arrays), rest)
 
     def padded(self, tree: Any) -> Any:
-        """``tree`` with the last example repeated until the leading axis can be divided; numpy arrays."""
+        """Return ``tree`` as numpy arrays, with the last example repeated until the leading axis can be divided."""
         return jax.tree.map(lambda x: last_repeated(x, -(-len(x) // self.count) * self.count), tree)
 
     def divided(self, function: Callable, in_axes: tuple, out_axes: Any) -> Callable:
-        """``function``, each device working on its share alone.
+        """Return ``function`` with its work divided over the devices.
 
         Args:
-            function: of pytrees of arrays; must treat examples independently.
-            in_axes: of every argument the axis to divide, or None for what every device gets whole.
-            out_axes: the same of the results; a pytree prefix.
+            function: function of pytrees of arrays that treats examples independently.
+            in_axes: axis to divide of every argument; None for arguments that every device gets whole.
+            out_axes: the same for the results, a pytree prefix.
 
         Returns:
-            A function of the same arguments, with the same results, to be called within a compiled one.
+            A function with the same arguments and results, to be called within a compiled function.
         """
         if not self.several:
             return function
@@ -139,7 +151,7 @@ class Devices:
                 mesh=self.mesh,
                 in_specs=tuple(map(_spec, in_axes)),
                 out_specs=jax.tree.map(_spec, out_axes),
-                # Scans begin with constants, which the check takes for another kind than what follows.
+                # The check rejects scans that begin with constants.
                 check_vma=False,
             )
             return shared(*arrays)
@@ -147,7 +159,7 @@ class Devices:
         return call
 
     def mapped(self, function: Callable) -> Callable:
-        """``jax.vmap(function)`` with the examples divided; compiled by the caller."""
+        """Return ``jax.vmap(function)`` with the examples divided over the devices; the caller compiles it."""
         batched = jax.vmap(function)
 
         def call(*arguments):
@@ -156,14 +168,17 @@ class Devices:
         return call
 
     def shared(self, batch: Any) -> Any:
-        """A batch (an `equinox.Module` with a field ``over``) placed on these devices, and knowing it: see `mapped`."""
+        """Place a batch on these devices and set its field ``over`` (an `equinox.Module`), for `mapped`."""
         if not self.several:
             return batch
         return replace(self.along(self.padded(batch)), over=self)
 
     def _together(self, arrays: Any) -> Any:
-        """The same, after a word with the other devices: XLA's CPU client runs programs that exchange nothing one after
-        another on one thread, and those that do side by side."""
+        """Return the arrays after a collective operation that does not change them.
+
+        XLA's CPU client runs programs without communication one after the other on one thread, and programs with
+        communication in parallel.
+        """
         if self.mesh.devices.flat[0].platform != "cpu":
             return arrays
         leaves, structure = jax.tree.flatten(arrays)
@@ -178,7 +193,7 @@ class Devices:
 
 
 def mapped(function: Callable, over: Devices | None) -> Callable:
-    """``jax.vmap(function)`` over a batch that is divided over devices, if it is."""
+    """Return ``jax.vmap(function)``, divided over the devices ``over`` unless that is None."""
     return jax.vmap(function) if over is None else over.mapped(function)
 
 
@@ -194,12 +209,12 @@ def _placed(x: Any, sharding: NamedSharding) -> Any:
         return jax.random.wrap_key_data(data, impl=jax.random.key_impl(x))
     if sharding.is_fully_addressable:
         return jax.device_put(x, sharding)
-    # Not device_put: it would send the array around to see that all processes gave the same.
+    # device_put would communicate to check that all processes have the same array.
     held = np.asarray(x)
     return jax.make_array_from_callback(held.shape, sharding, lambda index: held[index])
 
 
 def last_repeated(x: Any, count: int) -> np.ndarray:
-    """``x`` with its last row again and again, up to so many rows."""
+    """Return ``x`` with its last row repeated, up to ``count`` rows."""
     x = np.asarray(x)
     return np.concatenate([x, np.repeat(x[-1:], count - len(x), axis=0)])

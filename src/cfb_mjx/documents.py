@@ -1,4 +1,4 @@
-"""YAML documents, read strictly: shipped ones by name, users' by path."""
+"""Strict reading of YAML documents: shipped ones by name, the user's by path."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from cfb_mjx.files import shipped
 
 LARGEST_INT = 2**63 - 1
 LARGEST_SEED = 2**32 - 1
-"""In single precision jax takes no more of a seed than that, and would draw the same for others."""
+"""In single precision jax uses only 32 bits of a seed; larger seeds would repeat the draws of smaller ones."""
 _REPR = reprlib.Repr()
 _REPR.maxlevel, _REPR.maxstring, _REPR.maxother = 3, 80, 80
 LONGEST = 160
 
 
 def shipped_names(*folder: str) -> list[str]:
-    """Names of the YAML files in a folder of ``configs``."""
+    """Return the names of the YAML files in a folder of ``configs``."""
     return sorted(path.stem for path in shipped("configs", *folder).glob("*.yaml"))
 
 
 def load_named(name_or_path: str | Path, what: str, format: str, *folder: str) -> tuple[Path, dict]:
-    """Path and content of a YAML file, or of a shipped one named without suffix.
+    """Return the path and the content of a YAML file, or of a shipped one that is named without suffix.
 
     Args:
-        name_or_path: of the document.
-        what: it is, for messages.
-        format: its entry of that name must say.
-        folder: of ``configs`` where the shipped ones lie.
+        name_or_path: path or name of the document.
+        what: kind of the document, for messages.
+        format: required value of its entry ``format``.
+        folder: folder of ``configs`` with the shipped documents.
 
     Raises:
         CfbError: no such file, not a YAML mapping, or another format.
@@ -54,8 +54,8 @@ def load_yaml(path: str | Path) -> dict:
     """Read a YAML mapping.
 
     Raises:
-        CfbError: the file is missing, unreadable, not YAML, not a mapping, has a key twice, holds itself, or a whole
-            number of more than 64 bits.
+        CfbError: the file is missing, unreadable, not YAML or not a mapping, has a duplicate key or a whole number of
+            more than 64 bits, or contains itself.
     """
     try:
         text = Path(path).read_text(encoding="utf-8")
@@ -70,15 +70,19 @@ def load_yaml(path: str | Path) -> dict:
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """What a YAML text says, read as strictly as a file.
+    """Parse a YAML text, as strictly as a file.
+
+    Args:
+        text: the text.
+        where: name of the text in messages.
 
     Raises:
-        CfbError: it is not valid, named by ``where``.
+        CfbError: the text is not valid.
     """
     try:
         document = yaml.load(text, Loader=_StrictLoader)
         _require_plain(document, (), (), set())
-    # PyYAML lets through whatever its parts raise: !!bool x a KeyError, a thirteenth month a ValueError, and so on.
+    # PyYAML raises many kinds of errors: !!bool x a KeyError, a thirteenth month a ValueError, and so on.
     except Exception as error:
         said = "nested too deeply" if isinstance(error, RecursionError) else "a value that does not fit its tag"
         if isinstance(error, yaml.YAMLError | ValueError):
@@ -88,29 +92,31 @@ def parse_yaml(text: str, where: str) -> Any:
 
 
 def told(value: Any) -> str:
-    """A value as messages quote it: on one line, and not longer than can be read."""
+    """Return a value as messages quote it: on one line and shortened."""
     text = _REPR.repr(value)
     return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
 
 
 def require_seed(seed: int, where: str) -> None:
-    """Refuse a seed of which jax would take a part only.
+    """Refuse a seed that jax would truncate.
 
     Raises:
-        CfbError: it is negative or above `LARGEST_SEED`.
+        CfbError: the seed is negative or above `LARGEST_SEED`.
     """
     if not 0 <= seed <= LARGEST_SEED:
         raise CfbError(f"{where} {seed} must be from 0 to {LARGEST_SEED}.")
 
 
 def with_former(written: dict[str, Any], key: str, former: dict[str, Any]) -> dict[str, Any]:
-    """A group that may have been written out, ``key`` among it, before it could hold the keys of ``former``: what it
-    meant then is filled in."""
+    """Return a group of settings with the values that keys of ``former`` had before they existed, if it has ``key``.
+
+    A group that was written out by an earlier version has ``key`` but not the keys of ``former``.
+    """
     return former | written if key in written else written
 
 
 def is_named(value: Any) -> bool:
-    """Whether this is a mapping with a ``name``, all its keys text: an effect, for instance."""
+    """Whether this is a mapping with text keys and a ``name``, such as an effect."""
     return isinstance(value, dict) and all(isinstance(k, str) for k in value) and isinstance(value.get("name"), str)
 
 
@@ -126,12 +132,12 @@ def _require_plain(value: Any, at: tuple[str, ...], within: tuple[int, ...], kno
                 _require_plain(key, at, within, known)
         for key, part in value.items() if isinstance(value, dict) else enumerate(value):
             _require_plain(part, (*at, str(key)), (*within, id(value)), known)
-        # What anchors repeat is looked at once.
+        # Values that anchors repeat are checked once.
         known.add(id(value))
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Refuses repeated keys, and reads 3.3e-5 as a number (YAML 1.1 wants 3.3e-05 with a dot and a sign)."""
+    """Loader that refuses duplicate keys and reads 1e-5 as a number (YAML 1.1 requires a dot and a sign)."""
 
     def construct_mapping(self, node, deep=False):
         seen = set()
@@ -151,10 +157,10 @@ _StrictLoader.add_implicit_resolver(
 
 
 def refuse_unknown(found: Mapping, known: set[str], path, prefix: str) -> None:
-    """Name the keys of a mapping that are not among the known ones.
+    """Refuse keys of a mapping that are not among the known ones.
 
     Raises:
-        CfbError: there are some.
+        CfbError: there are unknown keys; the message names them.
     """
     unknown = [str(key) for key in found if key not in known]
     if unknown:

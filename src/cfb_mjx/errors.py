@@ -1,9 +1,9 @@
-"""What a user's mistake raises, and what unusual input warns with: one sentence that names the file."""
+"""The error for invalid input and the warning for unusual input, each one sentence that names the file."""
 
 
 class CfbError(Exception):
-    """Bad input or an unusable environment. The command line prints the message and exits with status 2."""
+    """Invalid input or an unusable environment. The command line prints the message and exits with status 2."""
 
 
 class CfbWarning(UserWarning):
-    """Input that can be meant but surely is unusual: one sentence. The command line prints it once and goes on."""
+    """Valid but unusual input. The command line prints the message, one sentence, once and continues."""

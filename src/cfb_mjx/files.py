@@ -1,4 +1,4 @@
-"""Writing results so that a failure never costs the user an earlier one, and finding shipped files."""
+"""Write results atomically, so that a failure never destroys an earlier result, and find shipped files."""
 
 from __future__ import annotations
 
@@ -22,37 +22,37 @@ from cfb_mjx.interrupts import held_back
 
 try:
     import fcntl
-except ImportError:  # Windows: what a killed process leaves stays there.
+except ImportError:  # Windows: temporary files of killed processes remain.
     fcntl = None
 
 _TEMPORARY = re.compile(r"\..+\.[0-9a-f]{8}\.cfb\.tmp(\.[^.]+)?")
 
 
 class _Written(NamedTuple):
-    """A file that is not in its place yet."""
+    """A temporary file that has not been renamed to its final name."""
 
     temporary: Path
     lock: int
-    """An open handle: while it is held, the writer is alive."""
+    """Handle with a lock; while it is held, the writer is alive."""
 
     def forget(self) -> None:
-        """Delete it, unless it is in its place."""
+        """Delete the temporary file if it still exists."""
         with contextlib.suppress(OSError):
             self.temporary.unlink()
         os.close(self.lock)
 
 
 _group: ContextVar[dict[Path, _Written | None] | None] = ContextVar("files that land together", default=None)
-"""By the path where each will be; None: what is there is to be gone."""
+"""Temporary files by their final path; None: the file at that path is to be deleted."""
 
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; rename it to ``path`` if the block succeeds, delete it otherwise.
+    """Yield a temporary path in the folder of ``path``; rename it to ``path`` if the block succeeds, else delete it.
 
-    The rename is atomic, so a reader (or a crash, a full disk, Ctrl-C) sees the old file or the whole new one; within
-    `together` it comes with those of the other files. The mode of an earlier file is kept. What processes that were
-    killed have left in the folder is deleted.
+    The rename is atomic: after a crash, a full disk or Ctrl-C there is the old file or the complete new one. Within
+    `together`, the rename happens with those of the other files. The mode of an earlier file is kept. Temporary files
+    of killed processes in the folder are deleted.
 
     Raises:
         CfbError: the folder is missing or the file cannot be written (full disk, no permission).
@@ -83,13 +83,13 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def together() -> Iterator[None]:
-    """Let all files that are written in this block take their places at its end, or none of them if it fails.
+    """Rename all files that are written in this block at its end, or none of them if it fails.
 
-    Whenever the process ends, a folder holds files of one run: none that is new beside one that is old. If it is killed
-    within the moment in which names change, some are missing. Blocks within a block land with the outermost.
+    A folder therefore never has new files together with old ones. If the process is killed during the renames, some
+    files are missing. Nested blocks are renamed with the outermost one.
 
     Raises:
-        CfbError: a file cannot be put in its place; all are as they were.
+        CfbError: a file cannot be renamed; all files are as they were.
     """
     if _group.get() is not None:
         yield
@@ -108,7 +108,7 @@ def together() -> Iterator[None]:
 
 @contextlib.contextmanager
 def scratch(prefix: str = "cfb-") -> Iterator[str]:
-    """A folder of files that are used within the block and thrown away: they are there at once, also in `together`."""
+    """Yield a temporary folder that exists during the block; its files are renamed immediately, also in `together`."""
     token = _group.set(None)
     try:
         with tempfile.TemporaryDirectory(prefix=prefix) as folder:
@@ -118,7 +118,7 @@ def scratch(prefix: str = "cfb-") -> Iterator[str]:
 
 
 def remove(path: str | os.PathLike) -> None:
-    """Delete a file if it is there; within `together`, when the others take their places."""
+    """Delete a file if it exists; within `together`, when the other files are renamed."""
     group = _group.get()
     if group is None:
         Path(path).unlink(missing_ok=True)
@@ -152,7 +152,7 @@ def _land(group: dict[Path, _Written | None]) -> None:
             for path, old in aside.items():
                 old.replace(path)
             raise _unwritten(first, error) from error
-        # From here on there is no way back, and nothing in the way.
+        # From here on nothing can be undone, and no old file blocks a rename.
         for path, temporary in new.items():
             if path != first:
                 temporary.replace(path)
@@ -166,24 +166,24 @@ def _name(path: Path) -> Path:
 
 
 def _begin(path: Path) -> _Written:
-    """A new temporary file, private until it is in place."""
+    """Create a temporary file that only the user can read until it is renamed."""
     while True:
         temporary = _name(path)
         lock = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-        # A file system without locks does without what they are for.
+        # On a file system without locks, temporary files of dead processes are not recognised.
         with contextlib.suppress(OSError):
             if fcntl is not None:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if temporary.exists():
             return _Written(temporary, lock)
-        os.close(lock)  # Another process took it for a dead one's before it was locked.
+        os.close(lock)  # Another process deleted it as that of a dead process before it was locked.
 
 
 def _clear(folder: Path) -> None:
-    """Delete the temporary files of dead processes: nobody holds their locks."""
+    """Delete the temporary files of dead processes, whose locks nobody holds."""
     if fcntl is None:
         return
-    # A folder may be written and not listed, and a lock may be held.
+    # Suppress: a folder may be writable but not readable, and a lock may be held.
     with contextlib.suppress(OSError):
         left = [entry for entry in os.scandir(folder) if _TEMPORARY.fullmatch(entry.name)]
         for entry in left:
@@ -193,7 +193,7 @@ def _clear(folder: Path) -> None:
 
 
 def _mode(path: Path) -> int:
-    """That of the earlier file, or what an ordinary open() would give a new one."""
+    """Return the mode of the earlier file, or the one that open() would give a new file."""
     with contextlib.suppress(FileNotFoundError):
         return stat.S_IMODE(path.stat().st_mode)
     umask = os.umask(0)
@@ -204,15 +204,15 @@ def _mode(path: Path) -> int:
 def _unwritten(path: Path, error: OSError) -> CfbError:
     return CfbError(
         f"{path}: could not be written ({error.strerror or error}); free some space or choose another place. "
-        "Nothing that was there before has changed."
+        "Earlier files are unchanged."
     )
 
 
 def require_folder(*paths: str | os.PathLike | None) -> None:
-    """Refuse, before any work is done, outputs (None: not asked for) whose folder does not exist.
+    """Refuse outputs whose folder does not exist, before any work is done; None is an output that is not requested.
 
     Raises:
-        CfbError: names the first such output.
+        CfbError: a folder does not exist; the message names the first such output.
     """
     for path in paths:
         if path is not None and not Path(path).parent.is_dir():
@@ -220,15 +220,15 @@ def require_folder(*paths: str | os.PathLike | None) -> None:
 
 
 FIGURES = (".svg", ".png", ".pdf")
-VectorFormat = Literal["pdf", "svg"]
 """Formats that figures are written in."""
+VectorFormat = Literal["pdf", "svg"]
 
 
 def require_ending(path: str | os.PathLike, endings: tuple[str, ...], demand: str) -> Path:
-    """The path, if it ends in one of ``endings``, in small or capital letters.
+    """Return the path if it ends in one of ``endings``, ignoring case.
 
     Raises:
-        CfbError: another ending; ``demand`` says which it must be.
+        CfbError: it has another ending; the message is ``demand``.
     """
     path = Path(path)
     if path.suffix.lower() not in endings:
@@ -237,10 +237,10 @@ def require_ending(path: str | os.PathLike, endings: tuple[str, ...], demand: st
 
 
 def output_folder(path: str | os.PathLike) -> Path:
-    """Make the folder a command writes its files into, with those above it.
+    """Create the output folder of a command, with its parents.
 
     Raises:
-        CfbError: a file is in the way, or the folder cannot be made.
+        CfbError: there is a file of that name, or the folder cannot be created.
     """
     path = Path(path)
     require_no_file(path)
@@ -248,16 +248,16 @@ def output_folder(path: str | os.PathLike) -> Path:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CfbError(
-            f"{path}: this folder cannot be made ({error.strerror or error}); choose another place."
+            f"{path}: this folder cannot be created ({error.strerror or error}); choose another place."
         ) from None
     return path
 
 
 def require_no_file(path: str | os.PathLike) -> None:
-    """Refuse, before any work is done, a folder for results where a file is, or below one.
+    """Refuse an output folder whose path is or contains a file, before any work is done.
 
     Raises:
-        CfbError: names the file.
+        CfbError: it does; the message names the file.
     """
     for place in (Path(path), *Path(path).parents):
         if place.exists():
@@ -267,7 +267,7 @@ def require_no_file(path: str | os.PathLike) -> None:
 
 
 def read_bytes(path: str | os.PathLike, count: int = -1) -> bytes:
-    """The first ``count`` bytes of a file, all of it by default; within `together`, of what was written there.
+    """Read the first ``count`` bytes of a file, by default all; within `together`, of the version written there.
 
     Raises:
         CfbError: the file is missing or cannot be read.
@@ -291,19 +291,19 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 
 
 def write_texts(folder: str | os.PathLike, texts: Mapping[str, str]) -> None:
-    """Write text files that belong together: all of them, or, when one cannot be written, none."""
+    """Write several text files: all of them, or none if one cannot be written."""
     with together():
         for name, text in texts.items():
             write_text(Path(folder) / name, text)
 
 
 def write_json(path: str | os.PathLike, value: object) -> None:
-    """Write ``value`` as JSON atomically; NaN and infinities, which JSON lacks, become null."""
+    """Write ``value`` as JSON atomically; NaN and infinities, which JSON does not have, become null."""
     write_text(path, json.dumps(plain(value), indent=1) + "\n")
 
 
 def plain(value):
-    """JSON terms only: arrays become lists; NaN and infinities, which JSON lacks, become null."""
+    """Convert to JSON values: arrays become lists; NaN and infinities, which JSON does not have, become null."""
     if isinstance(value, Mapping):
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -316,7 +316,7 @@ def plain(value):
 
 
 def code_identity() -> str:
-    """Version of the library, and a hash of its source: what is half done is gone on with by the same code only."""
+    """Return version and hash of the library's source; only the same code may resume unfinished work."""
     package = Path(__file__).resolve().parent
     digest = sha256()
     for path in sorted(package.rglob("*.py")):
@@ -325,7 +325,14 @@ def code_identity() -> str:
 
 
 def shipped(*parts: str) -> Path:
-    """Path of a file shipped with the library (``assets/...`` or ``configs/...``), installed or from a checkout."""
+    """Return the path of a file that is part of the library, installed or in a checkout.
+
+    Args:
+        parts: parts of the path, for instance ``"configs", "loop.yaml"``.
+
+    Raises:
+        CfbError: the installation is incomplete.
+    """
     package = Path(__file__).resolve().parent
     for root in (package / "_data", package.parents[1]):
         path = root.joinpath(*parts)

@@ -1,8 +1,8 @@
-"""Several processes, on one machine or many, that run as one: what they must agree on comes from the first.
+"""Several processes, on one machine or many, that run as one; values that must be equal come from the first process.
 
-Every process runs the same program; arrays are divided over the devices of all of them (`cfb_mjx.devices`). Files are
-read and written by the first alone, so that the others need no common folder. ``jax.distributed.initialize`` comes
-before anything else; for ``cfb train --coordinator`` `cfb_mjx.joining` calls it.
+Every process runs the same program; arrays are divided over the devices of all of them (`cfb_mjx.devices`). Only the
+first process reads and writes files, so that the others need no common folder. ``jax.distributed.initialize`` must come
+before anything else; for ``cfb train --coordinator``, `cfb_mjx.joining` calls it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from cfb_mjx.errors import CfbError
 
 
 def first() -> bool:
-    """Whether this process is the one that reads, writes and talks."""
+    """Whether this is the first process, which reads and writes files and prints."""
     return jax.process_index() == 0
 
 
 def from_first(produce: Callable[[], Any]) -> Any:
-    """What ``produce`` returns in the first process (JSON terms), in every process; the others do not call it.
+    """Call ``produce`` in the first process only, and return its result (JSON values) in every process.
 
     Raises:
-        CfbError: in every process, where the first raises it.
+        CfbError: ``produce`` raised it; it is raised in every process.
     """
     if jax.process_count() == 1:
         return produce()
@@ -40,7 +40,7 @@ def from_first(produce: Callable[[], Any]) -> Any:
         except CfbError as error:
             said["refused"] = str(error)
     content = json.dumps(said).encode()
-    # Arrays only, and of one size everywhere: first how long it is, then what it says.
+    # Only arrays of equal size can be sent: first the length, then the content.
     length = int(multihost_utils.broadcast_one_to_all(np.asarray(len(content), np.int32)))
     padded = np.frombuffer(content.ljust(length)[:length], np.uint8)
     said = json.loads(multihost_utils.broadcast_one_to_all(padded).tobytes())
@@ -50,7 +50,7 @@ def from_first(produce: Callable[[], Any]) -> Any:
 
 
 def as_first(tree: Any) -> Any:
-    """The arrays of the first process, in every process: elsewhere the same computation may have rounded otherwise."""
+    """Return the arrays of the first process in every process; the same computation may round differently elsewhere."""
     if jax.process_count() == 1:
         return tree
     arrays, rest = eqx.partition(tree, eqx.is_array)

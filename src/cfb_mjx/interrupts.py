@@ -1,4 +1,4 @@
-"""Ctrl-C that is not lost."""
+"""Reliable handling of Ctrl-C and SIGTERM."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from contextlib import contextmanager
 
 @contextmanager
 def heard() -> Iterator[None]:
-    """Let every Ctrl-C in this block end it with KeyboardInterrupt.
+    """Make every Ctrl-C in this block raise KeyboardInterrupt.
 
-    Two ways it would not: the caller's shell started us with the signal ignored (scripts, ``make -j``); and Python
-    discards an exception that is raised in a callback of the garbage collector or in a finaliser, of which jax has
-    several, so that the one Ctrl-C that lands there is gone. That one is sent again a moment later.
+    Without this a Ctrl-C is lost in two cases. The shell may have started the process with the signal ignored (scripts,
+    ``make -j``). And Python discards exceptions in callbacks of the garbage collector and in finalisers, of which jax
+    has several; the signal is then sent again a moment later.
     """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN and sys.stdin is not None and sys.stdin.isatty():
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -37,7 +37,7 @@ def heard() -> Iterator[None]:
 
 @contextmanager
 def held_back() -> Iterator[None]:
-    """Let a Ctrl-C wait for the end of this block, which should be short: while jaxlib loads it would crash."""
+    """Delay a Ctrl-C to the end of this block, which should be short; while jaxlib loads, it would crash."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -53,7 +53,7 @@ def held_back() -> Iterator[None]:
 
 @contextmanager
 def ended_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM, as batch systems send it, count as Ctrl-C in this block; in the main thread alone."""
+    """Treat SIGTERM, which batch systems send, as Ctrl-C in this block; in the main thread only."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,6 +1,7 @@
-"""Commands that several processes run as one: joining, and what is said when one of them is gone.
+"""Commands that several processes run as one: joining them, and the message if one of them ends.
 
-Without jax, which must not be there yet when `joined` begins; what joined processes agree on is `cfb_mjx.hosts`.
+This module does not import jax, which must not be loaded before `joined` begins. `cfb_mjx.hosts` is for the processes
+after they have joined.
 """
 
 from __future__ import annotations
@@ -21,18 +22,24 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.supervising import supervised
 
 BOUND = "JAX_COORDINATOR_BIND_ADDRESS"
-"""The environment variable that says where process 0 listens, if not where the others find it."""
+"""Environment variable with the address that process 0 listens on, if the others use another address."""
 LOST = 3
-"""Exit status of a process whose fellows are gone."""
+"""Exit status of a process when another one of the group has ended."""
 HEARTBEAT_S = 20
-"""A process is believed dead that has been silent for so long."""
+"""Time without a heartbeat after which a process counts as dead."""
 JOINING_S, LEAVING_S, REFUSED_S = 120, 60, 5
-"""How long all are waited for at the start, at the end, and at an end with a refusal."""
+"""Times to wait for all processes at the start, at the end, and after an error in the input."""
 
 
 @dataclass(frozen=True)
 class Hosts:
-    """Where the processes meet (``HOST:PORT`` of the first, or ``auto``), how many they are, and which this is."""
+    """A group of processes.
+
+    Attributes:
+        coordinator: ``HOST:PORT`` of the first process, or ``auto``.
+        processes: number of processes.
+        process: number of this process.
+    """
 
     coordinator: str
     processes: int | None = None
@@ -40,10 +47,10 @@ class Hosts:
 
     @classmethod
     def asked(cls, coordinator: str | None, processes: int | None, process: int | None) -> Hosts | None:
-        """From the options; None where none is given.
+        """Return the group that the options describe; None if no option is given.
 
         Raises:
-            CfbError: some are missing, or impossible.
+            CfbError: an option is missing or invalid.
         """
         if coordinator is None:
             if processes is not None or process is not None:
@@ -60,23 +67,23 @@ class Hosts:
                 "--coordinator needs --processes N and --process I (0 to N - 1); or write --coordinator auto."
             )
         if not 0 <= process < processes:
-            raise CfbError(f"--process {process}: with --processes {processes} it is 0 to {processes - 1}.")
+            raise CfbError(f"--process {process}: with --processes {processes} it must be 0 to {processes - 1}.")
         return cls(coordinator, processes, process)
 
 
 @contextmanager
 def joined(hosts: Hosts | None, goes_on: str) -> Iterator[None]:
-    """Run the block as one process of several; without ``hosts``, just run it.
+    """Run the block as one process of several, or alone if ``hosts`` is None.
 
-    Call it before jax computes anything. Where another process is gone this one ends with the status `LOST` and one
+    Call it before jax computes anything. If another process ends early, this one ends with the status `LOST` and one
     sentence.
 
     Args:
-        hosts: the others.
-        goes_on: the end of that sentence: what is left, and how to go on.
+        hosts: the group of processes.
+        goes_on: end of that sentence: the state of the results, and how to continue.
 
     Raises:
-        CfbError: no cluster is found by ``auto``, or the coordinator's port is taken.
+        CfbError: ``auto`` finds no cluster, or the coordinator's port is in use.
     """
     if hosts is None:
         yield
@@ -88,7 +95,7 @@ def joined(hosts: Hosts | None, goes_on: str) -> Iterator[None]:
     try:
         yield
         jax.distributed.shutdown()
-    # Not through the interpreter's end: there jax waits for the others, and then ends this process as if they had died.
+    # os._exit skips the end of the interpreter, where jax would wait for the others and then treat them as dead.
     except KeyboardInterrupt:
         os._exit(130)
     except CfbError as error:
@@ -98,14 +105,14 @@ def joined(hosts: Hosts | None, goes_on: str) -> Iterator[None]:
     except Exception as error:
         if not re.search(r"gloo|nccl|mpi|collective|coordination|heartbeat", str(error), re.IGNORECASE):
             raise
-        # Of several the coordination service will say which one it was, and end this process as it does.
+        # With more than two processes, the coordination service reports which one it was, and ends this process.
         if jax.process_count() > 2:
             time.sleep(2 * HEARTBEAT_S)
         os._exit(LOST)
 
 
 def _leave_soon() -> None:
-    """Give the others, who may have been refused with the same sentence, time to say it."""
+    """Give the other processes time to print their messages; they may have refused the same input."""
     import jax
 
     leaving = threading.Thread(target=jax.distributed.shutdown, daemon=True)
@@ -116,7 +123,7 @@ def _leave_soon() -> None:
 def _join(hosts: Hosts) -> None:
     import jax
 
-    # The default of newer versions only.
+    # This is the default only in newer versions.
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     given = {} if hosts.coordinator == "auto" else _arguments(hosts)
     try:
@@ -128,13 +135,13 @@ def _join(hosts: Hosts) -> None:
         )
     except ValueError as error:
         raise CfbError(
-            f"--coordinator auto: no cluster is found here ({error}); start with srun or mpirun, or give "
+            f"--coordinator auto: no cluster is found here ({error}); start cfb with srun or mpirun, or give "
             "--coordinator HOST:PORT --processes N --process I."
         ) from None
     except RuntimeError as error:
         raise CfbError(
-            f"--coordinator {hosts.coordinator}: cannot listen there ({error}); take another port, or set "
-            f"{BOUND} to the HOST:PORT that this machine has for it."
+            f"--coordinator {hosts.coordinator}: cannot listen there ({error}); use another port, or set "
+            f"{BOUND} to the HOST:PORT to listen on."
         ) from None
 
 
@@ -145,15 +152,15 @@ def _arguments(hosts: Hosts) -> dict:
         "coordinator_address": hosts.coordinator,
         "num_processes": hosts.processes,
         "process_id": hosts.process,
-        # Left alone, jax listens on all addresses of the machine, to whoever can reach one of them.
+        # By default jax listens on all addresses of the machine, for anybody who can reach one of them.
         "coordinator_bind_address": os.environ.get(BOUND, hosts.coordinator),
-        # All is said: whatever cluster this may be is not to be asked.
+        # The options describe the group completely; do not search for a cluster.
         "cluster_detection_method": "deactivate",
     }
 
 
 def _require_reachable(coordinator: str) -> None:
-    """Refuse the machine's own name where, as on many, only the machine itself can reach it by that name."""
+    """Refuse the machine's own name if it resolves to a loopback address, as it often does."""
     name = coordinator.rpartition(":")[0]
     try:
         addresses = {str(found[4][0]) for found in socket.getaddrinfo(name.strip("[]"), None)}
@@ -162,8 +169,8 @@ def _require_reachable(coordinator: str) -> None:
     typed = name == "localhost" or addresses == {name.strip("[]")}
     if not typed and all(ip_address(a.partition("%")[0]).is_loopback for a in addresses):
         raise CfbError(
-            f"--coordinator {coordinator}: here {name} is {', '.join(sorted(addresses))}, where no other machine can "
-            f"reach process 0; give its address, or set {BOUND} to the HOST:PORT to listen on."
+            f"--coordinator {coordinator}: {name} is {', '.join(sorted(addresses))} on this machine, where no other "
+            f"machine can reach process 0; give its address, or set {BOUND} to the HOST:PORT to listen on."
         )
 
 
@@ -172,21 +179,21 @@ def _explained(hosts: Hosts, goes_on: str, status: int, printed: str) -> tuple[i
         return LOST, f"{_other(hosts, printed)} stopped; {goes_on}"
     if status == -signal.SIGABRT and "RegisterTask" in printed:
         return LOST, (
-            f"--coordinator {hosts.coordinator}: not all processes came together there within {JOINING_S} s; start "
-            "every process, with one coordinator, one number of processes and a number of its own."
+            f"--coordinator {hosts.coordinator}: not all processes joined within {JOINING_S} s; start every process "
+            "with the same --coordinator and --processes, and with its own --process."
         )
     if status == -signal.SIGABRT and re.search("distributed service detected fatal|coordination", printed):
         return LOST, f"{_other(hosts, printed)} stopped or cannot be reached; {goes_on}"
     if status == -signal.SIGKILL:
-        return 128 + signal.SIGKILL, f"this process was killed, for want of memory perhaps; {goes_on}"
+        return 128 + signal.SIGKILL, f"this process was killed, perhaps because it ran out of memory; {goes_on}"
     if status == 130:
         return 130, "interrupted; earlier results are as they were."
-    # What the libraries of a process that ended by itself print is of no interest.
+    # The output of the libraries is not shown if the process ended normally.
     return (status, "") if status in (0, 2) else None
 
 
 def _other(hosts: Hosts, printed: str) -> str:
-    """Which process is gone, as far as it can be known."""
+    """Return the name of the process that has ended, as far as it is known."""
     unhealthy = re.search(r"unhealthy \(stopped sending heartbeats\):\s*((?:\d+\s+)+)", printed)
     if hosts.process is not None and hosts.processes == 2:
         return f"process {1 - hosts.process} of 2"

@@ -1,4 +1,4 @@
-"""Values whose type says optional where the code knows they are there."""
+"""Optional values that are known to be present."""
 
 from typing import TypeVar
 
@@ -6,6 +6,6 @@ T = TypeVar("T")
 
 
 def not_none(value: T | None) -> T:
-    """`value`, which is known to be there; an AssertionError where it is not."""
-    assert value is not None, "a value that is known to be there is missing"
+    """Return ``value``, which must not be None; an AssertionError otherwise."""
+    assert value is not None, "a required value is None"
     return value

@@ -1,7 +1,7 @@
-"""Effects from outside the package: those registered, those of installed packages, and those of files.
+"""Effects from outside the package: registered ones, those of installed packages, and those of files.
 
-Without jax, since commands note their files here before anything heavy is loaded. Packages and files are read when an
-effect is first looked up (`cfb_mjx.model.effects.catalogue`).
+This module does not import jax, because commands register their files here before they load anything heavy. Packages
+and files are read when an effect is first looked up (`cfb_mjx.model.effects.catalogue`).
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.optional import not_none
 
 GROUP = "cfb_mjx.effects"
-"""Entry points of installed packages: an effect, or a module with effects."""
+"""Group of entry points of installed packages; each is an effect or a module with effects."""
 
 
 @dataclass(frozen=True)
 class _Outside:
-    """All that is known at a time."""
+    """The effects from outside, and the files that are still to be read."""
 
     kinds: Mapping[str, type] = field(default_factory=dict)
     files: tuple[Path, ...] = ()
     read: bool = False
-    """Whether packages and files have been."""
+    """Whether packages and files have been read."""
 
 
 _outside = _Outside()
@@ -41,12 +41,16 @@ _reading = False
 
 @contextmanager
 def plugged(*paths: str | Path) -> Iterator[None]:
-    """A block in which the effects of Python files are known; afterwards everything is as before.
+    """Make the effects of Python files available during a block.
 
-    Effects registered within are forgotten too, so that tests and notebooks leave nothing behind.
+    At its end all effects that were added in the block are removed, also registered ones, so that tests and notebooks
+    have no side effects.
+
+    Args:
+        paths: Python files that define effects.
 
     Raises:
-        CfbError: no such file.
+        CfbError: a file does not exist.
     """
     global _outside
     for path in map(Path, paths):
@@ -62,22 +66,22 @@ def plugged(*paths: str | Path) -> Iterator[None]:
 
 
 def files() -> tuple[Path, ...]:
-    """The files plugged in here."""
+    """Return the plugin files of the enclosing blocks."""
     return _outside.files
 
 
 def kinds(take: Callable[[object], None]) -> Mapping[str, type]:
-    """Effects from outside by name.
+    """Return the effects from outside by name.
 
     Args:
-        take: registers (`add`) what an entry point or a file holds; called for what has not been read yet.
+        take: function that registers (`add`) the effects of an entry point or a file; called for those not read yet.
 
     Raises:
-        CfbError: a package or file that cannot be loaded, or holds no effect, or one that is refused.
+        CfbError: a package or file cannot be loaded, or has no effect or an invalid one.
     """
     global _outside, _reading
     with _lock:
-        # What is being read may look effects up itself.
+        # A plugin may look up effects while it is being read.
         if not (_outside.read or _reading):
             _reading = True
             try:
@@ -90,15 +94,15 @@ def kinds(take: Callable[[object], None]) -> Mapping[str, type]:
 
 
 def add(name: str, kind: type) -> None:
-    """Make an effect known.
+    """Register an effect.
 
     Raises:
-        CfbError: another one has the name.
+        CfbError: another effect has the name.
     """
     global _outside
     with _lock:
         there = _outside.kinds.get(name, kind)
-        # A notebook's cell or a module that runs again defines the same class anew.
+        # A notebook cell or module that runs again defines the same class again.
         if _place(there) != _place(kind):
             raise CfbError(f"effect {kind.__qualname__}: {there.__qualname__} has the name {name!r} already.")
         _outside = replace(_outside, kinds={**_outside.kinds, name: kind})
@@ -134,14 +138,14 @@ def _line(where: str, error: BaseException) -> str:
 
 
 def _module(path: Path) -> ModuleType:
-    """A file as a module; the one there is, if the file has not changed, so that what was compiled for it serves."""
+    """Load a file as a module, or return the loaded one if the file is unchanged, to reuse its compiled programs."""
     source = path.read_bytes()
     name = f"{__name__}.{path.stem}_{sha256(str(path.resolve()).encode()).hexdigest()[:12]}"
     digest = sha256(source).hexdigest()
     there = sys.modules.get(name)
     if there is not None and there.__digest__ == digest:
         return there
-    # Executed here, not by the import system: that would leave compiled files beside the user's.
+    # The import system would write compiled files into the user's folder.
     module = module_from_spec(not_none(spec_from_loader(name, None, origin=str(path))))
     module.__file__ = str(path)
     vars(module)["__digest__"] = digest

@@ -1,4 +1,4 @@
-"""Imports of libraries that talk."""
+"""Imports of libraries that print messages."""
 
 from __future__ import annotations
 
@@ -10,8 +10,11 @@ from collections.abc import Iterator
 
 @contextlib.contextmanager
 def quietly() -> Iterator[None]:
-    """Import within: MJX prints that its optional warp backend is missing, and Brax brings it along together with
-    jaxopt, which warns that it is no longer maintained."""
+    """Suppress the output of imports in this block.
+
+    MJX prints that its optional warp backend is missing. Brax imports MJX and jaxopt, which warns that it is no longer
+    maintained.
+    """
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.filterwarnings("ignore", category=DeprecationWarning)
         yield

@@ -1,8 +1,8 @@
-"""A parent for a process that may be ended by force: it says in one sentence what became of it.
+"""Run the work in a child process, and explain in one sentence how it ended.
 
-When a process of several dies, jax ends the others from C++, with a stack trace and SIGABRT; no Python runs any more
-that could say something better. So the work is done by a child, and what its libraries print by themselves is read
-here, and shown only if nobody can explain it.
+When one of several processes dies, jax ends the others from C++, with a stack trace and SIGABRT; Python code cannot
+print a better message then. So a child does the work. The parent reads the output of its libraries, and shows it only
+if there is no explanation.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ _FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 def supervised(explain: Callable[[int, str], tuple[int, str] | None]) -> None:
-    """Return in a child process. The parent waits for it, and leaves by SystemExit with its status.
+    """Fork, and return in the child. The parent waits for the child and raises SystemExit with its status.
 
-    Call it before threads and jax: it forks.
+    Call it before starting threads or loading jax.
 
     Args:
-        explain: given how the child ended (its exit status; minus the signal's number where one ended it) and what its
-            libraries printed, the status to leave with and a sentence; None if it is not to be explained.
+        explain: function from the child's exit status (minus the number of a signal that ended it) and the output of
+            its libraries to the status of the parent and a sentence; None if there is no explanation.
     """
     said, say = os.pipe()
     waited, alive = os.pipe()
@@ -40,7 +40,7 @@ def supervised(explain: Callable[[int, str], tuple[int, str] | None]) -> None:
         return
     os.close(say)
     os.close(waited)
-    # What the caller had ignored stays so.
+    # Signals that the caller ignored stay ignored.
     heard = [number for number in _FORWARDED if signal.getsignal(number) is not signal.SIG_IGN]
     before = {number: signal.signal(number, lambda number, _: _send(child, number)) for number in heard}
     printed = _read(said)
@@ -58,8 +58,8 @@ def supervised(explain: Callable[[int, str], tuple[int, str] | None]) -> None:
 
 
 def _begin(say: int, waited: int) -> None:
-    """In the child: Python prints where it did, libraries into the pipe; and the parent's end is the child's."""
-    # A Ctrl-C in the terminal goes to the parent alone, which passes it on.
+    """Set up the child: libraries print into the pipe, Python as before; it ends when the parent ends."""
+    # A Ctrl-C in the terminal goes to the parent only, which forwards it.
     os.setpgid(0, 0)
     sys.stdout = Escaped(os.fdopen(os.dup(1), "w", buffering=1))
     sys.stderr = Escaped(os.fdopen(os.dup(2), "w", buffering=1))
@@ -82,7 +82,7 @@ def _send(child: int, number: int) -> None:
 
 
 def _read(source: int) -> str:
-    """To its end; the last `KEPT_BYTES`."""
+    """Read to the end; return the last `KEPT_BYTES`."""
     kept = b""
     while piece := os.read(source, 4096):
         kept = (kept + piece)[-KEPT_BYTES:]

@@ -1,4 +1,4 @@
-"""What reaches the terminal: names of files and words of other programs, but not what would steer it."""
+"""Safe output to the terminal: control characters in file names and in other programs' output are escaped."""
 
 from __future__ import annotations
 
@@ -8,28 +8,28 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TextIO
 
-# Controls but for tab and newline, what turns the direction of writing, other ends of lines, and lone surrogates: bytes
-# of a file's name that are no text, and cannot be printed.
+# Control characters except tab and newline, characters that change the writing direction, other line ends, and lone
+# surrogates, which are bytes of a file name that is not valid text and cannot be printed.
 _STEERING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
 
 def shown(text: str) -> str:
-    r"""The text with escapes (``\x1b``) in place of characters that a terminal would obey."""
+    r"""Return the text with escapes (``\x1b``) in place of characters that control a terminal."""
     return _STEERING.sub(lambda found: ascii(found[0])[1:-1], text)
 
 
 class Escaped:
-    """A stream whose text is `shown`; in everything else the one it is made of."""
+    """A stream that writes `shown` text; otherwise it behaves as the stream it wraps."""
 
     def __init__(self, stream: TextIO):
         self.unescaped = stream
 
     def write(self, text: str) -> int:
-        """Write what may be shown of a text."""
+        """Write the escaped text."""
         return self.unescaped.write(shown(text))
 
     def writelines(self, lines: Iterable[str]) -> None:
-        """Write what may be shown of several."""
+        """Write several escaped texts."""
         for line in lines:
             self.write(line)
 
@@ -39,13 +39,13 @@ class Escaped:
 
 @contextmanager
 def escaped() -> Iterator[None]:
-    """Let all that is printed in this block, by whomever, be `shown`."""
+    """Escape everything that is printed in this block (see `shown`)."""
     out, err = Escaped(sys.stdout), Escaped(sys.stderr)
     sys.stdout, sys.stderr = out, err
     try:
         yield
     finally:
-        # A child process may have put others in their place.
+        # A child process may have replaced the streams.
         if sys.stdout is out:
             sys.stdout = out.unescaped
         if sys.stderr is err:
@@ -53,7 +53,7 @@ def escaped() -> Iterator[None]:
 
 
 def aligned(rows: Iterable[Sequence[str]], gap: int = 2) -> str:
-    """Rows of texts as a table: columns as wide as what stands in them, apart by at least ``gap`` spaces."""
+    """Format rows of texts as a table with aligned columns, at least ``gap`` spaces apart."""
     rows = [list(row) for row in rows]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ((text.ljust(width + gap) for text, width in zip(row, widths, strict=True)) for row in rows)

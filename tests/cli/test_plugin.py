@@ -102,7 +102,7 @@ def test_without_the_plugin_a_model_with_it_is_refused_by_a_sentence_that_says_h
     assert main(["fly", "pid", "--model", str(folder / "mine.yaml")]) == 2
     said = capsys.readouterr().err
     assert "mine.yaml: unknown effect 'air_drag'" in said
-    assert "one of your own needs --plugin FILE.py" in said
+    assert "load an effect of your own with --plugin FILE.py" in said
 
 
 def test_a_search_and_a_training_do_not_go_on_with_another_text_of_the_effect(folder, tmp_path):

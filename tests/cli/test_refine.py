@@ -75,7 +75,7 @@ def test_effects_that_are_not_fitted_anew_keep_what_is_known_of_them(monkeypatch
     given = Given(effects, {"rotor_drag": {"coefficient": 1e-3}}, HEALTHY)
     monkeypatch.setattr("cfb_mjx.sysid.refinement.model_files.fit_given", lambda *_: given)
     base = replace(load_model_file("cfb-guards"), effects=(inertia,))
-    with pytest.warns(CfbWarning, match="no rigid body"):
+    with pytest.warns(CfbWarning, match="impossible for a rigid body"):
         refined, report = model_files.by_innovations(base, [read_log(LOG)], ["rotor_drag"])
     assert refined.effects[0]["uncertainty"] == known
     assert list(report["numbers"]) == ["rotor_drag.coefficient"]

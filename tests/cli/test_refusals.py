@@ -151,7 +151,9 @@ def test_what_is_unusual_is_said_once_and_in_one_sentence(capsys):
             with warnings.catch_warnings():  # as libraries do: Python then forgets what it has shown
                 load_model_file("cfb-guards").with_values("scales", mass=0.3)
     said = capsys.readouterr().err.splitlines()
-    assert said == ["cfb: model cfb-guards: parameters.mass = 0.3 is unusual; mostly it lies between 0.015 and 0.2 kg."]
+    assert said == [
+        "cfb: model cfb-guards: parameters.mass = 0.3 is unusual; usually it lies between 0.015 and 0.2 kg."
+    ]
 
 
 def run_after(preparation, *arguments, **options):

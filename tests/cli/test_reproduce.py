@@ -80,7 +80,7 @@ def test_a_run_stopped_at_the_third_item_shows_two_and_goes_on_with_the_third(it
     page, text = ((tmp_path / name).read_text() for name in ("index.html", "paper.md"))
     for shown in (page, text):
         assert "Title two" in shown
-        assert "Not made yet: three; the same command goes on with them." in shown
+        assert "Not made yet: three; the same command continues with them." in shown
     assert json.loads((tmp_path / "paper.json").read_text())["left"] == ["three"]
     stopped.clear()
     assert cli.main(arguments) == 0

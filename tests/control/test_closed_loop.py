@@ -241,7 +241,7 @@ def test_a_controller_alone_in_another_precision_than_the_drone():
 
 def test_what_cannot_be_flown_is_refused():
     state = MODEL.hover_state()
-    with pytest.raises(CfbError, match="no multiple of the simulation step"):
+    with pytest.raises(CfbError, match="not a multiple of the simulation step"):
         rollout_closed_loop(MODEL, find_controller("pid", MODEL), state, 3)
     with pytest.raises(ValueError, match="cannot be kept every 2"):
         rollout_closed_loop(MODEL, network(), state, 3, every=2)

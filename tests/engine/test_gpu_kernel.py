@@ -336,7 +336,7 @@ def test_the_kernel_is_tried_before_it_is_used(monkeypatch):
     assert tried == [True]
     right = gpu.gpu_kernel.fly
     monkeypatch.setattr(gpu.gpu_kernel, "fly", lambda *a, **k: right(*a, **k) * 1.001)
-    with pytest.warns(UserWarning, match="computes something else"):
+    with pytest.warns(UserWarning, match="its results differ from the plain program's"):
         assert not gpu._tried("interpret", helpers.QUICK_COMPILE)
     monkeypatch.setattr(gpu.gpu_kernel, "fly", lambda *a, **k: 1 / 0)
     with pytest.warns(UserWarning, match="ZeroDivisionError"):

@@ -234,5 +234,5 @@ def test_the_state_is_kicked_in_every_simulation_step():
 
 def test_the_control_step_must_fit_the_simulation():
     task = TargetTask(layout=Layout(control_dt_s=0.01))
-    with pytest.raises(CfbError, match=r"control_dt_s = 0.01 is no multiple"):
+    with pytest.raises(CfbError, match=r"control_dt_s = 0.01 is not a multiple"):
         task.hold(DRONE)

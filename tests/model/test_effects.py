@@ -297,9 +297,9 @@ def test_the_rotors_momentum_of_an_earlier_file_is_kept(guards):
     old = {"name": "gyroscopic", "parameters": {"rotor_inertia": 2e-7}}
     assert float(effect_from_mapping(old, "old.yaml", guards).scale) == pytest.approx(2e-7 / 5e-8)
     for parameters in (None, replace(guards, rotor_inertia=0.0)):
-        with pytest.raises(CfbError, match=r"old\.yaml: .*rotor_inertia is a share .* write scale in its place"):
+        with pytest.raises(CfbError, match=r"old\.yaml: .*rotor_inertia is now a factor .* write scale instead"):
             effect_from_mapping(old, "old.yaml", parameters)
-    with pytest.raises(CfbError, match="write scale in its place"):
+    with pytest.raises(CfbError, match="write scale instead"):
         effect_from_mapping({"name": "gyroscopic", "parameters": {"rotor_inertia": "small"}}, "old.yaml", guards)
     file = replace(load_model_file("cfb-guards"), effects=(old,))
     assert float(Quadrotor.from_file(file).effects[0].scale) == pytest.approx(4.0)

@@ -76,19 +76,19 @@ def test_what_is_registered_within_a_block_is_forgotten_after_it():
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"name": "Air Drag"}, "'name' must be a word"),
+        ({"name": "Air Drag"}, "'name' must consist of lower-case letters"),
         ({"name": "rotor_drag"}, "RotorDrag has the name 'rotor_drag' already"),
         ({"name": "residual_formula"}, "ResidualFormula has the name"),
         ({"name": "sensor_delay"}, "a sensor fault has the name"),
         ({"name": "command_lead"}, "the search has the name"),
-        ({"units": {"coefficient": "N s/m"}}, r"'units' must say something of each field \(coefficient, axes\)"),
-        ({"prior": {"coefficient": (0.0, 0.1)}}, "'prior' must say something of each field"),
+        ({"units": {"coefficient": "N s/m"}}, r"'units' must have an entry for each field \(coefficient, axes\)"),
+        ({"prior": {"coefficient": (0.0, 0.1)}}, "'prior' must have an entry for each field"),
         ({"prior": {"coefficient": (0.1, 0.0), "axes": (0.5, 2.0)}}, "'prior' of coefficient must be two numbers"),
         ({"prior": {"coefficient": (0.01, 0.1), "axes": (0.5, 2.0)}}, "strength coefficient must be zero at neutral"),
         ({"strengths": "coefficient"}, "'strengths' must be a tuple"),
         ({"strengths": ("mass",)}, "'strengths' must be a tuple of the fields"),
         ({"probes": ({"coefficient": 0.1},)}, "'probes' must be a tuple"),
-        ({"coarse": {1: 0.2}}, "'coarse' must number probes"),
+        ({"coarse": {1: 0.2}}, "the keys of 'coarse' must be indices of probes"),
         ({"neutral": Effect.neutral}, "'neutral' is missing"),
         ({"neutral": classmethod(lambda cls: cls(0.1))}, "strength coefficient must be zero at neutral"),
         ({"neutral": classmethod(lambda cls: RotorDrag(0.0))}, "'neutral' must return a Wrong"),
@@ -105,7 +105,7 @@ def test_an_incomplete_effect_is_refused_by_a_sentence_that_names_it(changes, wo
 
 def test_what_is_no_effect_is_refused():
     for thing in (Own(0.0), int):
-        with pytest.raises(CfbError, match="is no effect"):
+        with pytest.raises(CfbError, match="is not an effect"):
             register(thing)
 
 
@@ -140,7 +140,7 @@ def test_the_effects_of_a_file_are_known_inside_a_block(plugin):
         ("def f(:\n", "cannot be loaded: SyntaxError"),
         ("import sys\nsys.exit(3)\n", "cannot be loaded: SystemExit"),
         (AIR_DRAG.replace('"air_drag"', '"wind"'), "effect AirDrag: Wind has the name 'wind' already"),
-        (AIR_DRAG.replace("    units", "    unit"), "effect AirDrag: 'units' must say something of each field"),
+        (AIR_DRAG.replace("    units", "    unit"), "effect AirDrag: 'units' must have an entry for each field"),
     ],
 )
 def test_a_file_that_is_no_plugin_is_refused_every_time_by_a_sentence(plugin, text, words):

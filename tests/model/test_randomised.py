@@ -120,13 +120,13 @@ def test_impossible_or_meaningless_ranges_are_refused(of_type, nominal):
     bare = Quadrotor.from_file("cfb")
     with pytest.raises(CfbError, match="varies rotor_drag, which this drone does not have; add it to the model"):
         sample_drone(jax.random.key(0), bare, ranges)
-    with pytest.raises(CfbError, match="varies effects, which are no parameters; draw with sample_drone"):
+    with pytest.raises(CfbError, match="varies effects, which are not parameters; draw with sample_drone"):
         sample_parameters(jax.random.key(0), nominal.parameters, ranges)
     with pytest.raises(CfbError, match=r"--magnitude = 40: randomisation 'mine' could then draw"):
         require_possible(nominal, ranges, 40.0, "--magnitude")
     effect, field, spread = ranges.effects[0]
     wide = Randomisation("wide", (), ((effect, field, replace(spread, half_width=(0.03,))),))
-    with pytest.raises(CfbError, match=r"rotor_drag.coefficient that does not lie between .* at most 0.\d+ fits"):
+    with pytest.raises(CfbError, match=r"rotor_drag.coefficient outside .* at most 0.\d+ fits"):
         sample_drone(jax.random.key(0), nominal, wide)
     lost = jax.jit(lambda magnitude: sample_drone(jax.random.key(0), nominal, wide, magnitude))(-100.0)
     assert np.isnan(lost.effects[0].coefficient)

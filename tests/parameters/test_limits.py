@@ -276,8 +276,13 @@ def test_traced_numbers_pass_every_constructor():
 
 def test_an_inertia_that_effects_make_impossible_is_refused():
     item = {"name": "inertia", "parameters": {"relative": [0.0, 0.0, 1.0]}}
-    refused(lambda: Quadrotor.from_file(replace(GUARDS, effects=(item,))), "cfb-guards", "inertia", "no rigid body")
-    with pytest.warns(CfbWarning, match="no rigid body"):  # an estimate errs, and comes with how much
+    refused(
+        lambda: Quadrotor.from_file(replace(GUARDS, effects=(item,))),
+        "cfb-guards",
+        "inertia",
+        "impossible for a rigid body",
+    )
+    with pytest.warns(CfbWarning, match="impossible for a rigid body"):  # an estimate errs, and comes with how much
         Quadrotor.from_file(replace(GUARDS, effects=(item | {"uncertainty": {"relative": [0.1, 0.1, 0.9]}},)))
     Quadrotor.from_file(replace(GUARDS, effects=(item,), kind="predictor"))
 
@@ -403,7 +408,7 @@ def test_what_is_no_array_is_refused_where_the_model_is_first_used(entry):
     refused(lambda: ENTRIES[entry](short), "parameters.inertia has shape (2,); it must be (3,)")
     dragged = eqx.tree_at(lambda m: m.effects, MODEL, (RotorDrag(coefficient=0.01),))
     dragged = eqx.tree_at(lambda m: m.effects[0].coefficient, dragged, 0.02)
-    refused(lambda: ENTRIES[entry](dragged), "rotor_drag.coefficient = 0.02 is no array")
+    refused(lambda: ENTRIES[entry](dragged), "rotor_drag.coefficient = 0.02 is not an array")
 
 
 def test_a_batch_of_drones_without_vmap_is_refused():

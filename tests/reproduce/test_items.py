@@ -143,12 +143,12 @@ def test_pages_hold_every_row(tmp_path):
     rows = [Row("a | b", "1", "2", "because"), Row("<c>", "", "3"), Row("<d>", "5", "5", kind="input")]
     results = {"some": Result("Title", ["Text."], rows)}
     text = markdown(results, {"date": "today"}, "a command")
-    assert "1 comparisons with numbers of the paper; beside them 1 inputs" in text
-    assert "and 0 predictions by the model of its own flights" in text
+    assert "1 comparisons with numbers of the paper. In addition there are 1 inputs" in text
+    assert "and 0 predictions of flights that were simulated with the model's own constants" in text
     table = [line for line in text.splitlines() if line.startswith("| ")]
     assert len(table) == 4
     assert {line.count("|") for line in table} == {6}
-    assert "| <d> | 5 | 5 | an input, no result |  |" in table
+    assert "| <d> | 5 | 5 | an input, not a result |  |" in table
     html = page(results, {"date": "today"})
     assert "&lt;c&gt;" in html
     assert not re.search(r'(src|href)="(?!data:)', html)

@@ -284,4 +284,4 @@ def test_what_moved_within_the_type_is_written_with_its_own_number(closed, whole
     assert item["parameters"]["relative"] == pytest.approx(own.parameters["relative"], abs=0.01)
     assert item["spread"] == {"relative": 0.2}
     assert item["uncertainty"]["relative"] > 0
-    assert "Moved within the spread of the type: thrust_scale." in closing_sections._held(typed)
+    assert "Changed within the spread of the type: thrust_scale." in closing_sections._held(typed)

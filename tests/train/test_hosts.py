@@ -244,7 +244,7 @@ def test_what_the_first_refuses_all_refuse(cache, alone):
         (("--processes", "2"), "need --coordinator"),
         (("--coordinator", "auto", "--process", "1"), "leave them out"),
         (("--coordinator", "auto"), "no cluster is found here"),
-        (("--devices", "3"), "cannot be spread over 3 devices evenly"),
+        (("--devices", "3"), "cannot be divided evenly over 3 devices"),
     ],
 )
 def test_what_makes_no_sense_gets_one_sentence(options, sentence, tmp_path):

@@ -107,7 +107,7 @@ class Diverging(Idle):
 def test_weights_that_are_no_numbers_end_a_training_and_cost_no_earlier_policy(tmp_path, monkeypatch):
     monkeypatch.setattr(run, "build", lambda *_: Diverging())
     with pytest.raises(
-        CfbError, match=r"by update 2 the policy's weights are no numbers; the policy of update 1 is kept"
+        CfbError, match=r"by update 2 the policy's weights are not finite any more; the policy of update 1 is kept"
     ):
         train(small("ppo", "checkpoints=2"), tmp_path, evaluate=False)
     assert all(np.isfinite(w).all() for w in weights(tmp_path))
@@ -484,7 +484,7 @@ def test_one_algorithm_goes_on_from_the_others_policy(tmp_path):
     for a, b in zip(weights(tmp_path / "first"), weights(tmp_path / "second"), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
     other = load_config("target", (*SMALL_TRAINING, "network.hidden=[9]"))
-    with pytest.raises(CfbError, match="another observation or network"):
+    with pytest.raises(CfbError, match="observation or network differs from the configuration"):
         Training.prepare(other, {}, tmp_path / "first" / POLICY)
 
 

@@ -276,7 +276,7 @@ def test_numbers_have_the_digits_they_deserve(value, std, unit, expected):
             {"rotor_speed": 60.0, "force": 5.0, "torque": 35.0},
             "what commands do to the rotors (60 %), in the torques (35 %).",
         ),
-        ({"rotor_speed": 0.0, "force": 20.0, "torque": -117.0}, "only predictions ask for it."),
+        ({"rotor_speed": 0.0, "force": 20.0, "torque": -117.0}, "only predictions improve with it."),
     ],
 )
 def test_a_report_says_where_the_evidence_lies(domains, words):

@@ -1,1 +1,1 @@
-"""Measuring speed: workloads, what a machine can do, and the page about it."""
+"""Benchmarks: workloads, the limits of a machine, and the page with the results."""

@@ -1,4 +1,4 @@
-"""Throughput beside the peers, from one run on one machine."""
+"""Measure throughput, together with that of crazyflow, in one run on one machine."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from cfb_mjx.optional import not_none
 from cfb_mjx.runtime import cores, environment, say
 
 TURN_S = 0.03
-"""Runs shorter than this are repeated for as long within a turn: a single one of microseconds says little."""
+"""Least time of a turn; shorter runs are repeated, because a single run of microseconds is not reliable."""
 TURNS, QUICK_TURNS = 7, 2
 TURNS_S = 20.0
-"""What runs quickly goes on taking turns for so long: machines shared with others are busy for seconds at a time."""
+"""Least time of all turns together; other programs on a shared machine can be busy for seconds."""
 
 
 class Peer(TimedProcess):
-    """A crazyflow process that times one run per request, so that its runs can alternate with ours."""
+    """A crazyflow process that times one run per request, so that its runs can alternate with this library's."""
 
     body = "crazyflow"
     devices = 1
@@ -47,7 +47,7 @@ class Peer(TimedProcess):
                     stdout=subprocess.PIPE,
                     stderr=subprocess.PIPE,
                     text=True,
-                    # As its users run it: without the compiler options the cfb command gives itself.
+                    # As its users run it, without the compiler options that the cfb command sets.
                     env={key: value for key, value in os.environ.items() if key != "XLA_FLAGS"},
                 )
         except OSError as error:
@@ -63,7 +63,7 @@ class Peer(TimedProcess):
 
 @contextlib.contextmanager
 def _bound_to(core: int | None) -> Iterator[None]:
-    """Processes started within may use this core only; all there are for None."""
+    """Bind processes that start in this block to one core; None does not bind them."""
     if core is None:
         yield
         return
@@ -78,22 +78,22 @@ def _bound_to(core: int | None) -> Iterator[None]:
 def benchmark(
     drones: Sequence[int], peer_python: Path | None = None, quick: bool = False, roofline: bool = False
 ) -> dict[str, Any]:
-    """Measure, and say how far it is.
+    """Measure the throughput of all workloads, and print the progress.
 
     Args:
         drones: batch sizes.
-        peer_python: a Python that has crazyflow installed, to measure it side by side.
-        quick: fewer rows and repetitions.
-        roofline: measure also how near this comes to what the machine can do.
+        peer_python: Python of an environment with crazyflow, to measure it as well.
+        quick: measure fewer workloads with fewer repetitions.
+        roofline: also compare the speed with the limits of the machine.
 
     Returns:
-        In JSON terms: ``rows``, ``environment``, ``first_call``; ``scaling`` unless ``quick``; ``roofline`` if asked
-        for.
+        JSON values: ``rows``, ``environment`` and ``first_call``; ``scaling`` unless ``quick``; ``roofline`` if
+        requested.
 
     Raises:
-        CfbError: no such peer.
+        CfbError: crazyflow does not run with ``peer_python``.
     """
-    # A program from the cache would make compile time look like nothing.
+    # A program from the cache would take no time to compile.
     jax.config.update("jax_enable_compilation_cache", False)
     over, rows = Devices.take(jax.local_device_count()), []
     for count in drones:
@@ -113,16 +113,16 @@ def benchmark(
     say("measuring the first call")
     result = {"rows": rows, "environment": environment(), "first_call": first_call()}
     if not quick:
-        say("measuring one core and two")
+        say("measuring one core and two cores")
         result["scaling"] = scaling()
     if roofline:
-        say("measuring what the machine can do")
+        say("measuring the limits of the machine")
         result["roofline"] = roofline_of_machine()
     return result
 
 
 def _open_loop(count: int, several: Devices | None, python: Path | None) -> list:
-    """What is measured in turns with crazyflow's own rollout."""
+    """Workloads that take turns with crazyflow's rollout."""
     found = [workloads.rollout(count), workloads.rollout_kept(count), workloads.rollout_randomised(count)]
     found += [workloads.rollout(count, "rigid-plain")] if kernel_is_chosen() else []
     found += [workloads.rollout(count, over=several)] if several else []
@@ -130,14 +130,14 @@ def _open_loop(count: int, several: Devices | None, python: Path | None) -> list
 
 
 def _closed_loop(count: int, several: Devices | None, python: Path | None, network: Path) -> list:
-    """What is measured in turns with crazyflow under the same network."""
+    """Workloads that take turns with crazyflow and the same network."""
     found = [workloads.rollout_policy(count), workloads.network_alone(count)]
     found += [workloads.rollout_policy(count, several)] if several else []
     return found + _peers(python, count, network)
 
 
 def _peers(python: Path | None, count: int, network: Path | None) -> list[Peer]:
-    """crazyflow as its users run it, and on one core, as one device of ours."""
+    """crazyflow as its users run it, and bound to one core, to compare it with one device."""
     if python is None:
         return []
     apart = jax.default_backend() == "cpu" and cores() > 1 and hasattr(os, "sched_getaffinity")
@@ -146,7 +146,7 @@ def _peers(python: Path | None, count: int, network: Path | None) -> list[Peer]:
 
 
 def _others(count: int) -> list:
-    """MJX, and derivatives."""
+    """Workloads of MJX and of derivatives."""
     found = [workloads.rollout(count, "mjx"), workloads.rollout(count, "mjx-floor"), workloads.stock_mjx(count)]
     if count <= 8192:
         found += [workloads.rollout_gradient(count), workloads.rollout_ten(count), workloads.rollout_hundred(count)]
@@ -154,12 +154,12 @@ def _others(count: int) -> list:
 
 
 def _alternate(items: list, turns: int, least_s: float = 0.0) -> list[float]:
-    """Best time of each; the runs take turns, so that a busy moment of the machine hits all of them.
+    """Return the best time of each item. The runs take turns, so that a busy moment of the machine affects all.
 
     Args:
-        items: what is run.
-        turns: of each at least.
-        least_s: for so long in all at least.
+        items: what to run.
+        turns: least number of turns of each.
+        least_s: least total time, s.
     """
     best, end, turn = [float("inf")] * len(items), time.perf_counter() + least_s, 0
     while turn < turns or time.perf_counter() < end:

@@ -1,4 +1,4 @@
-"""How long a user waits for the first rollout of a new process, with nothing compiled before and with everything."""
+"""Time of the first rollout in a new process, with an empty and with a filled compile cache."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ DRONES = 4096
 
 
 def first_call() -> list[dict[str, Any]]:
-    """Rows with ``cache`` (empty, or filled by the row before), ``import_s`` and ``call_s``.
+    """Measure the first rollout, each time in a new process with the compile cache in a temporary folder.
 
-    Each is a process of its own, its compile cache in a temporary folder.
+    Returns:
+        Rows with ``cache`` (``empty``, or ``filled`` by the first row), ``import_s`` and ``call_s``.
     """
     rows = []
     with tempfile.TemporaryDirectory() as folder:

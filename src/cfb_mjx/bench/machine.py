@@ -1,4 +1,4 @@
-"""What this machine can do at most: small loops of multiply-adds, of tanh, and of reading and writing memory."""
+"""Measure the limits of this machine with small loops: multiply-adds, tanh, and memory access."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ import jax
 import jax.numpy as jnp
 
 IN_CACHE, IN_MEMORY = 4096, 2**25
-"""Numbers in an array that stays in a core's fastest cache, and in one that fits in none."""
+"""Sizes of an array that stays in the fastest cache of a core, and of one that fits into no cache."""
 _CHAINS, _LONG, _TURNS = 4, 32, 400
 
 
 class Peaks(NamedTuple):
-    """Per second, of float32, by XLA programs as ours are."""
+    """Rates per second that XLA programs reach in float32."""
 
     plain: float
     """Additions and multiplications."""
     transcendental: float
-    """tanh."""
+    """Evaluations of tanh."""
     cache: float
     """Bytes of a triad (a = b + s c) on arrays of `IN_CACHE` numbers."""
     memory: float
@@ -49,8 +49,7 @@ def _rate(function, amount: float, repetitions: int, size: int = IN_CACHE) -> fl
 
 
 def _multiply_adds(x):
-    # One pass over the array with much to do for each number: chains side by side, so that no multiply-add waits for
-    # the one before it.
+    # One pass over the array with much work per number, in parallel chains, so that no multiply-add waits.
     def turn(_, x):
         chains = [x * (1 + 0.1 * i) for i in range(_CHAINS)]
         for _ in range(_LONG):

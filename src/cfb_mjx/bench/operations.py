@@ -1,4 +1,4 @@
-"""Counting what a program does, from its trace: floating-point operations, transcendental functions, bytes moved."""
+"""Count floating-point operations, transcendental functions and bytes moved in the trace of a program."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ REDUCTIONS = {"reduce_sum", "reduce_max", "reduce_min", "cumsum"}
 
 
 class Operations(NamedTuple):
-    """Of one call."""
+    """Counts of one call."""
 
     plain: float
     """Additions, multiplications, comparisons, divisions, roots; two for each multiply-accumulate of a product."""
     transcendental: float
-    """Exponentials, tangents and the like, each counted as one."""
+    """Exponentials, tangents and other transcendental functions, each counted once."""
     moved: float
-    """Bytes that must pass from one step of a loop to the next, or in and out of a matrix product."""
+    """Bytes that pass from one step of a loop to the next, or in and out of a matrix product."""
 
     def __add__(self, other: tuple[Any, ...]) -> Operations:
         return Operations(*(a + b for a, b in zip(self, other, strict=True)))
 
     def times(self, factor: float) -> Operations:
-        """So many calls."""
+        """Return the counts of ``factor`` calls."""
         return Operations(*(factor * x for x in self))
 
 
@@ -44,9 +44,10 @@ NOTHING = Operations(0.0, 0.0, 0.0)
 
 
 def operations(function: Callable, *arguments: Any) -> Operations:
-    """What a call of ``function`` on such arguments does, by its definition: before a compiler simplifies it.
+    """Count the operations of a call of ``function``, in its trace, before the compiler simplifies it.
 
-    Loops count their turns; of branches the costliest counts. A loop without a known number of turns counts once.
+    The body of a loop counts once per iteration, or once in all if the number of iterations is unknown. Of several
+    branches, the most expensive one counts.
     """
     return _of(jax.make_jaxpr(function)(*arguments).jaxpr)
 
@@ -59,8 +60,8 @@ def _equation(equation) -> Operations:
     name, parameters = equation.primitive.name, equation.params
     if name == "scan":
         body = _plain(parameters["jaxpr"])
-        # By their axes, since versions of jax name the parts differently: what is read of sequences and written to them
-        # has one axis less inside; the carry comes before it.
+        # Recognised by the number of axes, because the names depend on the version of jax: sequences that are read or
+        # written have one axis less in the body. The carry comes before them.
         read = [b for a, b in zip(equation.invars, body.invars, strict=True) if _deeper(a, b)]
         written = [b for a, b in zip(equation.outvars, body.outvars, strict=True) if _deeper(a, b)]
         carry = body.outvars[: len(body.outvars) - len(written)]

@@ -1,4 +1,4 @@
-"""What ``cfb bench`` measured, as sentences and as a Markdown page."""
+"""The results of ``cfb bench`` as sentences and as a Markdown page."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cfb_mjx.bench.roofline import section
 
 
 def body(row: dict) -> str:
-    """The body of a row; of a peer with its version and cores."""
+    """Format the body of a row; for a peer with its version and cores."""
     if "version" not in row:
         return row["body"]
     return f"{row['body']} {row['version']}" + (f", {_cores(row['cores'])}" if row["cores"] else "")
@@ -23,7 +23,7 @@ def _cores(count: int) -> str:
 
 
 def ratios(result: Mapping[str, Any]) -> list[str]:
-    """Side-by-side sentences for every batch size."""
+    """Return sentences that compare the rows of each batch size."""
     lines = []
     for drones in sorted({row["drones"] for row in result["rows"]}):
         rows = [row for row in result["rows"] if row["drones"] == drones]
@@ -35,7 +35,7 @@ def ratios(result: Mapping[str, Any]) -> list[str]:
 
         found = _beside_peers(rows, speed)
         if ten := speed("rollout_ten"):
-            found.append(f"a gradient by ten parameters costs {speed('rollout_hundred') / ten:.1f} x the same rollout")
+            found.append(f"a gradient for ten parameters costs {speed('rollout_hundred') / ten:.1f} x the same rollout")
         if plain := speed("rollout", "rigid-plain"):
             found.append(f"the kernel {speed('rollout') / plain:.2f} x the plain program")
         free, floor, stock = (speed("rollout", name) for name in ("mjx", "mjx-floor", "mjx-stock"))
@@ -51,7 +51,7 @@ def _beside_peers(rows: list[dict], speed) -> list[str]:
     for what, title in (("rollout", "closed form"), ("rollout_policy", "the same network in the loop")):
         name, parts = "", []
         for peer in (row for row in rows if "version" in row and row["what"] == what):
-            # As many devices of ours as it has cores, where that was measured; else the one.
+            # Compare with as many devices as the peer has cores, if that was measured, else with one.
             ours = speed(what, devices=peer["cores"]) if peer["cores"] else None
             on = f"{_cores(peer['cores'])} each" if ours else "one device of ours"
             parts.append(f"{(ours or speed(what)) / peer['steps_per_s']:.1f} x ({on})")
@@ -60,12 +60,12 @@ def _beside_peers(rows: list[dict], speed) -> list[str]:
             lines.append(f"{title} {', '.join(parts)} {name}")
     alone, one = speed("network_alone"), speed("rollout_policy", "crazyflow", cores=1)
     if alone and one:
-        lines.append(f"the network alone, nothing flown, {alone / one:.1f} x crazyflow in the loop (1 core each)")
+        lines.append(f"the network alone, without simulation, {alone / one:.1f} x crazyflow in the loop (1 core each)")
     return lines
 
 
 def text(result: Mapping[str, Any]) -> str:
-    """All rows as a table, and what they say side by side."""
+    """Return all rows as a table, and the comparison."""
     head = f"{'what':<20}{'body':<18}{'drones':>7}{'devices':>8}{'steps/s':>12}{'compile s':>11}{'memory MB':>11}"
     lines = [head, *map(_line, result["rows"])]
     if "roofline" in result:
@@ -85,11 +85,11 @@ def _memory(row: dict) -> str:
 
 
 def page(result: dict, flags: str) -> str:
-    """The results as a Markdown page.
+    """Return the results as a Markdown page.
 
     Args:
-        result: what was measured.
-        flags: of XLA, in that process.
+        result: the results of `benchmark`.
+        flags: ``XLA_FLAGS`` of the process that measured them.
     """
     facts = ", ".join(f"{name} {value}" for name, value in result["environment"].items())
     table = [
@@ -105,25 +105,38 @@ def page(result: dict, flags: str) -> str:
     comparison = "\n".join(f"- {line}" for line in ratios(result))
     return f"""# Performance
 
+Use this page to estimate the time and memory of rollouts, gradients and trainings on a CPU.
+
 Written by `make bench` (`cfb bench --peer-python ... --markdown docs/performance.md`); do not edit.
 
 {facts}
 
-Steps per second of all drones together, float32; the best of several runs that take turns with the peer's.
-`rollout`: open loop, {workloads.STEPS} steps of 4 ms (MJX fewer), one command held per drone, final state only.
-`rollout_kept`: with a command per step, and every state returned. `rollout_randomised`: as `rollout`, every drone with
-its own parameters. `rollout_gradient`: reverse-mode gradient of a
-100-step rollout with respect to all parameters, `rollout_ten` with respect to ten, `rollout_hundred` that rollout
-alone. `rollout_policy`: the shipped policy `target-analytic` in the loop (`rollout_closed_loop`), a command every 8 ms;
-`network_alone`: its network evaluated as often, with nothing to fly or to observe. Bodies: `rigid` closed form; `mjx`
-MuJoCo XLA without contact; `mjx-floor` with floor contact; `mjx-stock` plain `mjx.step` on the same MJCF without
-contact. One JAX device of a CPU is one core of it.
+Speeds are steps per second of all drones together, float32, the best of several runs. Memory is that of the compiled
+program's arguments, results and temporaries. One JAX device of a CPU is one core.
 
-crazyflow runs first-principles dynamics under rotor-velocity control at 500 Hz, `sim.step(500)`, and with the same
-network in its loop at 250 Hz, a command every 8 ms, in a process with XLA's default options, on the one device it uses:
-once free to use all cores, as XLA's library for matrix products does, and once bound to one. Ours runs with the option
-the `cfb` command sets for itself on CPU ([model.md](model.md#speed)): `XLA_FLAGS={flags}`.
-Memory is the compiled program's arguments, results and temporaries.
+| what | measured program |
+|---|---|
+| `rollout` | open loop, {workloads.STEPS} steps of 4 ms (MJX fewer), one command held per drone, final state only |
+| `rollout_kept` | a command per step, every state returned |
+| `rollout_randomised` | as `rollout`, every drone with its own parameters |
+| `rollout_gradient` | reverse-mode gradient of a 100-step rollout with respect to all parameters |
+| `rollout_ten` | the same with respect to ten parameters |
+| `rollout_hundred` | that 100-step rollout without gradient |
+| `rollout_policy` | the shipped policy `target-analytic` in the loop (`rollout_closed_loop`), a command every 8 ms |
+| `network_alone` | its network evaluated as often, without simulation and observation |
+
+| body | meaning |
+|---|---|
+| `rigid` | closed form |
+| `mjx` | MuJoCo XLA without contact |
+| `mjx-floor` | MuJoCo XLA with floor contact |
+| `mjx-stock` | plain `mjx.step` on the same MJCF without contact |
+
+The runs take turns with those of crazyflow. It simulates first-principles dynamics under rotor-velocity control at
+500 Hz (`sim.step(500)`), and with the same network in its loop at 250 Hz, a command every 8 ms. Its process has XLA's
+default options and one device. It is measured twice: free to use all cores, as XLA's library for matrix products does,
+and bound to one core. This library runs with the option that the `cfb` command sets on CPU
+([model.md](model.md#speed)): `XLA_FLAGS={flags}`.
 
 {comparison}
 
@@ -136,12 +149,12 @@ Memory is the compiled program's arguments, results and temporaries.
 
 
 def first_call_section(rows: list[dict]) -> str:
-    """Markdown."""
+    """Return the section on the first call, as Markdown."""
     lines = "\n".join(f"| {row['cache']} | {row['import_s']:.1f} | {row['call_s']:.1f} |" for row in rows)
     return f"""## The first call
 
-A new process flies 4096 drones for half a second, as the `cfb` command would: loading the library, and from there to
-the result. The cache of compiled programs is on by default, in the user's cache folder.
+A new process loads the library and simulates 4096 drones for half a second, as the `cfb` command would. The cache of
+compiled programs is on by default, in the user's cache folder.
 
 | cache | loading, s | first call, s |
 |---|---:|---:|
@@ -150,7 +163,7 @@ the result. The cache of compiled programs is on by default, in the user's cache
 
 
 def scaling_section(rows: list[dict] | None) -> str:
-    """Markdown; nothing where it was not measured."""
+    """Return the section on two cores, as Markdown; empty if it was not measured."""
     if not rows:
         return ""
     lines = "\n".join(
@@ -159,10 +172,10 @@ def scaling_section(rows: list[dict] | None) -> str:
     )
     return f"""## From one core to two
 
-One device in a process bound to one core, and two devices in one bound to two; the runs take turns, the best counts.
-`ppo`: one update with the shipped configuration.
+One device in a process that is bound to one core, and two devices in a process that is bound to two. The runs take
+turns, and the best one counts. `ppo` is one update with the shipped configuration.
 
-| what | drones | devices | steps/s | times one |
+| what | drones | devices | steps/s | relative to one |
 |---|---:|---:|---:|---:|
 {lines}
 """

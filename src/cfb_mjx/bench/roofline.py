@@ -1,4 +1,4 @@
-"""How near the hot paths come to what the machine can do: operations and bytes of a step beside measured peaks."""
+"""Compare the hot paths with the limits of the machine: operations and bytes per step over measured peak rates."""
 
 from __future__ import annotations
 
@@ -16,11 +16,14 @@ HEAD = (
 
 
 def roofline(drones: int = 1024, repetitions: int = REPETITIONS) -> dict[str, Any]:
-    """Measure the machine and every hot path on it.
+    """Measure the peak rates of the machine and the speed of every hot path.
 
     Args:
-        drones: in the rollouts; few enough for their states to stay in a core's cache.
-        repetitions: of every path; the best counts.
+        drones: drones in the rollouts; few enough that their states stay in the cache of a core.
+        repetitions: runs of every path; the best one counts.
+
+    Returns:
+        JSON values: ``machine`` (the peak rates) and ``rows`` (one per path).
     """
     machine = peaks()
     makers = (
@@ -65,7 +68,7 @@ def _row(work: workloads.Workload, seconds: float, machine: Peaks) -> dict[str, 
 
 
 def section(found: dict[str, Any]) -> str:
-    """Markdown of the results."""
+    """Return the section with the results, as Markdown."""
     machine = found["machine"]
     rows = "\n".join(
         f"| {r['what']} | {r['drones']} | {r['steps_per_s']:.3g} | {r['ns_per_step']:.1f} | {r['plain']:.0f} "
@@ -75,22 +78,22 @@ def section(found: dict[str, Any]) -> str:
     )
     return f"""## Beside the machine's limit
 
-This machine, measured in the same run with XLA programs of one line: {machine["plain"] / 1e9:.0f} G additions and
+XLA programs of one line, measured in the same run, reach {machine["plain"] / 1e9:.0f} G additions and
 multiplications per second in cache, {machine["transcendental"] / 1e9:.2f} G tanh per second,
-{machine["cache"] / 1e9:.0f} GB/s for a triad in cache and {machine["memory"] / 1e9:.0f} GB/s in memory; all float32.
+{machine["cache"] / 1e9:.0f} GB/s for a triad in cache and {machine["memory"] / 1e9:.0f} GB/s in memory, all in float32.
 
 Operations, transcendental functions and bytes of one step of one drone are counted in the traced program, before the
-compiler simplifies it: an addition, multiplication, comparison, division or root is one operation (a multiply-add two),
-and bytes are what has to pass from one step of a loop to the next or through a matrix product. Each is divided by the
-measured peak. Their sum over the measured time is what is accounted for; the rest is divisions and roots (which take
-longer than a multiplication), numbers that do not fit into registers between the parts of a step, loops and calls. A
-share above one means that the compiler found less to do than the definition says.
+compiler simplifies it. An addition, multiplication, comparison, division or root is one operation, a multiply-add two.
+Bytes are those that pass from one step of a loop to the next or through a matrix product. Each count is divided by the
+measured peak rate. *Accounted for* is the sum of these times over the measured time. The rest is divisions and roots
+(which take longer than a multiplication), numbers that do not stay in registers between the parts of a step, loops and
+calls. More than 100 % means that the compiler removed operations.
 
 {HEAD}
 |{"---|" * HEAD.count("| ")}
 {rows}
 
-`fit_jacobian`: residuals of a flight's predictions and their derivatives by ten parameters, a step being one row of the
-log; `ppo`: one update with the shipped configuration, flights and learning, a step being one of the simulation.
-`rollout_ten`: derivatives by ten parameters of a loss over 100 steps.
+`fit_jacobian` computes the residuals of a flight's predictions and their derivatives with respect to ten parameters; a
+step is one row of the log. `ppo` is one update with the shipped configuration, flights and training; a step is one step
+of the simulation. `rollout_ten` computes derivatives of a loss over 100 steps with respect to ten parameters.
 """

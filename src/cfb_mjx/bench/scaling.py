@@ -1,7 +1,7 @@
-"""How much faster two cores are than one: the same work on one device bound to one core, and on two.
+"""Measure the speed-up of two cores over one: the same work on one device bound to one core, and on two.
 
-XLA's one CPU device may use several cores by itself, so each measurement runs in a process of its own that may use as
-many cores as it has devices. The processes stay alive and take turns.
+One CPU device of XLA can use several cores, so each measurement runs in a process that may use as many cores as it has
+devices. The processes stay alive and take turns.
 """
 
 from __future__ import annotations
@@ -17,24 +17,25 @@ from cfb_mjx.bench.timed_process import TimedProcess
 from cfb_mjx.optional import not_none
 
 DRONES = {"rollout": 8192, "rollout_policy": 8192, "ppo": 512}
-"""What is measured, and with how many drones."""
+"""Workloads and their numbers of drones."""
 
 
 def scaling(repetitions: int = 15, drones: dict[str, int] | None = None) -> list[dict[str, Any]]:
-    """Rows with ``what``, ``drones``, ``devices``, ``steps_per_s`` (the best run) and ``ratio`` to one device.
+    """Measure all workloads on one core and on two.
 
     Args:
-        repetitions: runs of each; those on one and on two cores alternate.
-        drones: of each workload; `DRONES` by default.
+        repetitions: runs of each workload; those on one and on two cores alternate.
+        drones: numbers of drones by workload; `DRONES` by default.
 
     Returns:
-        No rows where this process may use one core only, or cannot choose them (other systems than Linux).
+        Rows with ``what``, ``drones``, ``devices``, ``steps_per_s`` (the best run) and ``ratio`` to one device. Empty
+        if this process may use one core only, or cannot bind processes (systems other than Linux).
     """
     if not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2:
         return []
     cores, rows = sorted(os.sched_getaffinity(0))[:2], []
     for what, count in (drones or DRONES).items():
-        # One device on either core: another program may keep one of them busy, which would flatter two.
+        # Measure one device on either core: if another program keeps one core busy, the ratio would be too large.
         runners = [_Runner(what, count, chosen) for chosen in (cores[:1], cores[1:], cores)]
         times = [float("inf")] * 3
         try:

@@ -1,4 +1,4 @@
-"""A process that times one run of something for every line it is sent, so that its runs can alternate with others."""
+"""A process that times one run of a workload per request, so that its runs can alternate with those of others."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from cfb_mjx.optional import not_none
 
 
 class TimedProcess:
-    """The caller's end of such a process, whose standard input and output are pipes of text."""
+    """Handle of such a process; its standard input and output are text pipes."""
 
     process: subprocess.Popen
 
     def seconds(self) -> float:
-        """Wall time of one run there."""
+        """Run it once and return the wall time."""
         given, answers = self._pipes()
         given.write("\n")
         given.flush()
         return float(answers.readline())
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         given, answers = self._pipes()
         given.close()
         self.process.wait()

@@ -1,4 +1,4 @@
-"""What ``cfb bench`` measures: each workload is a compiled program with its arguments and its number of steps."""
+"""The workloads of ``cfb bench``: compiled programs with their arguments and numbers of steps."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ from cfb_mjx.parameters import load_randomisation, sample_parameters
 
 STEPS = 500
 MJX_WORK = 200_000
-"""Steps of all drones together in one MJX measurement; MJX is some hundred times slower than the closed form."""
+"""Steps of all drones together in one MJX measurement; MJX is about a hundred times slower than the closed form."""
 
 KEPT = 1_000_000
-"""States of all drones together in one measurement that keeps them: 70 MB."""
+"""States of all drones together in a measurement that returns them: 70 MB."""
 
 
 @dataclass
 class Workload:
-    """A measurable program: ``run`` blocks until done."""
+    """A compiled program to measure; ``run`` returns when it is done."""
 
     what: str
     body: str
@@ -52,7 +52,7 @@ class Workload:
     """The function and its arguments, before compiling."""
 
     def seconds(self) -> float:
-        """Wall time of one run."""
+        """Run it once and return the wall time."""
         begin = time.perf_counter()
         self.run()
         return time.perf_counter() - begin
@@ -61,7 +61,7 @@ class Workload:
 def _compile(
     what: str, body: str, drones: int, steps: int, function, *arguments, over: Devices | None = None
 ) -> Workload:
-    """With ``over``, what comes after the first argument is divided over these devices."""
+    """Compile a workload; with ``over``, the arguments after the first are divided over these devices."""
     if over is not None:
         function = over.divided(function, (None, *[0] * (len(arguments) - 1)), 0)
         arguments = (over.whole(arguments[0]), *over.along(arguments[1:]))
@@ -82,15 +82,18 @@ def _compile(
 def _start(model: Quadrotor, drones: int):
     hover, command = model.hover_state(), model.hover_command()
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (drones, *x.shape)), hover)
-    # Not all alike: nothing may be shared between drones.
+    # Different commands, so that no work can be shared between drones.
     commands = command * (1 + 0.01 * jax.random.normal(jax.random.key(0), (drones, 1, 4)))
     return states, commands
 
 
 def rollout(drones: int, body: str = "rigid", over: Devices | None = None) -> Workload:
-    """Open loop, one command held per drone, final state only: what crazyflow's ``sim.step(n)`` does.
+    """Open-loop rollout that returns the final state, with one command held per drone, as crazyflow's ``sim.step(n)``.
 
-    With ``over`` the drones are divided over several devices.
+    Args:
+        drones: number of drones.
+        body: ``rigid``, ``rigid-plain`` (without the GPU kernel), ``mjx`` or ``mjx-floor``.
+        over: devices that share the drones; one device by default.
     """
     mjx_floor = {"mjx": False, "mjx-floor": True}
     choices = {"body": MjxBody(floor=mjx_floor[body])} if body in mjx_floor else {}
@@ -98,13 +101,13 @@ def rollout(drones: int, body: str = "rigid", over: Devices | None = None) -> Wo
     steps = max(5, min(200, MJX_WORK // drones)) if choices else STEPS
     states, commands = _start(model, drones)
     fly = jax.vmap(lambda m, s, u: rollout_final(m, s, u, hold=steps), in_axes=(None, 0, 0))
-    # Beside the kernel that a GPU gets, the program it would have got without.
+    # The program without the kernel that a GPU uses by default.
     with using("plain") if body == "rigid-plain" else contextlib.nullcontext():
         return _compile("rollout", body, drones, steps, fly, model, states, commands, over=over)
 
 
 def rollout_kept(drones: int) -> Workload:
-    """As `rollout` (closed form), every state kept; fewer steps of many drones."""
+    """Rollout of the closed form that returns every state; large batches take fewer steps."""
     model, steps = Quadrotor.from_file("cfb-guards"), max(10, min(STEPS, KEPT // drones))
     states, commands = _start(model, drones)
     commands = jnp.repeat(commands, steps, axis=1)
@@ -113,7 +116,7 @@ def rollout_kept(drones: int) -> Workload:
 
 
 def rollout_randomised(drones: int) -> Workload:
-    """As `rollout` (closed form) with every drone's parameters drawn from the paper's randomisation."""
+    """Rollout of the closed form with the parameters of every drone drawn from the paper's randomisation."""
     model = Quadrotor.from_file("cfb-guards")
     ranges = load_randomisation()
 
@@ -128,7 +131,7 @@ def rollout_randomised(drones: int) -> Workload:
 
 
 def rollout_gradient(drones: int) -> Workload:
-    """Reverse-mode gradient of the final position's square with respect to all parameters, 100 steps."""
+    """Reverse-mode gradient of the squared final distance after 100 steps with respect to all parameters."""
     model = Quadrotor.from_file("cfb-guards")
     states, commands = _start(model, drones)
 
@@ -142,9 +145,11 @@ def _distance(model: Quadrotor, states: State, commands: Array) -> Array:
 
 
 def rollout_policy(drones: int, over: Devices | None = None) -> Workload:
-    """Closed loop: the shipped policy `target-analytic` commands every 8 ms on the true state, two steps of 4 ms each.
+    """Closed-loop rollout: the shipped policy `target-analytic` reads the true state every 8 ms, two steps of 4 ms.
 
-    With ``over`` the drones are divided over several devices.
+    Args:
+        drones: number of drones.
+        over: devices that share the drones; one device by default.
     """
     model = Quadrotor.from_file("cfb-guards")
     controller = load_policy("target-analytic").controller
@@ -162,12 +167,12 @@ def rollout_policy(drones: int, over: Devices | None = None) -> Workload:
 
 
 def network_alone(drones: int) -> Workload:
-    """The network of `rollout_policy` as often as there, with nothing to fly: no simulator can be faster with it."""
+    """The network of `rollout_policy`, evaluated as often, without a simulation: an upper bound for any simulator."""
     controller = load_policy("target-analytic").controller
     commands, groups = STEPS // 4, -(-drones // at_once())
 
     def one(shown, _):
-        # Every command is seen by the next one; nothing could be left out.
+        # Every evaluation depends on the last one, so that none can be optimised away.
         return shown.at[:4].set(controller.act(shown)), None
 
     def act(shown):
@@ -178,7 +183,7 @@ def network_alone(drones: int) -> Workload:
 
 
 def network_file(folder: Path) -> Path:
-    """The network of `rollout_policy` as arrays w0, b0, w1 ..., for a peer."""
+    """Write the network of `rollout_policy` as arrays w0, b0, w1 ..., for a peer; return the path of the file."""
     network = load_policy("target-analytic").controller.network
     layers = enumerate(zip(network.weights, network.biases, strict=True))
     path = folder / "network.npz"
@@ -188,19 +193,19 @@ def network_file(folder: Path) -> Path:
 
 
 def rollout_ten(drones: int) -> Workload:
-    """As `rollout_gradient`, with respect to ten parameters only."""
+    """Reverse-mode gradient of the loss of `rollout_hundred` with respect to ten parameters."""
     states, commands, loss = _of_ten_parameters(drones)
     return _compile("rollout_ten", "rigid", drones, 100, jax.grad(loss), jnp.ones(10), states, commands)
 
 
 def rollout_hundred(drones: int) -> Workload:
-    """The loss that `rollout_ten` differentiates, alone."""
+    """The loss over 100 steps that `rollout_ten` differentiates, without derivatives."""
     states, commands, loss = _of_ten_parameters(drones)
     return _compile("rollout_hundred", "rigid", drones, 100, loss, jnp.ones(10), states, commands)
 
 
 def _of_ten_parameters(drones: int):
-    """States, commands, and the loss as a function of ten factors of parameters and of them."""
+    """Return states, commands, and the loss as a function of ten factors of parameters, states and commands."""
     model = Quadrotor.from_file("cfb-guards")
     names = ("mass", "inertia", "rotor_inertia", "motor_time_constant", "motor_gain", "thrust_scale", "torque_scale")
 
@@ -216,7 +221,7 @@ def _of_ten_parameters(drones: int):
 
 
 def fit_jacobian() -> Workload:
-    """Residuals of a fit to the shipped logs, and their derivatives by its parameters; a step is a row of a log."""
+    """Residuals of a fit to the shipped logs and their derivatives with respect to its parameters; a step is a row."""
     from cfb_mjx.logs import read_log
     from cfb_mjx.sysid.identification.fitting import fit_slopes
     from cfb_mjx.sysid.identification.flight_data import prepare
@@ -237,7 +242,7 @@ def fit_jacobian() -> Workload:
 
 
 def ppo_update(drones: int = 512) -> Workload:
-    """One update of PPO with the shipped configuration: flights of all drones, and the learning from them."""
+    """One update of PPO with the shipped configuration: flights of all drones, and training on them."""
     from cfb_mjx.train.config import load_config
     from cfb_mjx.train.ppo import Ppo
     from cfb_mjx.train.run import Training, build
@@ -257,7 +262,7 @@ def ppo_update(drones: int = 512) -> Workload:
 
 
 def stock_mjx(drones: int) -> Workload:
-    """Plain ``mjx.step`` on the shipped MJCF with contacts switched off and a constant applied force, for reference."""
+    """Plain ``mjx.step`` on the shipped MJCF, without contacts and with a constant applied force, for reference."""
     specification = mujoco.MjSpec.from_file(str(shipped("assets", "cfb.xml")))
     specification.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
     model = mjx.put_model(specification.compile(), impl="jax")

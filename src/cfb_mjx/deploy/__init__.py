@@ -1,4 +1,4 @@
-"""Trained policies as C for the drone, and the check that they do the same there."""
+"""Export of trained policies as C for the drone, and the check that the C computes the same commands."""
 
 from cfb_mjx.deploy.compiled import CompiledPolicy, compile_policy
 from cfb_mjx.deploy.contract import contract

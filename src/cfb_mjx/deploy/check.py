@@ -1,4 +1,4 @@
-"""Whether an exported policy does what it does in JAX, and what a step of it costs on the drone."""
+"""Check an exported policy: does it compute what it computes in JAX, and what does a step cost on the drone."""
 
 from __future__ import annotations
 
@@ -13,41 +13,44 @@ from cfb_mjx.deploy.flights import fly_beside
 from cfb_mjx.deploy.parity import TOLERANCE, begin, compare, random_inputs
 
 NEAR_M = 1e-3
-"""How near each other the C and JAX have to hover."""
+"""Largest distance between the flights of C and JAX."""
 FLASH, RAM, STEP_S = 64 * 1024, 8 * 1024, 1e-3
-"""What a step may take on the drone."""
+"""Limits of flash [bytes], memory [bytes] and time [s] of a step on the drone."""
 _EMULATED_TOLERANCE = 1e-6
 
 
 class Finding(NamedTuple):
-    """One of the things that were looked at."""
+    """Result of one check."""
 
     text: str
     good: bool = True
 
 
 class Check(NamedTuple):
-    """What was found."""
+    """Results of all checks."""
 
     numbers: dict[str, Any]
     findings: list[Finding]
 
     @property
     def faults(self) -> list[str]:
-        """What is not as it should be."""
+        """Texts of the failed checks."""
         return [finding.text for finding in self.findings if not finding.good]
 
 
 def check_export(exported: Exported) -> Check:
-    """Compile the C, compare it with JAX on random sequences and in closed loop, and measure what it costs.
+    """Compile the C, compare it with JAX on random sequences and in closed loop, and measure its costs.
+
+    Args:
+        exported: the exported policy.
 
     Raises:
-        CfbError: there is no compiler, or it objects.
+        CfbError: there is no compiler, or it reports an error.
     """
     deployment, compiled = exported.deployment, compile_policy(exported)
     parity = compare(deployment, compiled)
     six = fly_beside(deployment, compiled, 6.0)
-    # A flip is demanding from where it begins; holding is from some way off.
+    # A flip is demanding from its start; holding a target is demanding from a distance.
     second = six if deployment.flips else fly_beside(deployment, compiled, 1.0, (0.5, -0.5, 0.3))
     largest, what = second.command_difference(1.0), "flip" if deployment.flips else "hover"
     costs, about_costs = _costs(exported, compiled)
@@ -74,7 +77,7 @@ def check_export(exported: Exported) -> Check:
 
 
 def _costs(exported: Exported, compiled: CompiledPolicy) -> tuple[dict[str, Any], list[Finding]]:
-    """On the drone's processor."""
+    """Cost of a step on the drone's processor: numbers and findings."""
     deployment, findings = exported.deployment, []
     macs, cycles, clock = cortex.multiply_accumulates(deployment), cortex.CYCLES_PER_INSTRUCTION, cortex.CLOCK_HZ
     found: dict[str, Any] = {"multiply_accumulates": macs, "clock_hz": clock}

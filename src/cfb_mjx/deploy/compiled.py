@@ -16,11 +16,11 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.files import scratch
 
 FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra", "-Werror")
-"""What the sources must compile with."""
+"""Flags with which the sources must compile."""
 
 
 class CompiledPolicy:
-    """The C policy behind its own interface. One of these at a time is in one state; `reset` begins anew."""
+    """The compiled C policy. The C library holds one global state; `reset` begins anew."""
 
     def __init__(self, library: ctypes.CDLL, flips: bool):
         self._library, self.flips = library, flips
@@ -37,31 +37,31 @@ class CompiledPolicy:
 
     @property
     def fault(self) -> int:
-        """0: fine, 1: blind, 2: stopped."""
+        """Fault of the policy: 0 none, 1 blind, 2 stopped."""
         return int(self._library.cfb_policy_fault())
 
     @property
     def phase(self) -> int:
-        """Of a flip: 0 hold, 1 climb, 2 turn, 3 catch."""
+        """Phase of a flip: 0 hold, 1 climb, 2 turn, 3 catch."""
         return int(self._library.cfb_policy_phase())
 
     def reset(self) -> None:
-        """Forget everything."""
+        """Clear the memory."""
         self._library.cfb_policy_reset()
 
     def set_flip(self, speed_mps: float, rate_radps: float) -> None:
-        """Begin a flip with the next step."""
+        """Begin a flip at the next step."""
         self._library.cfb_policy_set_flip(speed_mps, rate_radps)
 
     def step(self, position, velocity, quaternion, body_rate, target=(0.0, 0.0, 0.0)) -> np.ndarray:
-        """Commands of M1..M4, (4,), float32."""
+        """Do one step; return the commands of M1..M4, (4,), float32."""
         return self.steps(np.concatenate([position, velocity, quaternion, body_rate, target])[None])[0]
 
     def steps(self, inputs: np.ndarray) -> np.ndarray:
-        """Many steps in a row.
+        """Do many steps in a row.
 
         Args:
-            inputs: (steps, 16) position, velocity, quaternion, body rate, target.
+            inputs: (steps, 16): position, velocity, quaternion, body rate, target.
 
         Returns:
             Commands, (steps, 4), float32.
@@ -76,25 +76,29 @@ class CompiledPolicy:
 
 
 def compile_policy(exported: Exported, extra: Sequence[str] = ()) -> CompiledPolicy:
-    """Compile with the system's compiler (``CC``, else cc), strictly.
+    """Compile with the system's compiler (``CC``, else cc) and strict flags.
+
+    Args:
+        exported: the exported policy.
+        extra: further flags.
 
     Raises:
-        CfbError: there is no compiler, or it objects.
+        CfbError: there is no compiler, or it reports an error.
     """
     compiler = os.environ.get("CC") or "cc"
     with scratch("cfb-policy-") as folder:
         library = Path(folder) / "policy.so"
         sources = [str(path) for path in exported.sources]
         run_compiler([compiler, *FLAGS, *extra, "-shared", "-fPIC", "-o", str(library), *sources, "-lm"])
-        # Loaded, it stays in memory after its file is gone.
+        # Once loaded, the library stays in memory after its file is deleted.
         return CompiledPolicy(ctypes.CDLL(str(library)), exported.deployment.flips)
 
 
 def run_compiler(command: list[str]) -> str:
-    """Run a compiler or one of its tools; what it printed.
+    """Run a compiler or one of its tools, and return its output.
 
     Raises:
-        CfbError: it is not there, or fails.
+        CfbError: the program is not installed, or fails.
     """
     if shutil.which(command[0]) is None:
         raise CfbError(f"{command[0]}: there is no such compiler; install one (Debian: apt install gcc) or set CC.")

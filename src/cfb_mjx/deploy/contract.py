@@ -1,4 +1,4 @@
-"""The contract of an exported policy: every number that goes in and comes out, with unit, frame, rate and scale."""
+"""The contract of an exported policy: all inputs and outputs with unit, frame, rate and scale."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from cfb_mjx.optional import not_none
 
 FORMAT = "cfb_mjx contract 1"
 BLIND_STEPS = 5
-"""Steps without an estimate before the motors are stopped."""
+"""Number of steps without an estimate after which the motors are stopped."""
 LARGEST = 1e6
-"""No estimate is larger."""
+"""Largest valid input."""
 
 
 def contract(deployment: Deployment) -> dict[str, Any]:
-    """The contract as JSON terms."""
+    """Return the contract of an export, for JSON."""
     layout = deployment.holder.controller.layout
     trained = deployment.trained_on()
     found: dict[str, Any] = {
@@ -118,7 +118,7 @@ def _bend(bend: float, unit: str) -> dict[str, str]:
 
 
 def _observation(layout: Layout) -> list[dict[str, Any]]:
-    """Segments of what the network is shown, in order."""
+    """Segments of the network's input, in order."""
     axes = "body" if layout.body_velocity else "world"
     frame: list[dict[str, Any]] = []
     if layout.position:

@@ -1,8 +1,8 @@
-"""What an exported policy costs on the drone's STM32F405: flash, memory, stack, instructions of a step.
+"""Cost of an exported policy on the drone's STM32F405: flash, memory, stack, instructions per step.
 
-Sizes are those of arm-none-eabi-gcc. Instructions are counted by running the very program on QEMU's model of an
-STM32F405 (machine netduinoplus2), whose commands are compared as well. Without these two there is an estimate from the
-number of multiply-accumulates.
+Sizes are those of arm-none-eabi-gcc. Instructions are counted by running the same program on QEMU's model of an
+STM32F405 (machine netduinoplus2), whose commands are also compared. Without these two programs the instructions are
+estimated from the number of multiply-accumulates.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from cfb_mjx.optional import not_none
 
 CLOCK_HZ = 168e6
 CYCLES_PER_INSTRUCTION = 2.0
-"""More than the Cortex-M4 needs on code like this: most instructions take one cycle, loads of two in a row fewer than
-two each, a division 14, a taken branch up to 4, and the STM32's cache hides waiting for flash most of the time."""
+"""More than the Cortex-M4 needs for such code: most instructions take one cycle, consecutive loads fewer than two each,
+a division 14, a taken branch up to 4, and the STM32's cache hides most of the waiting for flash."""
 INSTRUCTIONS_PER_MAC, INSTRUCTIONS_PER_ACTIVATION = 8.0, 80.0
-"""For the estimate: somewhat more than what QEMU counts for the shipped policies."""
+"""For the estimate: slightly more than QEMU counts for the shipped policies."""
 _TARGET = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard")
 _GCC, _SIZE, _QEMU = "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm"
 _KNOWN = 1_000_000
-"""Instructions of the loop that the emulated clock is read against; see emulated/main.c."""
+"""Instructions of the loop that calibrates the emulated clock; see emulated/main.c."""
 
 
 class Size(NamedTuple):
-    """In bytes, of the plain library."""
+    """Sizes of the plain library, in bytes."""
 
     flash: int
     ram: int
     stack: int
-    """Of all its functions together: more than any chain of calls needs."""
+    """Stack of all its functions together: more than any chain of calls needs."""
 
 
 class Emulated(NamedTuple):
@@ -50,35 +50,38 @@ class Emulated(NamedTuple):
     commands: np.ndarray
     """(steps, 4), float32."""
     instructions: np.ndarray
-    """(steps,), of every step."""
+    """(steps,), instructions of every step."""
 
 
 def has_compiler() -> bool:
-    """Whether sizes can be measured here."""
+    """Whether sizes can be measured on this machine."""
     return all(map(shutil.which, (_GCC, _SIZE)))
 
 
 def has_emulator() -> bool:
-    """Whether instructions can be counted here."""
+    """Whether instructions can be counted on this machine."""
     return has_compiler() and shutil.which(_QEMU) is not None
 
 
 def multiply_accumulates(deployment: Deployment) -> int:
-    """Of a step: of the larger network, since a step asks one of them."""
+    """Multiply-accumulates per step: those of the larger network, because a step evaluates one of them."""
     return max(sum(int(w.size) for w in p.controller.network.weights) for p in deployment.policies.values())
 
 
 def estimated_instructions(deployment: Deployment) -> float:
-    """Of a step, without running it."""
+    """Instructions per step, estimated without running it."""
     activations = max(sum(len(b) for b in p.controller.network.biases) for p in deployment.policies.values())
     return INSTRUCTIONS_PER_MAC * multiply_accumulates(deployment) + INSTRUCTIONS_PER_ACTIVATION * activations
 
 
 def size(exported: Exported) -> Size:
-    """Compile the plain library for the Cortex-M4, as strictly as for the host, and measure it.
+    """Compile the plain library for the Cortex-M4, as strictly as for the host, and measure its size.
+
+    Args:
+        exported: the exported policy.
 
     Raises:
-        CfbError: there is no such compiler, or it objects.
+        CfbError: the compiler is not installed, or reports an error.
     """
     with scratch("cfb-cortex-") as folder:
         objects = []
@@ -92,14 +95,14 @@ def size(exported: Exported) -> Size:
 
 
 def emulate(exported: Exported, inputs: np.ndarray) -> Emulated:
-    """Run estimates through the policy on the emulated STM32F405; flips begin with the first.
+    """Run estimates through the policy on the emulated STM32F405; a flip begins with the first.
 
     Args:
-        exported: the policy.
-        inputs: (steps, 16) position, velocity, quaternion, body rate, target.
+        exported: the exported policy.
+        inputs: (steps, 16): position, velocity, quaternion, body rate, target.
 
     Raises:
-        CfbError: no compiler or emulator, or the program does not come to its end.
+        CfbError: compiler or emulator is not installed, or the program does not end.
     """
     if not has_emulator():
         raise CfbError(
@@ -133,12 +136,12 @@ def emulate(exported: Exported, inputs: np.ndarray) -> Emulated:
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=120)
         except subprocess.TimeoutExpired:
-            raise CfbError("the policy does not come to its end on the emulated STM32F405.") from None
+            raise CfbError("the policy did not finish on the emulated STM32F405 within 120 s.") from None
         return _read(done.stdout + done.stderr, len(inputs))
 
 
 def _read(said: str, steps: int) -> Emulated:
-    """What the program says, in hexadecimal."""
+    """Parse the output of the program, hexadecimal numbers."""
     words = re.findall(r"^(\w+) ([0-9a-f]{8})$", said, re.MULTILINE)
     found = {what: np.array([int(v, 16) for w, v in words if w == what], np.uint32) for what in ("known", "u", "ticks")}
     if len(found["known"]) != 1 or len(found["u"]) != 4 * steps or len(found["ticks"]) != steps:

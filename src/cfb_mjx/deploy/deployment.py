@@ -1,4 +1,4 @@
-"""What goes onto the drone: a policy that holds a target, or one that flips in between."""
+"""What is exported to the drone: a policy that holds a target, optionally with a flip."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cfb_mjx.parameters.model_file import load_model_file
 from cfb_mjx.parameters.parameters import current_names
 
 CATCH_S = 3.0
-"""How long after the turn a flip counts as under way."""
+"""Time after the turn during which a flip still counts as running, s."""
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,10 @@ class Deployment:
     """Policies and manoeuvre of one export.
 
     Attributes:
-        name: for people.
-        holder: flies to targets.
-        turner: of a flip; None: there is none.
-        manoeuvre: its knobs.
+        name: name for users.
+        holder: policy that flies to targets.
+        turner: policy of the flip; None: no flip.
+        manoeuvre: rotations and knobs of the flip.
     """
 
     name: str
@@ -45,19 +45,19 @@ class Deployment:
 
     @property
     def controller(self) -> NeuralController | Manoeuvre:
-        """The same in JAX. A flip begins with its first command."""
+        """The same controller in JAX. A flip begins with its first command."""
         if self.turner is None:
             return self.holder.controller
         return Manoeuvre(self.holder.controller, self.turner.controller, not_none(self.manoeuvre).knobs)
 
     @property
     def policies(self) -> dict[str, PolicyFile]:
-        """All of them by what they do."""
+        """All policies by their role."""
         return {"holder": self.holder} | ({} if self.turner is None else {"turner": self.turner})
 
     @property
     def setpoint_ranges(self) -> dict[str, tuple[float, float]]:
-        """Of a flip's speed and rate: what its policy was trained for, and the manoeuvre's own, where that is more."""
+        """Ranges of a flip's speed and rate: those of the policy's training, extended to the manoeuvre's own values."""
         turner, manoeuvre = not_none(self.turner), not_none(self.manoeuvre)
         trained = (turner.training.get("config") or {}).get("setpoints", {})
         ranges = {}
@@ -68,20 +68,20 @@ class Deployment:
         return ranges
 
     def trained_on(self) -> dict[str, Any] | None:
-        """The model that the holder was trained on; None: its file does not say."""
+        """Model on which the holder was trained; None if its file does not say."""
         return self.holder.training.get("model")
 
     def pose_delay(self) -> float | None:
-        """Age of the pose that the holder was trained with, s; None: its file does not say."""
+        """Pose delay with which the holder was trained, s; None if its file does not say."""
         trained = self.trained_on()
         return None if trained is None else current_names(trained["parameters"], f"policy {self.name}")["pose_delay"]
 
     def hover_command(self) -> float:
-        """The command that hovers the drone it was trained for, mean of the motors."""
+        """Command at which the drone of the training hovers, mean of the motors."""
         return float(np.mean(self.plant().hover_command()))
 
     def plant(self) -> Quadrotor:
-        """The drone it was trained for, without effects; the paper's with guards where its file does not say."""
+        """Drone of the training, without effects; the paper's with guards if the policy's file does not say."""
         model = load_model_file("cfb-guards")
         if (trained := self.trained_on()) is not None:
             model = model.with_values(f"training of {self.name}", **trained["parameters"])
@@ -89,16 +89,16 @@ class Deployment:
 
 
 def find_deployment(name: str | Path, knobs: str | Path | None = None, holder: str | Path | None = None) -> Deployment:
-    """What a name or file stands for.
+    """Find the policies and the manoeuvre of a name or file.
 
     Args:
-        name: a shipped policy, a policy file, or a shipped manoeuvre (``double-flip``: the shipped flip policy
-            with it).
-        knobs: manoeuvre of a flip policy: a shipped one or a YAML file; ``flip`` by default.
-        holder: the target policy that climbs and catches in a flip; by default the one its knobs were found with.
+        name: shipped policy, policy file, or shipped manoeuvre (``double-flip``: the shipped flip policy with that
+            manoeuvre).
+        knobs: manoeuvre of a flip policy: a shipped one or a YAML file; default: ``flip``.
+        holder: target policy that climbs and catches in a flip; default: the one with which the knobs were found.
 
     Raises:
-        CfbError: there is no such policy or manoeuvre, or they do not go together.
+        CfbError: there is no such policy or manoeuvre, or they do not fit together.
     """
     shipped = shipped_policies()
     if str(name) in shipped_manoeuvres() and str(name) not in shipped:
@@ -125,5 +125,5 @@ def _policy(name: str | Path) -> PolicyFile:
 def _flip(name: str, turner: PolicyFile, manoeuvre: ManoeuvreFile, holder: str | Path | None) -> Deployment:
     held = _policy(holder or manoeuvre.holder)
     found = Deployment(name, held, turner, manoeuvre)
-    _ = found.controller  # says so where they do not go together
+    _ = found.controller  # raises if the two do not fit together
     return found

@@ -1,4 +1,4 @@
-"""A policy as a folder of C: fixed sources, and weights and settings generated for it."""
+"""Export a policy as a folder of C: fixed sources, and generated weights and settings."""
 
 from __future__ import annotations
 
@@ -20,43 +20,47 @@ from cfb_mjx.optional import not_none
 FIXED = ("cfb_network.h", "cfb_network.c", "cfb_pilot.h", "cfb_policy.h", "cfb_policy.c", "controller_out_of_tree.c")
 BUILD = ("Kbuild", "Makefile", "app-config", "README.md")
 LIBRARY = ("cfb_policy.c", "cfb_pilot.c", "cfb_network.c", "cfb_data.c")
-"""What makes the plain library."""
+"""Sources of the plain library."""
 PILOTS = {True: "cfb_pilot_flip.c", False: "cfb_pilot_hold.c"}
-"""Both are exported under one name, so that nothing of an earlier export is left beside a later one."""
+"""Both are exported under one name, so that no file of an earlier export remains beside a later one."""
 RESULTS = "check.json"
-"""What ``cfb export --check`` writes."""
+"""File that ``cfb export --check`` writes."""
 _NEVER = 1e9
-"""A time, speed or angle that is not reached."""
+"""Stands for a time, speed or angle that is never reached."""
 
 
 class Exported(NamedTuple):
-    """What was written."""
+    """Folder of an export."""
 
     folder: Path
     deployment: Deployment
 
     @property
     def sources(self) -> list[Path]:
-        """Of the plain library."""
+        """Sources of the plain library."""
         return [self.folder / name for name in LIBRARY]
 
 
 def export_policy(deployment: Deployment, folder: str | Path) -> Exported:
     """Write the C sources, the firmware app and the contract.
 
+    Args:
+        deployment: policies to export.
+        folder: output folder; created if it does not exist.
+
     Raises:
-        CfbError: the folder cannot be made or written; what it held before is as it was.
+        CfbError: the folder cannot be created or written; its earlier contents are unchanged.
     """
     folder = output_folder(folder)
     with together():
         write_texts(folder, sources(deployment))
-        # It is about what is overwritten.
+        # The results belong to the export that was overwritten.
         remove(folder / RESULTS)
     return Exported(folder, deployment)
 
 
 def sources(deployment: Deployment) -> dict[str, str]:
-    """Names and texts of all files of an export."""
+    """Names and contents of all files of an export."""
     texts = {name: _filled(_template(name), deployment) for name in (*FIXED, *BUILD)}
     texts["cfb_pilot.c"] = _filled(_template(PILOTS[deployment.flips]), deployment)
     texts["cfb_sizes.h"] = _sizes(deployment)
@@ -71,7 +75,7 @@ def _template(name: str) -> str:
 
 
 def _filled(text: str, deployment: Deployment) -> str:
-    """A template without the parts that are for flips only, where it does not flip, and with the names filled in."""
+    """Fill the names into a template, and remove the parts for flips if there is no flip."""
     kept, dropping = [], False
     for line in text.splitlines():
         if line in ("//@flip", "//@end"):
@@ -125,7 +129,7 @@ is set to 1; then it climbs, turns {times} about its x axis, and is caught at th
 
 
 def literal(x) -> str:
-    """A number as C of single precision, that reads back as the same."""
+    """A number as a C literal of single precision that reads back as the same number."""
     value = np.float32(x)
     if not math.isfinite(value):
         value = np.float32(math.copysign(_NEVER, float(value)))
@@ -144,7 +148,7 @@ def _sizes(deployment: Deployment) -> str:
         "CFB_FRAME": frame,
         "CFB_KEPT_FRAMES": max(1, *(layout.past_estimates * layout.estimate_stride for layout in layouts)),
         "CFB_KEPT_COMMANDS": commands,
-        # For all there could be at once: a compiler that looks into the loops must not find them writing too far.
+        # Sized for all networks together: a compiler that analyses the loops must not find out-of-bounds writes.
         "CFB_WIDEST": max(frame * (1 + estimates) + 4 * commands + 3 + setpoints, *outputs),
     }
     lines = "\n".join(f"#define {name} {value}" for name, value in numbers.items())
@@ -185,7 +189,7 @@ def _network(name: str, policy: PolicyFile) -> str:
     network, layout = policy.controller.network, policy.controller.layout
     parts, layers = [f"/* weights_sha256 {policy.weights_sha256} */"], []
     for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
-        # A row for each output, so that the sums walk through memory.
+        # One row per output, so that the sums read memory in order.
         parts += [
             _array(f"{name}_weight_{i}", np.asarray(weight, np.float32).T),
             _array(f"{name}_bias_{i}", np.asarray(bias, np.float32)),

@@ -1,4 +1,4 @@
-"""The compiled C in closed loop with the simulated drone, beside the JAX policy on the same drone and noise."""
+"""Fly the compiled C in closed loop with the simulated drone, and the JAX policy with the same drone and noise."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Flier = NeuralController | Manoeuvre
 
 
 class Beside(NamedTuple):
-    """Two flights: of the C, and of JAX."""
+    """Two flights: C and JAX."""
 
     position: np.ndarray
     """(2, steps, 3), relative to the target, m."""
@@ -35,13 +35,13 @@ class Beside(NamedTuple):
     """Time between two commands, s."""
 
     def command_difference(self, seconds: float | None = None) -> float:
-        """Largest, over all motors and the first ``seconds``."""
+        """Largest difference of a command, over all motors and the first ``seconds``."""
         until = None if seconds is None else round(seconds / self.dt)
         return float(np.abs(self.command[0, :until] - self.command[1, :until]).max())
 
     @property
     def distance_m(self) -> float:
-        """Largest between the two drones at one time."""
+        """Largest distance between the two drones at the same time."""
         return float(np.linalg.norm(self.position[0] - self.position[1], axis=-1).max())
 
 
@@ -52,14 +52,14 @@ def fly_beside(
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
     seed: int = 0,
 ) -> Beside:
-    """Fly both from hover, with the noise that policies are trained with.
+    """Fly both from hover, with the noise of trainings.
 
     Args:
-        deployment: what was exported; flips begin with the first step.
-        compiled: the C.
-        seconds: how long.
-        offset: of the start from the target, m.
-        seed: of the noise, the same for both.
+        deployment: the exported policies; a flip begins with the first step.
+        compiled: the compiled C.
+        seconds: duration, s.
+        offset: start relative to the target, m.
+        seed: seed of the noise, the same for both.
     """
     plant = deployment.plant()
     controller, dt = deployment.controller, deployment.controller.control_dt_s

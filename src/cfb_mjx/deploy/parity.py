@@ -1,4 +1,4 @@
-"""The same numbers in C as in JAX, on random estimates: sequences that share nothing but the policy."""
+"""Compare the commands of C and JAX on random estimates, in independent sequences."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ from cfb_mjx.optional import not_none
 
 SEQUENCES, STEPS = 10_000, 12
 TOLERANCE = 1e-5
-"""Largest difference of a command, of 1."""
+"""Largest difference of a command in [0, 1]."""
 
 
 class Parity(NamedTuple):
-    """Of commands in C and in JAX."""
+    """Differences between the commands of C and JAX."""
 
     sequences: int
     steps: int
     largest: float
-    """Difference of a command, over all sequences, steps and motors."""
+    """Largest difference of a command, over all sequences, steps and motors."""
     mean: float
 
 
 def compare(
     deployment: Deployment, compiled: CompiledPolicy, sequences: int = SEQUENCES, steps: int = STEPS, seed: int = 0
 ) -> Parity:
-    """Run both on the same random estimates, each sequence from a reset, and compare every command.
+    """Run both on the same random estimates, each sequence after a reset, and compare every command.
 
     Args:
-        deployment: what was exported; flips begin with the first step.
-        compiled: the C.
-        sequences: how many.
-        steps: of each, more than a policy's history holds of commands.
-        seed: of the estimates.
+        deployment: the exported policies; a flip begins with the first step.
+        compiled: the compiled C.
+        sequences: number of sequences.
+        steps: steps per sequence, more than the number of commands in a policy's history.
+        seed: seed of the estimates.
     """
     inputs = random_inputs(np.random.default_rng(seed), sequences, steps)
     expected = np.asarray(
@@ -54,7 +54,7 @@ def compare(
 
 
 def begin(deployment: Deployment, compiled: CompiledPolicy) -> None:
-    """Reset; a flip begins with the next step."""
+    """Reset the policy; a flip begins with the next step."""
     compiled.reset()
     if deployment.flips:
         knobs = not_none(deployment.manoeuvre).knobs
@@ -62,7 +62,7 @@ def begin(deployment: Deployment, compiled: CompiledPolicy) -> None:
 
 
 def random_inputs(generator: np.random.Generator, sequences: int, steps: int) -> np.ndarray:
-    """Estimates of all kinds, (sequences, steps, 16): near and far, slow and fast, any attitude; float32."""
+    """Random estimates, (sequences, steps, 16), float32: near and far, slow and fast, any attitude."""
     # Half of the sequences hover about their targets, the others are anywhere.
     wide = np.where(np.arange(sequences) % 2, 1.0, 0.05)[:, None, None]
     shape = sequences, steps

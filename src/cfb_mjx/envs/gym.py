@@ -229,7 +229,7 @@ class TargetVectorEnv(VectorEnv):
         self._taken, self._over = self._taken | which, self._over & ~which
         return shown
 
-    def step(self, actions: Any):
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Fly one action per drone.
 
         Returns:
@@ -306,7 +306,7 @@ class TargetEnv(gymnasium.Env):
         seen, info = self.many.reset(seed=[seed])
         return seen[0], _of_one(info)
 
-    def step(self, action: Any):
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Fly one action.
 
         Returns:

@@ -56,12 +56,12 @@ class Data(eqx.Module):
 
     @property
     def qpos(self) -> Float[Array, "*batch 7"]:
-        """Position of the centre of gravity, m, and quaternion (w, x, y, z)."""
+        """Position of the rotors' centre, m, and quaternion (w, x, y, z)."""
         return jnp.concatenate([self.episode.state.position, self.episode.state.quaternion], axis=-1)
 
     @property
     def qvel(self) -> Float[Array, "*batch 6"]:
-        """Velocity, m/s, world axes, and body rate, rad/s, body axes."""
+        """Velocity of the rotors' centre, m/s, world axes, and body rate, rad/s, body axes."""
         return jnp.concatenate([self.episode.state.velocity, self.episode.state.body_rate], axis=-1)
 
     @property

@@ -193,7 +193,7 @@ def _warnings(intact: bool, problem: str | None, position: int, size: int) -> li
         ]
     return [
         "the checksum does not match: the log was cut short (the firmware writes the checksum when logging is switched "
-        "off) or values in it are damaged, which cannot be told apart; check it before use."
+        "off) or values in it are damaged, which cannot be distinguished; check it before use."
     ]
 
 

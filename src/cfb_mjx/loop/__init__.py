@@ -1,4 +1,4 @@
-"""The loop closed all the way: fly, name what the model lacks, train on the corrected model, fly the same drone again.
+"""Demonstration of the whole cycle: fly, correct the model, train on the corrected model, fly the same drone again.
 
-It flies in the reference simulator (`cfb_mjx.reference_simulator`), which shares nothing with the library's model.
+The drones fly in the reference simulator (`cfb_mjx.reference_simulator`), which shares no code with the model.
 """

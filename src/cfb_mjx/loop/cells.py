@@ -1,4 +1,4 @@
-"""Effects by seeds: every cell is one drone."""
+"""Cells of a study: one drone for each effect and seed."""
 
 from __future__ import annotations
 
@@ -13,27 +13,37 @@ FIRST_SEED, BETWEEN_SEEDS = 61_000, 100
 
 @dataclass(frozen=True)
 class Cell:
-    """One drone: its effect, and the seed of its policies and, with the effect's place in the list, of all draws."""
+    """One drone.
+
+    Attributes:
+        effect: the effect that the declared model lacks.
+        seed: seed of the policies; together with the position of the effect in the list, of all other random draws.
+    """
 
     effect: str
     seed: int
 
     @property
     def name(self) -> str:
-        """Of its folder."""
+        """Name of the cell and of its folder."""
         return f"{self.effect}-{self.seed}"
 
     @property
     def case(self) -> Case:
-        """The drone."""
+        """The drone in the reference simulator."""
         return Case(self.name, self.seed + 1 + list(EFFECTS).index(self.effect), ((self.effect, 1.0),))
 
 
 def cells_of(effects: Iterable[str], seeds: int, first: int = FIRST_SEED) -> list[Cell]:
-    """Cells seed by seed, so that an unfinished study has every effect.
+    """Cells of all effects and seeds, ordered by seed, so that an unfinished study contains every effect.
+
+    Args:
+        effects: names of the effects; duplicates are dropped.
+        seeds: number of seeds.
+        first: the first seed.
 
     Raises:
-        CfbError: an unknown effect, or none.
+        CfbError: an unknown effect, or no effect.
     """
     effects = list(dict.fromkeys(effects))
     known = [name for name in EFFECTS if not name.startswith(("outside", "sensor"))]

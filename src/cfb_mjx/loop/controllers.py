@@ -1,4 +1,4 @@
-"""Trained policies in the reference simulator: jax on one side, NumPy on the other."""
+"""Adapter for trained policies (jax) as controllers of the reference simulator (NumPy)."""
 
 from __future__ import annotations
 
@@ -17,17 +17,20 @@ from cfb_mjx.reference_simulator.other_controller import OtherController, Seen
 
 
 def controller_of(controllers: Sequence[NeuralController]) -> OtherController:
-    """One controller for as many lanes as there are controllers, each flown by its own.
+    """Combine policies into one controller of the simulator, with one lane per policy.
+
+    Args:
+        controllers: one policy per lane.
 
     Raises:
-        CfbError: the controllers differ in more than their weights, or their control step is no multiple of a tick.
+        CfbError: the policies differ in more than their weights, or their control step is not a multiple of a tick.
     """
     first = controllers[0]
     if any(jax.tree.structure(one) != jax.tree.structure(first) for one in controllers):
         raise CfbError("policies that fly side by side must have the same observation and layers.")
     every = first.control_dt_s / TICK
     if abs(every - round(every)) > 1e-6 or every < 1:
-        raise CfbError(f"a policy's control step of {first.control_dt_s} s is no multiple of the plants' {TICK} s.")
+        raise CfbError(f"a policy's control step of {first.control_dt_s} s is not a multiple of the plants' {TICK} s.")
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *controllers)
 
     def fly(memory, seen: Seen):

@@ -1,9 +1,9 @@
-"""The flights a policy makes for the sake of tracing: it follows set-points that excite, and its logs are kept.
+"""Flights of a policy that give the logs for the model correction: it follows set-points that excite the drone.
 
-A policy holds a target. Shown its position and velocity relative to a target that moves, it follows: the set-points are
-those of the reference simulator's own manoeuvres, `RAISE` higher, for a policy that does not know its drone sinks.
-Rates cannot be asked of it; in place of that manoeuvre its target jumps. Two of the flights have a dither on the
-commands.
+A policy holds a target. If its input is position and velocity relative to a moving target, it follows that target. The
+set-points are those of the reference simulator's own manoeuvres, raised by `RAISE`, because a policy trained without
+the effect may sink. A policy has no rate set-point; the manoeuvre with rates is replaced by jumps of the target. Two of
+the flights have a dither on the commands.
 """
 
 from __future__ import annotations
@@ -30,17 +30,26 @@ HELD_OUT = ("figure8", "waypoints", "climb_dive")
 SECONDS = {"long_hover": (20.0, 25.0)}
 USUAL_SECONDS = (13.0, 17.0)
 RAISE = 0.4
-"""m"""
+"""Height added to the set-points, m."""
 DITHER_OF_JUMPS = 0.02
+"""Amplitude of the dither on the commands in the flight with jumps."""
 TRIES, GENTLER = 6, 0.85
-"""A flight that crashes is drawn anew so often, each time gentler by this factor."""
+"""Largest number of tries of a flight that crashes, and the factor on its vigour for each further try."""
 _OWN = 7
-"""Sets the draws of these flights apart from those of the plants' own campaigns."""
+"""Part of the random seed that distinguishes these flights from the reference simulator's own campaigns."""
 
 
 @dataclass(frozen=True)
 class Flown:
-    """A campaign: logs to fit and to judge on, what was flown and at which try, and the drone's truth."""
+    """A campaign of flights.
+
+    Attributes:
+        fit: logs of the fit flights.
+        held_out: logs of the held-out flights.
+        manoeuvres: names of the manoeuvres, fit flights first.
+        tries: number of tries of each flight.
+        truth: true effects and constants of the drone.
+    """
 
     fit: list[FlightLog]
     held_out: list[FlightLog]
@@ -55,16 +64,16 @@ def fly_campaign(
     duration_scale: float = 1.0,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Flown:
-    """Fly a drone with a policy and log it.
+    """Fly a drone with a policy and log the flights.
 
     Args:
         case: the drone.
         controller: the policy.
-        duration_scale: factor on the logs' lengths.
-        progress: told what happens.
+        duration_scale: factor on the durations of the flights.
+        progress: called with a line of text for each round of flights.
 
     Raises:
-        CfbError: the policy cannot keep the drone in the air, however gently it is flown.
+        CfbError: a flight still crashes at the last, gentlest try.
     """
     names = FIT + HELD_OUT
     drone, instruments, truth = draw_drone(case)
@@ -89,8 +98,8 @@ def fly_campaign(
 
 
 def _streams(case: Case, index: int, attempt: int) -> list[np.random.Generator]:
-    """Of what is flown, of the noise in flight, and of the noise of what is only logged."""
-    # All by one `spawn`: it does no more than append 0, 1, 2 to these numbers, so a list of one's own can be one of it.
+    """Random generators of the set-points, of the noise in flight, and of the noise of the logs."""
+    # One `spawn` for all three: it appends 0, 1, 2 to this seed, and a longer seed could equal one of the results.
     return np.random.default_rng([case.seed, index, attempt, _OWN]).spawn(3)
 
 
@@ -110,7 +119,7 @@ def _lane(
         drone,
         instruments,
         setpoints,
-        # From the warm-up's end, when a command falls due: rows see commands change as they do.
+        # From the end of the warm-up, when a command is due, so that rows show command changes when they occur.
         row_ticks(rng, len(setpoints) * c.SETPOINT_TICKS, instruments.irregular, rng.random() < 0.4),
         voltage=rng.uniform(3.4, 3.95),
         gyro_bias=0.003 * rng.standard_normal(3),
@@ -119,7 +128,13 @@ def _lane(
 
 
 def jumps(rng: np.random.Generator, seconds: float, vigour: float) -> np.ndarray:
-    """Set-points (n, 17) at 100 Hz: the target jumps within a metre or so, and every command is dithered a little."""
+    """Set-points (n, 17) at 100 Hz of a target that jumps by up to about a metre, with a dither on every command.
+
+    Args:
+        rng: random generator.
+        seconds: duration, s.
+        vigour: factor on the size of the jumps.
+    """
     goal = np.zeros((round(seconds / STEP), SETPOINT_COLUMNS))
     start = 0
     while start < len(goal):

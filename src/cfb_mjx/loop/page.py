@@ -1,4 +1,4 @@
-"""The story of a loop closed all the way: a figure, tables, and what to think of them."""
+"""Page of a study of the whole cycle (fly, correct the model, train, fly again): figure, tables and explanations."""
 
 from __future__ import annotations
 
@@ -34,7 +34,11 @@ ERROR = "position_rmse_m@0.5s"
 
 
 def lead(results: dict[str, Any]) -> str:
-    """The first paragraph: what was found, counted."""
+    """First paragraph: numbers of effects that were found, and of effects with better flights.
+
+    Args:
+        results: results of `cfb_mjx.loop.study.study`.
+    """
     rows = summarise(results["cells"].values())
     count = len(results["cells"])
     right = sum(row.right for row in rows)
@@ -50,11 +54,11 @@ def lead(results: dict[str, Any]) -> str:
 
 
 def sections(results: dict[str, Any], figure: Path) -> list[Section]:
-    """Everything below the first paragraph.
+    """All sections after the first paragraph.
 
     Args:
-        results: of `cfb_mjx.loop.study.study`.
-        figure: drawn by `loop_figure`.
+        results: results of `cfb_mjx.loop.study.study`.
+        figure: file drawn by `loop_figure`.
     """
     rows = summarise(results["cells"].values())
     short = (
@@ -202,10 +206,14 @@ def _each(results: dict[str, Any]) -> tuple:
 
 
 def loop_figure(results: dict[str, Any], path: Path) -> None:
-    """Draw every effect as a row: each policy's errors, seeds as points, an arrow from the nominal to the corrected.
+    """Draw one row per effect: errors of each policy, seeds as points, an arrow from nominal to corrected policy.
+
+    Args:
+        results: results of `cfb_mjx.loop.study.study`.
+        path: file to write.
 
     Raises:
-        CfbError: an unknown ending, or the file cannot be written.
+        CfbError: the ending of ``path`` is not supported, or the file cannot be written.
     """
     rows = summarise(results["cells"].values())
     cells = list(results["cells"].values())

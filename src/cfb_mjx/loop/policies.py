@@ -1,4 +1,4 @@
-"""The policies of a demonstration, of one budget each: on the declared model, on randomised drones, gone on with."""
+"""Training of the policies of a demonstration: on the declared model, on randomised drones, and further training."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from cfb_mjx.train.config import load_config, with_changes
 from cfb_mjx.train.run import POLICY, Training, train
 
 CONFIG = "loop"
-"""Shipped: ``configs/loop.yaml``."""
+"""Name of the shipped configuration ``configs/loop.yaml``."""
 FURTHER = ("analytic.updates=200", "analytic.learning_rate=1.0e-3")
-"""Of a policy gone on with, on the corrected model or, to be fair, on the declared one."""
+"""Changes for further training on the corrected model and, for a fair comparison, on the declared model."""
 RANDOMISED = ("randomisation.magnitude=1.0", "analytic.updates=700")
-"""The paper's whole spread, and as many updates as `CONFIG` and `FURTHER` have together."""
+"""Changes for the randomised policy: the paper's spread, and as many updates as `CONFIG` and `FURTHER` together."""
 BOTH = (*FURTHER, RANDOMISED[0])
-"""Of the randomised policy gone on with on the corrected model."""
+"""Changes for further training of the randomised policy on the corrected model."""
 DONE = "training.json"
 
 
@@ -32,15 +32,15 @@ def train_policy(
     model: Path | None = None,
     start: Path | None = None,
 ) -> dict[str, Any]:
-    """Train into ``folder``, or go on where an interruption left it; what is done is left alone.
+    """Train a policy, or resume an interrupted training. A finished training is not repeated.
 
     Args:
-        what: is trained, in words.
-        folder: of this policy.
-        seed: of everything random.
-        changes: to the configuration `CONFIG`.
-        model: YAML in place of the declared model.
-        start: policy file to begin from.
+        what: description of the training, for the terminal.
+        folder: folder of this policy.
+        seed: seed of all random draws.
+        changes: changes to the configuration `CONFIG`.
+        model: model file that replaces the declared model.
+        start: policy file from which the training starts; None starts from random weights.
 
     Returns:
         The last row of the learning curve.
@@ -64,5 +64,5 @@ def train_policy(
 
 
 def policy_file(folder: Path) -> Path:
-    """Where `train_policy` leaves the policy."""
+    """File in which `train_policy` stores the policy."""
     return folder / POLICY

@@ -1,6 +1,6 @@
-"""The steps of a cell: each goes on where it was interrupted, is quick where it is done, and leaves files in a folder.
+"""Steps of a cell. Each step writes files to a folder, resumes after an interruption, and skips work already done.
 
-Of the folders they take, ``policies`` holds what the cells of one seed have in common, and ``own`` all of one cell.
+The folder ``policies`` holds the policies shared by the cells of one seed, and ``own`` the files of one cell.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ HELD_OUT = ("position_rmse_m@0.5s", "velocity_rmse_mps@0.5s", "attitude_rmse_deg
 
 
 def settings() -> dict[str, Any]:
-    """What the results depend on beside effects and seeds."""
+    """Settings on which the results depend, other than effects and seeds."""
     names = ("FIT", "HELD_OUT", "SECONDS", "USUAL_SECONDS", "RAISE", "DITHER_OF_JUMPS", "GENTLER")
     tests = ("HEIGHT", "HOVERS", "HOVER_S", "SETTLING_S", "TRACKS", "TRACK_S", "ENTRY_S")
     eight = ("PERIOD_S", "WIDTH_M", "DEPTH_M", "RAMP_S")
@@ -45,7 +45,11 @@ def settings() -> dict[str, Any]:
 
 
 def train_common(seed: int, folder: Path) -> dict[str, Any]:
-    """Train a seed's own policies; the last row of each learning curve."""
+    """Train the policies shared by the cells of one seed.
+
+    Returns:
+        Policy name to the last row of its learning curve.
+    """
     nominal = train_policy("on the declared model", folder / "nominal", seed)
     start = policy_file(folder / "nominal")
     return {
@@ -56,7 +60,7 @@ def train_common(seed: int, folder: Path) -> dict[str, Any]:
 
 
 def fly(cell: Cell, policies: Path, own: Path) -> dict[str, Any]:
-    """Fly and write the logs; `FLOWN`, written last, says that all are there."""
+    """Fly the campaign and write its logs. `FLOWN` is written last and marks the step as complete."""
     if (own / FLOWN).exists():
         return json.loads((own / FLOWN).read_text(encoding="utf-8"))
     with jax.enable_x64(False):
@@ -77,14 +81,18 @@ def fly(cell: Cell, policies: Path, own: Path) -> dict[str, Any]:
 
 
 def close(own: Path) -> dict[str, Any]:
-    """Diagnose the drone from its logs and the declared model, as ``cfb close-loop`` does; what its report says."""
+    """Correct the model from the logs and the declared model, as ``cfb close-loop`` does.
+
+    Returns:
+        The entries `KEPT` of its report, the held-out errors, and the time in s.
+    """
     report, began = own / CLOSED / "report.json", time.perf_counter()
     if not report.exists():
         fit, held_out = (tuple(sorted((own / "flights" / side).glob("*.mcap"))) for side in ("fit", "held-out"))
         declared = load_config(CONFIG).model
         closed = CloseLoop(own / CLOSED, fit=fit, held_out=held_out, model=declared).run()
         say(f"close-loop names {', '.join(effect['name'] for effect in closed.numbers['effects']) or 'no effect'}")
-        # Programs of every shape met would pile up until the process may map no more memory.
+        # Compiled programs of every shape would accumulate until the process runs out of memory mappings.
         jax.clear_caches()
     found = json.loads(report.read_text(encoding="utf-8"))
     errors = {when: {key: found["held_out"][when][key] for key in HELD_OUT} for when in ("before", "after")}
@@ -92,7 +100,11 @@ def close(own: Path) -> dict[str, Any]:
 
 
 def learn(cell: Cell, policies: Path, own: Path) -> dict[str, Any]:
-    """Go on with the policies on the corrected model."""
+    """Train the nominal and the randomised policy further on the corrected model.
+
+    Returns:
+        Policy name to the last row of its learning curve.
+    """
     model, seed = own / CLOSED / "model.yaml", cell.seed
     start, wide = (policy_file(policies / name) for name in ("nominal", "randomised"))
     what = "on the corrected model"
@@ -102,7 +114,11 @@ def learn(cell: Cell, policies: Path, own: Path) -> dict[str, Any]:
 
 
 def judge(cell: Cell, policies: Path, own: Path) -> dict[str, Any]:
-    """Fly the same drone again; `Trial.to_json` by policy."""
+    """Fly the same drone again with every policy.
+
+    Returns:
+        Policy name to `Trial.to_json`, and ``environment``.
+    """
     say("flying the same drone again")
     files = {name: policies / name for name in ("nominal", "longer", "randomised")}
     files |= {"corrected": own / LEARNT, "both": own / LEARNT_BOTH}

@@ -1,4 +1,4 @@
-"""Cells, one after another: flown, diagnosed, learnt and flown again. What is done is kept."""
+"""Run the cells of a study one after another and store their results: fly, correct the model, train, fly again."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ RESULT = "result.json"
 
 
 def study(cells: Sequence[Cell], folder: Path) -> Iterator[dict[str, Any]]:
-    """Go through the cells; those whose result lies in ``folder`` already are taken from there.
+    """Run the cells. A cell whose result already exists in ``folder`` is read from there.
 
     Args:
-        cells: in this order.
-        folder: for everything; made if need be.
+        cells: the cells, in the order in which they are run.
+        folder: folder of all files; created if it does not exist.
 
     Yields:
-        After every cell ``settings``, ``policies`` by seed and ``cells`` by name, those of earlier runs among them.
+        After every cell ``settings``, ``policies`` by seed and ``cells`` by name, including those of earlier runs.
 
     Raises:
-        CfbError: the folder holds results of other settings.
+        CfbError: the folder holds results with other settings.
     """
     output_folder(folder)
     settings = steps.settings()

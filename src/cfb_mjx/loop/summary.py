@@ -1,4 +1,4 @@
-"""What a study comes to, effect by effect: medians over the seeds, whether the flight got better, and if not, why."""
+"""Summary of a study by effect: medians over the seeds, whether the flight improved, and reasons if it did not."""
 
 from __future__ import annotations
 
@@ -11,17 +11,24 @@ from typing import Any
 POLICIES = ("without_effect", "nominal", "longer", "randomised", "corrected", "both")
 MEASURES = ("hover_mm", "track_m")
 HARDLY = 0.1
-"""What raises an error by less than this share costs hardly anything."""
+"""Relative increase of an error below which an effect counts as harmless."""
 NOTES = {
     "battery_sag": "A policy cannot see the voltage: it is trained with a cell that starts half full, and the flights "
     "begin with packs of 3.4 to 3.95 V. The right model is of no use to a controller that is not told what changes."
 }
-"""What is known of an effect and a policy that only sees the estimated state."""
+"""Effect to a known reason why a policy that only receives the estimated state does not improve."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Of the seeds' values: median, least and greatest; infinite where a flight crashed. ``crashed`` counts flights."""
+    """Distribution of the values of the seeds.
+
+    Attributes:
+        median: median over the seeds; infinite if half of the seeds or more had a crash.
+        least: smallest value.
+        greatest: largest value; infinite if a flight crashed.
+        crashed: number of flights that crashed.
+    """
 
     median: float
     least: float
@@ -31,15 +38,15 @@ class Spread:
 
 @dataclass(frozen=True)
 class Row:
-    """One effect.
+    """Results of one effect.
 
     Attributes:
-        effect: its name.
-        named: what close-loop reported, seed by seed.
-        spreads: by measure and policy.
-        change: by measure, the median over seeds of the corrected policy's error over the nominal policy's, less one.
-        alone: the same of the policy trained as long on the declared model.
-        held_out: before and after, by error: the median over seeds.
+        effect: name of the effect.
+        named: effects reported by close-loop, for each seed.
+        spreads: measure and policy to the distribution over the seeds.
+        change: measure to the relative change of the error from the nominal to the corrected policy, median over seeds.
+        alone: the same for the policy trained further by as many updates on the declared model.
+        held_out: prediction error to its median over the seeds before and after the correction.
     """
 
     effect: str
@@ -51,16 +58,16 @@ class Row:
 
     @property
     def right(self) -> int:
-        """Seeds whose effect was named, whatever else was."""
+        """Number of seeds for which the effect was reported, with or without others."""
         return sum(self.effect in names for names in self.named)
 
     def improved(self, measure: str) -> bool:
-        """Whether the median over seeds got better."""
+        """Whether the error decreased, in the median over the seeds."""
         return self.change[measure] < 0
 
     @property
     def why_not(self) -> list[str]:
-        """Sentences, where a measure did not improve."""
+        """Sentences with reasons if a measure did not improve."""
         worse = [measure for measure in MEASURES if not self.improved(measure)]
         if not worse:
             return []
@@ -85,7 +92,7 @@ def _text(measure: str, value: float) -> str:
 
 
 def value_of(trial: dict[str, Any], measure: str) -> float:
-    """Mean over the flights; infinite if one of them crashed."""
+    """Mean of a measure over the flights of a trial; infinite if one of them crashed."""
     values = trial[measure]
     return math.inf if any(v is None for v in values) else sum(values) / len(values)
 
@@ -94,7 +101,7 @@ def summarise(cells: Iterable[dict[str, Any]]) -> list[Row]:
     """One row per effect, in the order in which they first appear.
 
     Args:
-        cells: results as `cfb_mjx.loop.study.study` gives them.
+        cells: results of cells, from `cfb_mjx.loop.study.study`.
     """
     groups: dict[str, list[dict[str, Any]]] = {}
     for cell in cells:

@@ -1,6 +1,6 @@
-"""How well policies fly one drone: hover and a figure eight, judged by what the drone's own tracking reports.
+"""Test flights of policies on one drone: hover and a figure eight, evaluated with the drone's own tracking.
 
-Every policy meets the same flights: the same sensor noise, battery and gyro bias, drawn apart from the campaign's.
+All policies fly with the same sensor noise, battery and gyro bias, which differ from those of the campaign.
 """
 
 from __future__ import annotations
@@ -21,23 +21,25 @@ from cfb_mjx.reference_simulator.controller import POSITION, SETPOINT_COLUMNS, V
 from cfb_mjx.reference_simulator.simulation import Flight, Lane, simulate
 
 HEIGHT = 1.2
-"""m"""
+"""Height of the targets, m."""
 HOVERS, HOVER_S, SETTLING_S = 6, 6.0, 1.0
-"""Flights, how long each, and how much of it is not counted, as in the paper's hover test."""
+"""Hover test as in the paper: number of flights, their duration, and the initial time that is not counted, s."""
 TRACKS, TRACK_S, ENTRY_S = 4, 15.0, 3.0
+"""Tracking test: number of flights, their duration, and the initial time that is not counted, s."""
 PERIOD_S, WIDTH_M, DEPTH_M, RAMP_S = 12.0, 1.0, 0.5, 2.0
-"""A figure eight: one round, half its width and depth, and how long its pace takes to build up."""
+"""Figure eight: period, half its width and depth, and the time in which the point accelerates."""
 _OWN = 9
+"""Part of the random seed that distinguishes these flights from the campaign's."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What one policy did on one drone; one number per flight, NaN where it crashed.
+    """Results of one policy on one drone: one number per flight, NaN if it crashed.
 
     Attributes:
-        hover_mm: mean distance from the target over the last five of six seconds.
+        hover_mm: mean distance from the target over the last five of six seconds, mm.
         command_std: standard deviation of the commands over that time, mean of the four motors.
-        track_m: RMS distance from the figure eight's moving point.
+        track_m: RMS distance from the moving point of the figure eight, m.
     """
 
     hover_mm: tuple[float, ...]
@@ -45,13 +47,13 @@ class Trial:
     track_m: tuple[float, ...]
 
     def to_json(self) -> dict[str, Any]:
-        """With how many crashed; NaN becomes null."""
+        """The results as JSON-compatible values, with the number of crashes. NaN becomes null."""
         lost = sum(not np.isfinite(x) for x in (*self.hover_mm, *self.track_m))
         return {"hover_mm": self.hover_mm, "command_std": self.command_std, "track_m": self.track_m, "crashed": lost}
 
 
 def figure_eight(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Position (n, 3) [m] and velocity (n, 3) [m/s] of the moving point; it rests before time 0."""
+    """Position (n, 3), m, and velocity (n, 3), m/s, of the point on the figure eight; it rests before time 0."""
     t = np.maximum(time, 0.0)
     pace = 2 * np.pi / PERIOD_S
     built = np.minimum(t, RAMP_S)
@@ -63,12 +65,15 @@ def figure_eight(time: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def fly_trials(case: Case, policies: Mapping[str, NeuralController], twin: str) -> dict[str, Trial]:
-    """Every policy on the drone of a case, side by side.
+    """Fly the drone of a case with every policy, in one batch.
 
     Args:
         case: the drone.
-        policies: by name, alike but for their weights.
-        twin: the policy that also flies the drone without its effects, as ``without_effect``.
+        policies: policies by name, which differ only in their weights.
+        twin: name of the policy that also flies the drone without its effects, as ``without_effect``.
+
+    Returns:
+        Results by policy name.
     """
     drone, instruments, _ = draw_drone(case)
     healthy, _, _ = draw_drone(Case(case.name, case.seed))
@@ -104,7 +109,7 @@ def _judged(flights: list[Flight]) -> Trial:
 
 
 def _hover(flight: Flight) -> tuple[float, float]:
-    """Mean distance [mm] and command std; NaN of a flight that crashed."""
+    """Mean distance, mm, and command std; NaN for a flight that crashed."""
     if flight.crashed:
         return float("nan"), float("nan")
     counted = round(SETTLING_S / (c.ROW_TICKS * c.TICK))
@@ -113,10 +118,10 @@ def _hover(flight: Flight) -> tuple[float, float]:
 
 
 def _track(flight: Flight) -> float:
-    """RMS distance, m; NaN of a flight that crashed."""
+    """RMS distance, m; NaN for a flight that crashed."""
     if flight.crashed:
         return float("nan")
     time = np.arange(len(flight.pose)) * c.ROW_TICKS * c.TICK
-    # A pose is of a moment ago, and so is the point it is compared with.
+    # The pose is late by POSE_TICKS, so it is compared with the point at that earlier time.
     off = flight.pose[:, P] - figure_eight(time - c.POSE_TICKS * c.TICK)[0]
     return float(np.sqrt((off[time >= ENTRY_S] ** 2).sum(axis=1).mean()))

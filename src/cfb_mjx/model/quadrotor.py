@@ -180,7 +180,7 @@ def begin(model: Quadrotor, state: State) -> State:
     if len(state.memory) == len(model.effects):
         return state
     if len(state.memory):
-        raise ValueError(f"the state has memories of {len(state.memory)} effects, the model has {len(model.effects)}")
+        raise ValueError(f"the state remembers {len(state.memory)} effects, the model has {len(model.effects)}")
     parameters, speed = _unstacked(model.changed_parameters()), Vec.unstack(jnp.asarray(state.rotor_speed))
     memory = tuple(effect.begin(speed, parameters, model.dt / model.substeps) for effect in model.effects)
     memory = jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec))

@@ -1,4 +1,4 @@
-"""The drone's constants: the parameter pytree, presets with their sources, YAML files and randomisation ranges."""
+"""The drone's constants: parameter pytree, presets with their sources, YAML files, and randomisation ranges."""
 
 from cfb_mjx.parameters.limits import Limits
 from cfb_mjx.parameters.model_file import Entry, ModelFile, load_model_file, preset_names, save_model_file

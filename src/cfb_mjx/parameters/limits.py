@@ -1,4 +1,4 @@
-"""Where a number may lie, declared once beside its unit: what cannot be is refused, what is unusual is warned of."""
+"""Limits of numbers, declared once beside their units: impossible values are refused, unusual ones give a warning."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jax.core import Tracer
 from cfb_mjx.errors import CfbError, CfbWarning
 
 _SLACK = 1e-6
-"""Share of a limit by which a number may pass it: what single precision does to it."""
+"""Relative amount by which a number may exceed a limit: the rounding of single precision."""
 _OTHERS = {
     "kg": (("g", 1e-3),),
     "m": (("mm", 1e-3), ("cm", 1e-2)),
@@ -23,15 +23,15 @@ _OTHERS = {
     "rad/s": (("rpm", math.pi / 30),),
     "kg m^2": (("g cm^2", 1e-7), ("g m^2", 1e-3)),
 }
-"""What numbers are often written in instead of their unit."""
+"""Other units in which numbers are often given, with factors, by unit."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one number, in its unit; all ends belong to the ranges.
+    """Limits of one number, in its unit; all ends belong to the ranges.
 
-    From ``hard_low`` to ``hard_high`` lies what can be; what lies beyond is refused. From ``soft_low`` to ``soft_high``
-    lies what laboratories do; of what lies beyond a user is warned.
+    Values outside ``hard_low`` to ``hard_high`` are impossible and refused. Values outside ``soft_low`` to
+    ``soft_high`` are unusual and give a warning.
     """
 
     hard_low: float
@@ -44,24 +44,24 @@ class Limits:
             raise ValueError(f"{self}: soft limits must lie between hard ones")
 
     def holds(self, value):
-        """Whether numbers lie within the hard limits, one by one; NaN does not. NumPy or jax, also traced."""
+        """Whether each number is within the hard limits; NaN is not. For NumPy and JAX, also traced."""
         return (value >= _down(self.hard_low)) & (value <= _up(self.hard_high))
 
     def usual(self, value):
-        """Whether numbers lie within the soft limits."""
+        """Whether each number is within the soft limits."""
         return (value >= _down(self.soft_low)) & (value <= _up(self.soft_high))
 
     def check(self, value: Any, name: str, unit: str, warn: bool = False) -> None:
-        """Refuse what cannot be. Nothing is said of traced numbers.
+        """Refuse impossible values. Traced numbers are not checked.
 
         Args:
             value: number or array.
-            name: of it, for messages: "FILE: parameters.mass".
-            unit: of it.
-            warn: also warn of what is unusual.
+            name: its name in messages, for example "FILE: parameters.mass".
+            unit: its unit.
+            warn: whether unusual values give a warning.
 
         Raises:
-            CfbError: a number beyond the hard limits, named.
+            CfbError: a number outside the hard limits.
         """
         numbers = concrete(value)
         if numbers is None:
@@ -75,7 +75,7 @@ class Limits:
         if warn and unusual.any():
             said, number = _first(name, numbers, unusual)
             span = _span(self.soft_low, self.soft_high, unit)
-            text = f"{said} is unusual; mostly it lies between {span}{self._hint(number, unit)}."
+            text = f"{said} is unusual; usually it lies between {span}{self._hint(number, unit)}."
             warnings.warn(text, CfbWarning, stacklevel=3)
 
     def _hint(self, number: float, unit: str) -> str:
@@ -86,7 +86,7 @@ class Limits:
 
 
 def concrete(value: Any) -> np.ndarray | None:
-    """The numbers of an array in float64; None where they are not known yet (traced), or not in this process."""
+    """Numbers of an array in float64; None if they are traced, or not all in this process."""
     if isinstance(value, Tracer) or (isinstance(value, jax.Array) and not value.is_fully_addressable):
         return None
     try:
@@ -104,7 +104,7 @@ def _up(limit: float) -> float:
 
 
 def _first(name: str, numbers: np.ndarray, chosen: np.ndarray) -> tuple[str, float]:
-    """The first of the chosen numbers, and how it is written."""
+    """Text "name[index] = number" of the first chosen number, and the number."""
     index = tuple(map(int, np.argwhere(chosen)[0]))
     number = float(numbers[index])
     return f"{name}{''.join(f'[{i}]' for i in index)} = {number:g}", number

@@ -1,4 +1,4 @@
-"""Model files: YAML in and out, every constant with its unit, its source and, where known, its uncertainty."""
+"""Model files: YAML with the unit, the source and, where known, the uncertainty of every constant."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class Entry:
     """One constant.
 
     Attributes:
-        value: in SI.
-        source: where it comes from.
-        std: its standard deviation; None where unknown.
-        spread: of a type of drone, the standard deviation between its drones; None where unknown.
+        value: value in SI units.
+        source: where the value comes from.
+        std: standard deviation of the value; None if unknown.
+        spread: standard deviation between the drones of a type; None if unknown.
     """
 
     value: np.ndarray
@@ -42,10 +42,10 @@ class Entry:
 
 @dataclass(frozen=True)
 class ModelFile:
-    """What a model YAML holds. ``effects`` are kept as read; `cfb_mjx.model.Quadrotor.from_file` builds them.
+    """Contents of a model YAML. ``effects`` are stored as read; `cfb_mjx.model.Quadrotor.from_file` builds them.
 
-    ``kind`` is "plant", or "predictor" for a model whose numbers were left free beyond what is physical: it foretells
-    flights like those it was fitted to, and answers commands as the drone does not.
+    ``kind`` is "plant", or "predictor" for a model that was fitted without physical limits on its numbers: it predicts
+    flights similar to those it was fitted to, but does not respond to commands as the drone does.
     """
 
     name: str
@@ -55,36 +55,40 @@ class ModelFile:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     kind: str = "plant"
     path: str = field(default="", compare=False)
-    """The file or preset it was read from, for messages."""
+    """File or preset that it was read from, for messages."""
 
     def require_plant(self, purpose: str, how: str) -> None:
-        """Refuse a predictor where the drone itself is needed.
+        """Refuse a predictor.
 
         Args:
-            purpose: what for, a sentence's subject ("training").
-            how: how to insist.
+            purpose: what the model is needed for, as the subject of a sentence ("training").
+            how: option that overrides the refusal.
 
         Raises:
-            CfbError: it is a predictor.
+            CfbError: the model is a predictor.
         """
         if self.kind != "plant":
             raise CfbError(
                 f"model {self.name} is a predictor, not a plant: its inertia was left free, so {purpose} with it would "
-                f"learn a drone that does not exist; take a plant, or insist with {how}."
+                f"learn a drone that does not exist; use a plant, or insist with {how}."
             )
 
     def parameters(self) -> Parameters:
-        """The parameter pytree, in the current default float precision."""
+        """Return the parameter pytree, in the current default float precision."""
         return Parameters(**{key: self.entries[key].value for key in SPECIFICATIONS})
 
     def with_values(self, source: str, **values: float | list | np.ndarray) -> ModelFile:
-        """A copy with some constants replaced, each carrying ``source``.
+        """Return a copy with some constants replaced.
+
+        Args:
+            source: source of the new values.
+            values: new values by name.
 
         Raises:
-            CfbError: an unknown name or an impossible value.
+            CfbError: a name is unknown, or a value is impossible.
 
         Warns:
-            CfbWarning: an unusual value.
+            CfbWarning: a value is unusual.
         """
         where = f"model {self.name}"
         if not source:
@@ -103,15 +107,16 @@ def load_model_file(name_or_path: str | Path, changes: Iterable[str] = ()) -> Mo
     """Read a shipped preset (by name) or a model YAML (by path).
 
     Args:
-        name_or_path: which.
-        changes: of its parameters, each ``NAME=VALUE``; lists are written with commas.
+        name_or_path: preset or file.
+        changes: changes of parameters, each ``NAME=VALUE``; lists are written with commas.
 
     Raises:
-        CfbError: a change that is not NAME=VALUE; no such preset or file, broken YAML, unknown or missing keys, missing
-            or wrong units, impossible values (`SPECIFICATIONS`); the message names the file and the key.
+        CfbError: a change is not NAME=VALUE, there is no such preset or file, the YAML is broken, keys are unknown or
+            missing, units are missing or wrong, or values are impossible (`SPECIFICATIONS`). The message names the
+            file and the key.
 
     Warns:
-        CfbWarning: values that are possible but unusual, named alike.
+        CfbWarning: a value is possible but unusual.
     """
     values = dict(map(_change, changes))
     described = _read(name_or_path)
@@ -163,7 +168,7 @@ def _read(name_or_path: str | Path) -> ModelFile:
 
 
 def save_model_file(model: ModelFile, path: str | Path) -> None:
-    """Write a model YAML atomically. What is written can be read back by `load_model_file` without loss.
+    """Write a model YAML, atomically; `load_model_file` reads it back without loss.
 
     Raises:
         CfbError: the file cannot be written.
@@ -225,7 +230,7 @@ def _numbers(key: str, raw: Any, path, what: str) -> np.ndarray:
 
 
 def _finite(x: Any) -> bool:
-    # Compared, not math.isfinite: that overflows on a huge int.
+    # Compared, because math.isfinite overflows on a huge int.
     return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) <= sys.float_info.max
 
 
@@ -240,7 +245,7 @@ def _same_unit(unit: Any) -> str:
 
 
 def _plain(value: np.ndarray):
-    # 4 equal motors read better as one number.
+    # Four equal motors are easier to read as one number.
     if value.ndim == 1 and value.size == 4 and np.all(value == value[0]):
         return float(value[0])
     return value.tolist()

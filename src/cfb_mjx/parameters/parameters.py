@@ -1,4 +1,4 @@
-"""The parameter pytree of the 17-state model (paper eqs. 1-10), and what each constant must satisfy."""
+"""The parameter pytree of the 17-state model (paper eqs. 1-10), and the unit, shape and limits of each parameter."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _array(value) -> Array:
 
 
 class Parameters(eqx.Module):
-    """Constants of one Crazyflie Brushless. Immutable; every field is a JAX array, so it can be batched and fitted.
+    """Constants of one Crazyflie Brushless. Immutable; every field is a JAX array and can be batched and fitted.
 
     Symbols in brackets are the paper's. Motors are in firmware order M1..M4 (front-right, back-right, back-left,
     front-left).
@@ -44,13 +44,13 @@ class Parameters(eqx.Module):
     motor_gain: Float[Array, "*batch 4"] = eqx.field(converter=_array)
     """Steady rotor speed per unit command [K, eq. 5], rad/s."""
     motor_speed_offset: Float[Array, "*batch 4"] = eqx.field(converter=_array)
-    """Steady rotor speed at zero command of an affine motor map, rad/s. Zero in the paper."""
+    """Steady rotor speed at zero command, for an affine motor map, rad/s. Zero in the paper."""
     reference_rotor_speed: Float[Array, "*batch"] = eqx.field(converter=_array)
-    """Rotor speed that makes s = Omega / sigma dimensionless in both polynomials [sigma], rad/s."""
+    """Rotor speed sigma that makes s = Omega / sigma dimensionless in both polynomials, rad/s."""
     thrust_polynomial: Float[Array, "*batch 3"] = eqx.field(converter=_array)
-    """Coefficients of s^3, s^2, s in the thrust of one rotor [eq. 8], N."""
+    """Coefficients of s^3, s^2, s of the thrust of one rotor [eq. 8], N."""
     torque_polynomial: Float[Array, "*batch 3"] = eqx.field(converter=_array)
-    """Coefficients of s^3, s^2, s in the aerodynamic torque of one rotor [eq. 9], N m."""
+    """Coefficients of s^3, s^2, s of the aerodynamic torque of one rotor [eq. 9], N m."""
     thrust_scale: Float[Array, "*batch 4"] = eqx.field(converter=_array)
     """Factor on each rotor's thrust. One in the paper."""
     torque_scale: Float[Array, "*batch 4"] = eqx.field(converter=_array)
@@ -60,8 +60,8 @@ class Parameters(eqx.Module):
     attitude_offset: Float[Array, "*batch 3"] = eqx.field(converter=_array)
     """Rotation vector from the true body axes to the axes the estimator reports, rad."""
     gyro_delay: Float[Array, "*batch"] = eqx.field(converter=_array)
-    """Age of the gyro's reading when the controller reads it, s. The gyro is on the drone: a real one's filters make
-    about 2 ms."""
+    """Age of the gyro's reading when the controller reads it, s. The gyro is on the drone; the filters of a real one
+    cause about 2 ms."""
 
     @property
     def observation_delay(self) -> Float[Array, "*batch"]:
@@ -73,13 +73,13 @@ class Parameters(eqx.Module):
             specification.check(getattr(self, name), f"parameters.{name}")
 
     def require_arrays(self, batched: bool = True) -> None:
-        """Refuse what ``eqx.tree_at`` lets in: a Python number in an array's place, or an array of another shape.
+        """Refuse what ``eqx.tree_at`` allows: a Python number in place of an array, or an array of another shape.
 
         Args:
             batched: whether batch axes may come first.
 
         Raises:
-            CfbError: a field that is no array, or of another shape, named.
+            CfbError: a field is not an array, or has another shape.
         """
         for name, specification in SPECIFICATIONS.items():
             value, shape = getattr(self, name), specification.shape
@@ -97,28 +97,28 @@ class Parameters(eqx.Module):
 
 @dataclass(frozen=True)
 class Specification:
-    """Unit, shape (without batch axes), limits of every component, and what the components must do together."""
+    """Unit, shape (without batch axes), limits of every component, and a condition on all components together."""
 
     unit: str
     shape: tuple[int, ...]
     meaning: str
     limits: Limits
     condition: str = ""
-    """What ``together`` asks for, after "must"."""
+    """Description of the condition ``together``, to follow "must"."""
     together: Callable[[Any], Any] | None = None
-    """Whether components (last axis, NumPy or jax) make sense together."""
+    """Whether components (last axis, NumPy or JAX) are possible together."""
 
     def check(self, value: Any, name: str, warn: bool = False, together: bool = True) -> None:
-        """Refuse what cannot be. Nothing is said of traced numbers.
+        """Refuse impossible values. Traced numbers are not checked.
 
         Args:
             value: number or array, batch axes first.
-            name: of it, for messages.
-            warn: also warn of what is unusual.
-            together: also ask whether the components make sense together.
+            name: its name in messages.
+            warn: whether unusual values give a warning.
+            together: whether to check the condition on all components together.
 
         Raises:
-            CfbError: an impossible value, named.
+            CfbError: a value is impossible.
         """
         self.limits.check(value, name, self.unit, warn)
         numbers = concrete(value)
@@ -127,8 +127,8 @@ class Specification:
 
 
 def physical_inertia(x: Any) -> Any:
-    """Whether a rigid body can have these principal moments of inertia (last axis); a flat plate can."""
-    # The slack is what single precision needs.
+    """Whether principal moments of inertia (last axis) are possible for a rigid body; those of a flat plate are."""
+    # The tolerance is the rounding of single precision.
     return 2 * x.max(-1) <= x.sum(-1) * (1 + 1e-6)
 
 
@@ -149,7 +149,7 @@ SPECIFICATIONS: dict[str, Specification] = {
     "rotor_spacing": Specification("m", (), "distance between neighbouring rotors", Limits(0.005, 2.0, 0.03, 0.25)),
     "rotor_inertia": Specification("kg m^2", (), "inertia of one rotor", Limits(0.0, 1e-4, 0.0, 1e-6)),
     "motor_time_constant": Specification("s", (4,), "motor lag", Limits(1e-5, 5.0, 1e-3, 0.3)),
-    # At 20000 rad/s tips of 3 cm blades would move at 600 m/s: larger numbers are in rpm.
+    # At 20000 rad/s the tips of 3 cm blades would move at 600 m/s: larger numbers are in rpm.
     "motor_gain": Specification("rad/s", (4,), "steady rotor speed per unit command", Limits(1.0, 2e4, 500.0, 6000.0)),
     "motor_speed_offset": Specification(
         "rad/s", (4,), "steady rotor speed at zero command", Limits(-2e4, 2e4, -1000.0, 1000.0)
@@ -175,10 +175,10 @@ SPECIFICATIONS: dict[str, Specification] = {
     "torque_scale": Specification("1", (4,), "factor on aerodynamic torque", Limits(0.0, 10.0, 0.2, 4.0)),
     "pose_delay": Specification("s", (), "age of pose and velocity", Limits(0.0, 1.0, 0.0, 0.1)),
     "attitude_offset": Specification("rad", (3,), "attitude error of the estimator", Limits(-3.15, 3.15, -0.3, 0.3)),
-    # Last: a parameter's place decides its random draws.
+    # Keep it last: the position of a parameter determines its random draws.
     "gyro_delay": Specification("s", (), "age of the gyro's reading", Limits(0.0, 1.0, 0.0, 0.05)),
 }
-"""What every parameter is and where it may lie: files, ``--set``, randomisation, fits and constructors ask here."""
+"""Specifications of all parameters, used for files, ``--set``, randomisation, fits and constructors."""
 
 DEFAULTS: dict[str, float] = {
     "center_of_gravity": 0.0,
@@ -189,19 +189,24 @@ DEFAULTS: dict[str, float] = {
     "attitude_offset": 0.0,
     "gyro_delay": 0.0,
 }
-"""Neutral values of what a parameter file may leave out."""
+"""Neutral values of parameters that a file may omit."""
 
 FORMER_NAMES = {"observation_delay": "pose_delay"}
-"""Names that files and commands may still use."""
+"""Former names of parameters, still accepted in files and commands."""
 
 
 def current_names(values: Mapping[Any, Any], where: str | Path, prefix: str = "") -> dict[Any, Any]:
-    """The same values under the names of today.
+    """Replace former names by present ones.
+
+    Args:
+        values: values by name.
+        where: file, for messages.
+        prefix: path of the names within the file, for messages.
 
     Raises:
-        CfbError: one is given under both of its names.
+        CfbError: a value is given under both names.
     """
     for former, now in FORMER_NAMES.items():
         if former in values and now in values:
-            raise CfbError(f"{where}: {prefix}{former} and {prefix}{now} are one thing; give {prefix}{now} alone.")
+            raise CfbError(f"{where}: {prefix}{former} and {prefix}{now} are the same; give only {prefix}{now}.")
     return {FORMER_NAMES.get(name, name): value for name, value in values.items()}

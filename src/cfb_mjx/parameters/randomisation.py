@@ -1,6 +1,6 @@
 """Domain randomisation: ranges read from YAML, and parameter draws as a pure function of a PRNG key.
 
-A model of a type of drone carries measured ranges itself: the ``spread`` of its numbers between drones.
+A model of a type of drone contains measured ranges itself: the ``spread`` of its parameters between drones.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters, current_na
 
 FORMAT = "cfb_mjx randomisation 1"
 UNIFORM = math.sqrt(3)
-"""Half-width of a uniform draw over its standard deviation."""
+"""Ratio of the half-width of a uniform distribution to its standard deviation."""
 
 
 @dataclass(frozen=True)
 class Range:
-    """Half-width of a uniform draw about the nominal value.
+    """Half-width of a uniform distribution about the nominal value.
 
-    ``relative`` widths are fractions of the nominal value; others carry the parameter's unit. ``shared`` draws one
-    number for all motors or axes of the parameter. ``unit`` is what a file says of an effect's field, whose effect is
-    only known where there is a drone.
+    ``relative`` widths are fractions of the nominal value; others are in the parameter's unit. ``shared`` draws one
+    number for all motors or axes of the parameter. ``unit`` is the unit that a file gives for a field of an effect; it
+    is checked when the drone, and with it the effect, is known.
     """
 
     half_width: tuple[float, ...]
@@ -45,28 +45,28 @@ class Range:
 
     @property
     def width(self) -> np.ndarray:
-        """The half-width: a number, or one of each component."""
+        """The half-width: one number, or one per component."""
         widths = self.half_width
         return np.asarray(widths[0] if len(widths) == 1 else widths)
 
     def reach(self, center: np.ndarray | np.generic) -> np.ndarray:
-        """How far from ``center`` a draw at magnitude 1 can lie."""
+        """Largest distance from ``center`` of a draw at magnitude 1."""
         return np.broadcast_to(np.abs(center) * self.width if self.relative else self.width, center.shape)
 
 
 def largest_magnitude(room: np.ndarray | np.floating, reach: np.ndarray | np.floating) -> float:
-    """Up to which no draw that reaches so far leaves the room there is."""
+    """Largest magnitude at which draws with this reach stay within the room."""
     return float(np.min(np.where(reach > 0, room / np.where(reach > 0, reach, 1.0), np.inf)))
 
 
 @dataclass(frozen=True)
 class Randomisation:
-    """What varies, and how far at magnitude 1. Hashable, so it can be closed over under ``jit``.
+    """Ranges at magnitude 1. Hashable, so that functions may close over it under ``jit``.
 
     Attributes:
-        name: for messages.
-        ranges: of parameters, by name.
-        effects: of effects: effect, field, range. Drawn by `cfb_mjx.model.sample_drone`.
+        name: name for messages.
+        ranges: ranges of parameters: name, range.
+        effects: ranges of effects: effect, field, range. Drawn by `cfb_mjx.model.sample_drone`.
     """
 
     name: str
@@ -77,8 +77,11 @@ class Randomisation:
 def load_randomisation(name_or_path: str | Path = "paper") -> Randomisation:
     """Read a shipped randomisation (``paper``, ``identification``), a YAML file, or a model with spreads.
 
+    Args:
+        name_or_path: name or file.
+
     Raises:
-        CfbError: no such file, unknown keys or impossible widths, named; a model whose numbers have no ``spread``.
+        CfbError: there is no such file, keys are unknown, widths are impossible, or a model has no ``spread``.
     """
     if _is_model(name_or_path):
         return _between_drones(load_model_file(name_or_path))
@@ -109,13 +112,15 @@ def _is_model(name_or_path: str | Path) -> bool:
 
 
 def _between_drones(model: ModelFile) -> Randomisation:
-    """Uniform draws as far from the type's value as has the measured spread for standard deviation."""
+    """Uniform distributions about a model's values with the measured spread as standard deviation."""
     ranges, effects = [], []
     for key, entry in model.entries.items():
         if entry.spread is not None:
             relative = _only_relative(key)
             if relative and np.any(entry.value == 0):
-                raise CfbError(f"model {model.name}: parameters.{key} is 0 and has a spread, which would allow less.")
+                raise CfbError(
+                    f"model {model.name}: parameters.{key} is 0 and has a spread, which would allow negative values."
+                )
             width = UNIFORM * (entry.spread / np.abs(entry.value) if relative else entry.spread)
             ranges.append((key, Range(tuple(width.ravel().tolist()), relative, False)))
     for item in model.effects:
@@ -130,7 +135,7 @@ def _between_drones(model: ModelFile) -> Randomisation:
 
 
 def _only_relative(key: str) -> bool:
-    """Whether a width in the parameter's unit would allow the wrong sign."""
+    """Whether a width in the parameter's unit would allow values of the wrong sign."""
     return SPECIFICATIONS[key].limits.hard_low >= 0 or bool(SPECIFICATIONS[key].together)
 
 
@@ -168,7 +173,7 @@ def _range_of_effect(where: str, raw, path: Path) -> Range:
 
 
 def _widths(where: str, raw, path: Path, *more: str) -> tuple[float, ...]:
-    """The half-widths of a range, whose keys are the usual ones and ``more``."""
+    """Half-widths of a range; its keys are the usual ones and ``more``."""
     if not isinstance(raw, dict):
         raise CfbError(f"{path}: {where} must be a mapping with half_width and unit.")
     refuse_unknown(raw, {"half_width", "unit", "source", *more}, path, f"{where}.")
@@ -187,32 +192,35 @@ def sample_parameters(
     randomisation: Randomisation | None = None,
     magnitude: float | Float[Array, ""] = 1.0,
 ) -> Parameters:
-    """Draw one drone. ``vmap`` over ``key`` for many; the same key gives the same drone.
+    """Draw the parameters of a random drone. Use ``vmap`` over ``key`` for many; the same key gives the same drone.
+
+    If ``nominal`` or ``magnitude`` is traced, nothing can be refused. Impossible draws are then NaN, and so are all
+    states of that drone. A drawn inertia that is impossible for a rigid body (the paper's independent +-20 % allow
+    some) has its largest moment reduced to the sum of the other two.
 
     Args:
         key: PRNG key.
         nominal: parameters about which to draw (without batch axes).
-        randomisation: ranges; the paper's (section V) by default.
+        randomisation: ranges; default: the paper's (section V).
         magnitude: factor on every range; 0 returns the nominal drone. May be traced.
 
-    Raises:
-        CfbError: ranges whose draws could lie beyond what can be (`require_possible`), or that vary effects.
+    Returns:
+        The drawn parameters.
 
-    Where ``nominal`` or ``magnitude`` is traced, nothing can be refused: there a number drawn beyond what can be is
-    NaN, and so is every state of that drone. A drawn inertia that no rigid body can have (the paper's independent
-    +-20 % allows some) has its largest moment reduced to the sum of the other two.
+    Raises:
+        CfbError: the ranges allow impossible values (`require_possible`), or vary effects.
     """
     randomisation = load_randomisation() if randomisation is None else randomisation
     if randomisation.effects:
         raise CfbError(
-            f"randomisation '{randomisation.name}' varies effects, which are no parameters; draw with sample_drone."
+            f"randomisation '{randomisation.name}' varies effects, which are not parameters; draw with sample_drone."
         )
     require_possible(nominal, randomisation, magnitude)
     drawn = {}
     for name, spread in randomisation.ranges:
         value = getattr(nominal, name)
         shape = () if spread.shared else value.shape
-        # fold_in by position in the specification table: adding a range never changes the draws of the others.
+        # Keyed by position in the table of specifications: adding a range never changes the draws of the others.
         order = list(SPECIFICATIONS).index(name)
         unit = jax.random.uniform(jax.random.fold_in(key, order), shape, value.dtype, -1.0, 1.0)
         change = magnitude * spread.width.astype(value.dtype) * unit
@@ -231,16 +239,16 @@ def require_possible(
     magnitude: float | Float[Array, ""] = 1.0,
     what: str = "magnitude",
 ) -> None:
-    """Refuse ranges whose draws could lie beyond what can be (`SPECIFICATIONS`). Nothing is said of what is traced.
+    """Refuse ranges that allow impossible values (`SPECIFICATIONS`). Traced values are not checked.
 
     Args:
         nominal: parameters about which to draw; batch axes may come first.
         randomisation: ranges.
         magnitude: factor on every range.
-        what: the magnitude is called, for messages.
+        what: name of the magnitude in messages.
 
     Raises:
-        CfbError: one parameter that could be drawn beyond its limits, and the largest magnitude that fits all.
+        CfbError: a parameter could be drawn outside its limits; the message gives the largest magnitude that fits.
     """
     asked = concrete(magnitude)
     if asked is None or not asked.any():
@@ -263,7 +271,7 @@ def require_possible(
 
 
 def _largest_magnitude(name: str, center: np.ndarray, spread: Range) -> float:
-    """Up to which no draw leaves what can be; below zero where the nominal value does."""
+    """Largest magnitude at which all draws are possible; negative if the nominal value is not."""
     limits = SPECIFICATIONS[name].limits
     reach = spread.reach(center)
     room = np.minimum(limits.hard_high - center, center - limits.hard_low)
@@ -274,11 +282,11 @@ def _largest_magnitude(name: str, center: np.ndarray, spread: Range) -> float:
 
 
 _SUMS = ("thrust_polynomial", "torque_polynomial")
-"""Their coefficients must have a positive sum."""
+"""Polynomials whose coefficients must have a positive sum."""
 
 
 def _possible(name: str, value: Array) -> Array:
-    """The value, and NaN where it cannot be."""
+    """The value, with NaN where it is impossible."""
     specification = SPECIFICATIONS[name]
     holds = specification.limits.holds(value)
     if name in _SUMS:

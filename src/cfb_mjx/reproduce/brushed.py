@@ -1,4 +1,4 @@
-"""The brushless drone beside the brushed one that simulators have known so far."""
+"""Comparison of the brushless drone with the brushed one of earlier simulators."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ QUANTITIES = (("velocity", "mps", "m/s"), ("attitude", "deg", "deg"), ("rate", "
 
 
 def brushed(folder: Path, real: Path | None, given: Given | None = None) -> Result:
-    """Thrust and agility of both, how well each predicts flights of the brushless one, and the brushed one its own."""
+    """Compare thrust and agility of both, and their predictions of brushless and, if given, brushed flights."""
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid import evaluate
@@ -29,15 +29,15 @@ def brushed(folder: Path, real: Path | None, given: Given | None = None) -> Resu
     able = {name: _abilities(file.parameters()) for name, file in files.items()}
     flights = {"generated": ([generated("figure8")], files)}
     text = [
-        "The brushed Crazyflie 2.x with the constants of gym-pybullet-drones (`configs/parameters/cf2x.yaml`, where "
-        "each has its source), and flights of a brushless one predicted by both models from the same commands.",
+        "The brushed Crazyflie 2.x with the constants of gym-pybullet-drones (`configs/parameters/cf2x.yaml` has the "
+        "sources), and flights of a brushless Crazyflie predicted by both models from the same commands.",
         f"Generated: {GENERATED}.",
     ]
     real_logs = real_flights(real)
     if real_logs:
         heavy = files | {"brushless": files["brushless"].with_values("weighed, with two decks", mass=REAL_MASS_KG)}
         flights["real"] = (real_logs, heavy)
-        text.append(f"Real: {len(real_logs)} flights, {SOURCE}; the brushless model with the mass as weighed.")
+        text.append(f"Real: {len(real_logs)} flights, {SOURCE}; the brushless model has the weighed mass.")
     else:
         text.append(SKIPPED)
     if given is not None:
@@ -47,8 +47,8 @@ def brushed(folder: Path, real: Path | None, given: Given | None = None) -> Resu
         )
     else:
         text.append(
-            "The paper compares a brushed model on brushed flights. None are shipped: give a folder of them with "
-            "--flights, and the drone's weight with --mass. What stands here is a brushed model on brushless flights."
+            "The paper compares a brushed model on brushed flights. No brushed flights are shipped: give a folder of "
+            "them with --flights, and the drone's mass with --mass. Shown here is a brushed model on brushless flights."
         )
     errors: dict[tuple[str, str], dict] = {}
     for where, (logs, models) in flights.items():
@@ -58,8 +58,8 @@ def brushed(folder: Path, real: Path | None, given: Given | None = None) -> Resu
             errors[where, "hold"] = not_none(found.metrics("hold"))
     less, more = able["brushed"]["thrust_n"], able["brushless"]["thrust_n"]
     limits = (
-        "at full command of both; the brushed one's limit is the one gym-pybullet-drones gives it, the brushless one's "
-        "what the paper's own curve gives at 2900 rad/s"
+        "at full command of both; the brushed drone's limit is from gym-pybullet-drones, the brushless drone's from "
+        "the paper's curve at 2900 rad/s"
     )
     rows = [Row("more thrust than the brushed one", "around 50 %", f"{100 * (more / less - 1):.0f} %", limits)]
     for key, what in ABILITIES.items():
@@ -88,7 +88,7 @@ def _abilities(p) -> dict[str, float]:
     return {
         "thrust_n": float(full.sum()),
         "to_weight": float(full.sum() / (p.mass * p.gravity)),
-        # Two rotors at full thrust, two at none.
+        # Two rotors at full thrust, two at zero thrust.
         "roll_radps2": float(full[0] * p.rotor_spacing / inertia[0]),
         "lag_s": float(np.max(p.motor_time_constant)),
     }

@@ -1,4 +1,4 @@
-"""The paper's constants, and what follows from them."""
+"""The paper's constants, compared with the shipped files, and values that follow from them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from cfb_mjx.reproduce.item import Result, Row, write_csv
 
-# Typed in from the paper (table II, eqs. 5-9): what the shipped parameter files are compared with.
+# Copied from the paper (table II, eqs. 5-9), for comparison with the shipped parameter files.
 PAPER = {
     "cfb-guards": {"mass": 0.044, "inertia": (3.3e-5, 3.6e-5, 5.9e-5)},
     "cfb": {"mass": 0.040, "inertia": (1.8e-5, 2.4e-5, 3.0e-5)},
@@ -35,7 +35,7 @@ RANDOMISATION = {
 
 
 def parameters(folder: Path, real: Path | None) -> Result:
-    """Table II and the ranges of the randomisation, as shipped."""
+    """Compare table II and the ranges of the randomisation with the shipped files."""
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.model.rotors import thrust
     from cfb_mjx.parameters import load_model_file, load_randomisation
@@ -71,7 +71,7 @@ def parameters(folder: Path, real: Path | None) -> Result:
     write_csv(folder / "parameters.csv", ("quantity", "paper", "ours"), [(r.what, r.paper, r.ours) for r in rows])
     return Result(
         "Parameters and randomisation",
-        ["The shipped parameter files and randomisation, beside the paper's table and text."],
+        ["The shipped parameter files and randomisation, compared with the paper's table and text."],
         rows,
     )
 

@@ -1,4 +1,4 @@
-"""Position controllers: the hover table, six metres back and forth, and what randomisation is worth."""
+"""Position controllers: the hover table, six metres back and forth, and the effect of randomisation."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from cfb_mjx.files import shipped
 from cfb_mjx.reproduce.item import Result, Row, write_csv
 from cfb_mjx.reproduce.paper import PAPER_FIRMWARE, PAPER_HOVER
 
-SIMULATED = "Ours flies in simulation, the paper's numbers are of its real drone."
+SIMULATED = "Our results are from simulation, the paper's numbers from its real drone."
 LEG_S, LEGS = 3.0, 4
 ALGORITHMS = {"analytic": "back-propagation", "ppo": "PPO"}
 SEEDS = 3
 
 
 def controllers(folder: Path, real: Path | None) -> Result:
-    """Hover error and command std of the network and of the firmware's controllers."""
+    """Measure hover error and command std of the network and of the firmware's controllers."""
     from cfb_mjx.control.controllers import find_controller
     from cfb_mjx.train.flying import hover
     from cfb_mjx.train.judge import Judge, away
@@ -46,11 +46,11 @@ def controllers(folder: Path, real: Path | None) -> Result:
     write_csv(folder / "controllers.csv", (*header, "paper_hover_mm", "paper_std"), numbers)
     _draw_hover(distances, paper, folder / "controllers.png")
     text = [
-        f"{SIMULATED} Six seconds at the target, the last five count, mean of {len(judge.few)} flights with the noise "
-        "and the delay, of pose and gyro alike, that networks are trained with; then the ten drones of "
-        "`configs/plants/off-nominal.yaml`, whose effects no controller knows of.",
-        "The firmware's PID has integral action, and a simulated drone without wind and drifting batteries lets it "
-        "come to rest; Mellinger's height error is that of the firmware's default mass and thrust scale.",
+        f"{SIMULATED} Six seconds at the target, of which the last five count; mean of {len(judge.few)} flights with "
+        "the noise and the delay (of pose and gyro) with which networks are trained; then the ten drones of "
+        "`configs/plants/off-nominal.yaml`, whose effects are unknown to all controllers.",
+        "The firmware's PID has integral action, and without wind and battery drift it comes to rest at the target. "
+        "Mellinger's height error is caused by the firmware's default mass and thrust scale.",
     ]
     return Result(
         "Controllers in hover", text, rows, [(folder / "controllers.png", "distance from the target over time")]
@@ -59,7 +59,7 @@ def controllers(folder: Path, real: Path | None) -> Result:
 
 def _why(name: str) -> str:
     if name == "target":
-        return "a reward with other weights; simulated, without what the real drone has beyond the model"
+        return "a reward with other weights; simulated, without the real drone's unmodelled effects"
     return "simulated drone: no wind, no drift" if name == "pid" else "default mass and thrust scale of the firmware"
 
 
@@ -86,7 +86,7 @@ def _draw_hover(distances: dict, paper: dict, path: Path) -> None:
 
 
 def back_and_forth(folder: Path, real: Path | None) -> Result:
-    """Six metres to and fro with the network."""
+    """Fly six metres back and forth with the network."""
     import jax
 
     from cfb_mjx.control.controllers import find_controller
@@ -103,7 +103,7 @@ def back_and_forth(folder: Path, real: Path | None) -> Result:
     speed, target = np.linalg.norm(flown.velocity, axis=-1), np.asarray(flown.watched)
     arrival, peak = float(np.median(step.arrival_s)), float(np.median(step.peak_speed_mps))
     slower = "to within 10 cm, median of 64 flights; ours flies faster"
-    limit = "nothing in the reward asks to fly slower than the 10 m/s at which an episode ends"
+    limit = "the reward does not limit the speed below the 10 m/s at which an episode ends"
     rows = [
         Row("distance, m", "6", f"{STEP_DISTANCE_M:g}", kind="input"),
         Row("time, s", "2", f"{arrival:.2f}", slower),
@@ -143,7 +143,7 @@ def _draw_back_and_forth(time, target, position, speed, path: Path) -> None:
 
 
 def randomisation(folder: Path, real: Path | None) -> Result:
-    """Networks trained with more and less randomisation, flown again."""
+    """Fly networks that were trained with different magnitudes of randomisation."""
     from cfb_mjx.control.controllers import find_controller
     from cfb_mjx.train.judge import Judge, away
     from cfb_mjx.view.magnitudes import magnitudes_figure
@@ -180,11 +180,9 @@ def randomisation(folder: Path, real: Path | None) -> Result:
     text = [
         f"{SIMULATED} Three networks per magnitude and algorithm (`data/study`; trained for hours by "
         "`python scripts/study_magnitudes.py`, docs/magnitudes.md) fly the hover test again: on the nominal drone, and "
-        "on ten drones with effects that stand in for the real one. Means of the seeds; lost: a drone was lost.",
+        "on ten drones with effects that represent the real one. Means over the seeds; lost: a drone was lost.",
     ]  # fmt: skip
-    return Result(
-        "What randomisation is worth", text, rows, [(folder / "randomisation.png", "hover error over magnitude")]
-    )
+    return Result("Effect of randomisation", text, rows, [(folder / "randomisation.png", "hover error over magnitude")])
 
 
 def _less(algorithm: str, policy: Path) -> str:

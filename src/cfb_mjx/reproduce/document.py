@@ -1,4 +1,4 @@
-"""What was reproduced, as a page for a browser and as Markdown."""
+"""Pages of the reproduced results, as HTML and as Markdown."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ from cfb_mjx.reproduce.item import Result
 from cfb_mjx.view.page import Section, html_page
 
 HEADER = ("quantity", "paper", "ours", "ours is", "how it differs and why")
-KINDS = {"result": "", "input": "an input, no result", "own": "of its own flight, no evidence"}
+KINDS = {"result": "", "input": "an input, not a result", "own": "for the model's own flight, not evidence"}
 TITLE = "How to Model Your Crazyflie Brushless, reproduced"
 
 
 def page(results: Mapping[str, Result], facts: Mapping[str, object], left: str = "") -> str:
-    """Everything on one self-contained HTML page; ``left`` says what is still to be made."""
+    """Build one self-contained HTML page.
+
+    Args:
+        results: results by name of the item.
+        facts: date, machine and versions.
+        left: sentence on the items that are not made yet.
+    """
     sections = [
         Section(
             result.title,
@@ -26,41 +32,43 @@ def page(results: Mapping[str, Result], facts: Mapping[str, object], left: str =
         for name, result in results.items()
     ]
     lead = (
-        "Every figure and table of the paper (ICRA 2026), from the shipped model, policies and logs, its numbers "
-        f"beside ours. {counted(results)} {left}"
+        "Every figure and table of the paper (ICRA 2026), made with the shipped model, policies and logs. The paper's "
+        f"numbers are next to ours. {counted(results)} {left}"
     )
     return html_page(TITLE, lead.strip(), sections, facts)
 
 
 def counted(results: Mapping[str, Result]) -> str:
-    """How many of the rows with a number of the paper say something, and how many do not."""
+    """Sentence with the numbers of comparisons with the paper that are results, inputs, and the model's own flights."""
     kinds = Counter(row.kind for result in results.values() for row in result.rows if row.paper)
     return (
-        f"{kinds['result']} comparisons with numbers of the paper; beside them {kinds['input']} inputs (constants of "
-        f"the paper that the shipped files repeat, or were put into generated data) and {kinds['own']} predictions "
-        "by the model of its own flights, neither of which is evidence."
+        f"{kinds['result']} comparisons with numbers of the paper. In addition there are {kinds['input']} inputs "
+        "(constants of the paper that are in the shipped files or were used to generate data) and "
+        f"{kinds['own']} predictions of flights that were simulated with the model's own constants. Neither is "
+        "evidence."
     )
 
 
 def markdown(
     results: Mapping[str, Result], facts: Mapping[str, object], command: str, figures: str = "", left: str = ""
 ) -> str:
-    """The same as Markdown.
+    """Build the page as Markdown.
 
     Args:
-        results: by name of the item.
+        results: results by name of the item.
         facts: date, machine and versions.
-        command: that wrote it.
-        figures: folder of the figures, relative to the file, with a slash at its end; none where they lie beside it.
-        left: what is still to be made.
+        command: the command that writes the page.
+        figures: folder of the figures, relative to the file, with a final slash; empty if it is the file's folder.
+        left: sentence on the items that are not made yet.
     """
     lines = [
         f"# {TITLE}",
         "",
         f"Written by `{command}`; do not edit. " + ", ".join(f"{key} {value}" for key, value in facts.items()) + ".",
         "",
-        f"{counted(results)} They stand in the paper's order, with the command that makes each; rows without a paper's "
-        "number are ours alone. Where the paper is silent or cannot be right: [deviations.md](deviations.md).",
+        f"{counted(results)} The sections follow the order of the paper, each with the command that makes it. Rows "
+        "without a number of the paper have only our result. [deviations.md](deviations.md) lists where the paper "
+        "gives no value or cannot be right.",
         *(["", left] if left else []),
     ]
     for name, result in results.items():
@@ -79,5 +87,5 @@ def _cells(row) -> list[str]:
 
 
 def names_of(results: Mapping[str, Result]) -> list[Path]:
-    """All figures."""
+    """Files of all figures."""
     return [path for result in results.values() for path, _ in result.figures]

@@ -1,4 +1,4 @@
-"""Which flights stand in for the paper's own, which are not public."""
+"""Flights that replace the paper's flights, which are not public."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ if TYPE_CHECKING:
 NO_LOGS = (".md", ".txt", ".yaml", ".yml", ".json", ".png")
 
 REAL_MASS_KG = 0.045
-"""The drone of the public flights carries an AI-deck and a flow deck."""
+"""Mass of the drone of the public flights, which carries an AI-deck and a flow deck."""
 SOURCE = (
     "the public IDSIA nano-drone system-identification benchmark (Busetto et al., Control Engineering Practice 172, "
     "2026)"
 )
-SKIPPED = "Real flights. Skipped: give --real FOLDER to see them beside these."
+SKIPPED = "Real flights. Skipped: give --real FOLDER to include them."
 GENERATED = "a flight that comes with the project, made by another program (`data/flight_logs`)"
 
 
 def generated(name: str) -> FlightLog:
-    """A flight log that is shipped."""
+    """A shipped flight log."""
     return read_log(shipped("data", "flight_logs", f"{name}.mcap"))
 
 
 @dataclass(frozen=True)
 class Given:
-    """Flights that the user gives for an item."""
+    """Flights given by the user for an item."""
 
     logs: tuple[FlightLog, ...]
     mass: float | None = None
-    """Of the drone as it was weighed, kg; None: that of the model."""
+    """Weighed mass of the drone, kg; None: the mass of the model."""
 
     @classmethod
     def read(cls, folder: Path, mass: float | None) -> Given:
-        """All flight logs in a folder and the folders in it.
+        """Read all flight logs in a folder and its subfolders.
 
         Raises:
-            CfbError: there are none, or one cannot be read.
+            CfbError: the folder has no flight logs, or one cannot be read.
         """
         if not folder.is_dir():
             raise CfbError(f"{folder}: there is no such folder; --flights takes a folder of flight logs.")
@@ -53,30 +53,32 @@ class Given:
         return cls(tuple(map(read_log, paths)), mass)
 
     def drone(self, preset: str) -> ModelFile:
-        """A preset with the mass as weighed."""
+        """A preset with the weighed mass."""
         from cfb_mjx.parameters import load_model_file
 
         file = load_model_file(preset)
         return file if self.mass is None else file.with_values("weighed", mass=self.mass)
 
     def said(self) -> str:
-        """Which flights, and with which mass."""
+        """Phrase with the names of the flights and the mass."""
         mass = "the mass of the preset" if self.mass is None else f"a mass of {self.mass:g} kg, as weighed"
         return f"{len(self.logs)} flights given with --flights ({', '.join(log.name for log in self.logs)}), {mass}"
 
 
 def require_real(folder: Path | None) -> None:
-    """Refuse a folder without real flights.
+    """Check that a folder, if given, contains real flights.
 
     Raises:
-        CfbError: it has none.
+        CfbError: the folder contains none.
     """
     if folder is not None and not _paths(folder):
-        raise CfbError(f"{folder}: has no fit/*.parquet or validation/*.parquet; leave --real out to do without.")
+        raise CfbError(
+            f"{folder}: has no fit/*.parquet or validation/*.parquet; give another folder, or leave --real out."
+        )
 
 
 def real_flights(folder: Path | None) -> list[FlightLog]:
-    """All flights of a folder with ``fit`` and ``validation``; none where there is no folder."""
+    """All flights of a folder with subfolders ``fit`` and ``validation``; empty for None."""
     return [] if folder is None else [read_log(path) for path in _paths(folder)]
 
 

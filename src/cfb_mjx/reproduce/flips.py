@@ -1,4 +1,4 @@
-"""Flips: four of different shape, and the double flip."""
+"""Flips: four single flips of different shape, and the double flip."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from cfb_mjx.reproduce.item import Result, Row, write_csv
 
 SHAPES = ("flip-low", "flip-fast", "flip-wide", "flip-high")
 FLIGHTS = 64
-SIMULATED = "Ours flies in simulation, seen 8 ms late and with noise; the paper's numbers are of its real drone."
+SIMULATED = (
+    "Our results are from simulation, with observations that are noisy and 8 ms late; the paper's numbers are from its "
+    "real drone."
+)
 
 
 def _flown(name: str, count: int):
@@ -26,13 +29,13 @@ def _flown(name: str, count: int):
     nominal = Quadrotor.from_file("cfb-guards")
     of = find_deployment(name)
     controller = of.controller
-    assert isinstance(controller, Manoeuvre)  # what is named here flips
+    assert isinstance(controller, Manoeuvre)  # all names in this file are flips
     measured, flown = flips(controller, TargetTask(), nominal, jax.random.split(jax.random.PRNGKey(11), count))
     return not_none(of.manoeuvre), measured, flown, controller.control_dt_s
 
 
 def four_flips(folder: Path, real: Path | None) -> Result:
-    """Single flips of different shape in the YZ plane."""
+    """Fly single flips of different shape, and draw them in the YZ plane."""
     from cfb_mjx.view.flip import draw_path
     from cfb_mjx.view.style import context, new_figure, save
 
@@ -61,12 +64,12 @@ def four_flips(folder: Path, real: Path | None) -> Result:
         save(figure, folder / "flips.png")
     write_csv(folder / "flips.csv", ("flip", "time_s", "y_m", "z_m", "roll_deg", "roll_rate_dps", "phase"), numbers)
     rows.insert(0, Row("shapes of single flips", "4", str(len(SHAPES)), kind="input"))
-    text = [f"{SIMULATED} One policy, four settings of when it is switched and what it is asked for."]
+    text = [f"{SIMULATED} One policy, with four settings of switching times and set-points."]
     return Result("Single flips", text, rows, [(folder / "flips.png", "four single flips in the YZ plane")])
 
 
 def double_flip(folder: Path, real: Path | None) -> Result:
-    """Two turns: the way in the YZ plane and the roll angle over time."""
+    """Fly double flips, and draw the path in the YZ plane and the roll angle over time."""
     from cfb_mjx.view.flip import flip_figure
 
     rows, numbers, figures = [], [], []
@@ -76,7 +79,7 @@ def double_flip(folder: Path, real: Path | None) -> Result:
         "rate_stop_s": ("rate stopped within, s", "0.35", 1.0, ".2f"),
         "fall_mps": ("falling speed, m/s", "3.5", 1.0, ".2f"),
         "vertical_stop_s": ("fall stopped within, s", "0.6", 1.0, ".2f"),
-        "return_error_m": ("off the start afterwards, m", "", 1.0, ".3f"),
+        "return_error_m": ("distance from the start afterwards, m", "", 1.0, ".3f"),
     }
     for name in ("double-flip-paper", "double-flip"):
         of, measured, _, dt = _flown(name, FLIGHTS)
@@ -89,13 +92,13 @@ def double_flip(folder: Path, real: Path | None) -> Result:
         _, _, one, _ = _flown(name, 1)
         numbers += _path(name, one, dt)
         flip_figure(one, dt, folder / f"{name}.png", name)
-        figures.append((folder / f"{name}.png", f"{name}: way in the YZ plane, roll angle, rate and vertical speed"))
+        figures.append((folder / f"{name}.png", f"{name}: path in the YZ plane, roll angle, rate and vertical speed"))
     write_csv(
         folder / "double-flip.csv", ("flip", "time_s", "y_m", "z_m", "roll_deg", "roll_rate_dps", "phase"), numbers
     )
     text = [
-        f"{SIMULATED} `double-flip-paper` is flown as fast as the paper's; `double-flip` is the one that most "
-        "randomised drones complete (docs/flips.md has 4096 of them, the lowest double flip, and three turns).",
+        f"{SIMULATED} `double-flip-paper` is as fast as the paper's double flip; `double-flip` is the one that most "
+        "randomised drones complete (docs/flips.md has 4096 of them, the lowest double flip, and a triple flip).",
     ]  # fmt: skip
     return Result("The double flip", text, rows, figures)
 

@@ -1,4 +1,4 @@
-"""What a figure or table of the paper is here: a function that draws it and says the paper's numbers beside ours."""
+"""Items of the reproduction: functions that draw a figure or table of the paper and compare its numbers with ours."""
 
 from __future__ import annotations
 
@@ -14,15 +14,16 @@ from cfb_mjx.files import replacing
 
 @dataclass(frozen=True)
 class Row:
-    """One number of the paper beside ours, as text.
+    """One number of the paper and ours, as text.
 
     Attributes:
         what: quantity and unit.
-        paper: what the paper states; empty where it does not state it.
-        ours: what came out.
+        paper: the paper's value; empty if the paper does not state it.
+        ours: our value.
         why: how the two differ, and why.
-        kind: what ours is: a ``result``; an ``input``, a constant of the paper that files here repeat or that was put
-            into the data; or the model's prediction of its ``own`` flights, which says nothing of a drone.
+        kind: kind of our value: a ``result``; an ``input``, which is a constant of the paper that is in the shipped
+            files or was used to generate the data; or the model's prediction of its ``own`` simulated flights, which is
+            no evidence about a drone.
     """
 
     what: str
@@ -34,14 +35,14 @@ class Row:
 
 @dataclass(frozen=True)
 class Result:
-    """One figure or table, made.
+    """Result of one figure or table.
 
     Attributes:
         title: heading.
-        text: paragraphs: what was done, and with which data.
+        text: paragraphs on the method and the data.
         rows: the paper's numbers and ours.
-        figures: file and alternative text of each.
-        tables: (caption, header, rows) of more.
+        figures: file and alternative text of each figure.
+        tables: (caption, header, rows) of further tables.
     """
 
     title: str
@@ -53,14 +54,14 @@ class Result:
 
 @dataclass(frozen=True)
 class Item:
-    """A figure or table that can be asked for.
+    """A figure or table that can be reproduced.
 
     Attributes:
         about: one line for the help.
-        make: draws into a folder; takes that folder and the folder of real flights (None: there is none).
-        given: whether it can be made with flights that the user gives; ``make`` then takes them as ``given``.
-        x64: whether it is computed in double precision: identification is, flights of policies are not, for those were
-            trained in single.
+        make: function that draws into a folder; its arguments are that folder and the folder of real flights (or None).
+        x64: whether it is computed in double precision. Identification is; flights of policies are not, because
+            policies were trained in single precision.
+        given: whether it can use flights given by the user; ``make`` then takes them as ``given``.
     """
 
     about: str
@@ -70,7 +71,7 @@ class Item:
 
 
 def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
-    """Write the numbers behind a figure atomically; floats with seven digits."""
+    """Write the numbers of a figure as csv, atomically, with seven digits for floats."""
     with replacing(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(header)
@@ -78,6 +79,6 @@ def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]
 
 
 def with_std(value: float, std: float) -> str:
-    """A fitted number and its standard deviation, that with two digits and the number to the same place."""
+    """Format a fitted number and its standard deviation: two digits of the deviation, the number to the same place."""
     place = max(0, 1 - math.floor(math.log10(std))) if std > 0 else 6
     return f"{value:.{place}f} +- {std:.{place}f}"

@@ -1,4 +1,4 @@
-"""What has been made, in its folder: the pages about it, and what an interrupted run needs to go on."""
+"""Store results in a folder: the pages, and the data with which an interrupted run continues."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ PAGE, TEXT, NUMBERS = "index.html", "paper.md", "paper.json"
 def keep(
     folder: Path, results: Mapping[str, Result], of: Mapping[str, Any], facts: Mapping[str, Any], command: str
 ) -> None:
-    """Write the pages, the rows and what is needed to go on.
+    """Write the pages, the rows, and the data needed to continue an interrupted run.
 
     Args:
-        folder: for all of it.
-        results: by name of the item.
-        of: what they depend on, ``names`` of all items that are wanted among it.
+        folder: folder of all files.
+        results: results by name of the item.
+        of: settings on which the results depend, including the ``names`` of all requested items.
         facts: date, machine and versions.
-        command: that makes them.
+        command: the command that makes the results.
     """
     left = [name for name in of["names"] if name not in results]
-    said = f"Not made yet: {', '.join(left)}; the same command goes on with them." if left else ""
-    # How long it took is said on the screen only: on one machine, a day's pages are the same to the byte.
+    said = f"Not made yet: {', '.join(left)}; the same command continues with them." if left else ""
+    # The duration is only printed, so that runs of the same day on the same machine give identical files.
     write_text(folder / PAGE, page(results, facts, said))
     write_text(folder / TEXT, markdown(results, facts, command, left=said))
     kept = {
@@ -45,7 +45,7 @@ def keep(
 
 
 def kept_in(folder: Path, of: Mapping[str, Any]) -> dict[str, Result]:
-    """What an interrupted run of the same has made already; nothing where one came to its end."""
+    """Results of an interrupted run with the same settings; empty if there is none, or if the run was complete."""
     try:
         found = json.loads((folder / NUMBERS).read_text(encoding="utf-8"))
         if found["of"] != of or not found["left"]:

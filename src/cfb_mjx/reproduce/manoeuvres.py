@@ -1,4 +1,4 @@
-"""Two manoeuvres, measured, in the bands of 4096 simulations: from hover into horizontal flight, and about yaw."""
+"""Two manoeuvres and the bands of 4096 simulations of each: hover to horizontal flight, and a yaw disturbance."""
 
 from __future__ import annotations
 
@@ -16,26 +16,27 @@ from cfb_mjx.reproduce.flights import GENERATED, REAL_MASS_KG, SKIPPED, SOURCE, 
 from cfb_mjx.reproduce.item import Result, Row, write_csv
 
 SIMULATIONS, FEWER, NOISE = 4096, 512, 1e-3
-"""As in the paper, fewer where many flights are looked at; the noise is added to velocity [m/s] and body rate [rad/s]
-in every step."""
+"""Number of simulations (as in the paper), number for each of many flights, and the standard deviation of the noise
+that is added to velocity, m/s, and body rate, rad/s, in every step."""
 REACH_S, USEFUL_S = 0.6, 0.2
-"""How long is simulated, and the horizon that the paper calls useful."""
+"""Simulated time, and the horizon that the paper calls useful, s."""
 LOST_DEG = 20.0
-"""A simulation is lost where its attitude is off by more."""
+"""Attitude error above which a simulation counts as lost."""
 CALM_MPS, CALM_RADPS = 0.35, 0.8
-"""What still counts as hovering at the start."""
+"""Largest velocity and body rate that count as hover at the start."""
 
 
 @dataclass(frozen=True)
 class Bands:
-    """A piece of a flight and the simulations of it.
+    """A part of a flight, and simulations of it.
 
     Attributes:
-        name: of the flight.
-        start: s of log time.
+        name: name of the flight.
+        start: start in the log's time, s.
         time: (T,) s since the start, of the simulations.
-        simulated: (N, T, 9) velocity, roll, pitch and yaw in deg, body rate.
-        measured_time, measured: (K,) and (K, 9) the same of the flight.
+        simulated: (N, T, 9) velocity, m/s; roll, pitch and yaw, deg; body rate, rad/s.
+        measured_time: (K,) s since the start, of the measurement.
+        measured: (K, 9) the same quantities, measured.
     """
 
     name: str
@@ -46,7 +47,7 @@ class Bands:
     measured: np.ndarray
 
     def lost(self) -> np.ndarray:
-        """(T,) share of the simulations whose attitude is off by more than `LOST_DEG`."""
+        """Share (T,) of the simulations whose attitude error is larger than `LOST_DEG`."""
         measured = np.stack([np.interp(self.time, self.measured_time, self.measured[:, i]) for i in (3, 4, 5)], axis=-1)
         apart = Rotation.from_euler("ZYX", measured[:, ::-1], degrees=True).inv()
         turned = self.simulated[..., 5:2:-1].reshape(-1, 3)
@@ -59,7 +60,7 @@ class Bands:
         )
 
     def off(self, at: float) -> list[float]:
-        """Distance of the median simulation from the flight at ``at`` [s]: velocity, attitude (deg), body rate."""
+        """Errors of the median simulation at a time (s): velocity (m/s), attitude (deg), body rate (rad/s)."""
         median = np.median(self.simulated, axis=0)
         both = [
             np.array([np.interp(at, t, x[:, i]) for i in range(9)])
@@ -69,7 +70,7 @@ class Bands:
 
 
 def hover_to_forward(folder: Path, real: Path | None, given: Given | None = None) -> Result:
-    """From hover into horizontal flight."""
+    """Simulate and draw the transition from hover to horizontal flight."""
     return _manoeuvre(
         "hover-to-forward",
         "From hover into horizontal flight",
@@ -82,7 +83,7 @@ def hover_to_forward(folder: Path, real: Path | None, given: Given | None = None
 
 
 def yaw_disturbance(folder: Path, real: Path | None, given: Given | None = None) -> Result:
-    """A disturbance about yaw, and the recovery."""
+    """Simulate and draw a yaw disturbance and the recovery from it."""
     return _manoeuvre(
         "yaw-disturbance",
         "Disturbed about yaw",
@@ -108,11 +109,12 @@ def _manoeuvre(
     model = load_model_file("cfb-guards")
     own = _pieces([generated(shipped_log)], size)
     text = [
-        f"{SIMULATIONS} simulations from the measured state with the logged commands, parameters within 2 %, centre of "
-        f"gravity within 2 mm, noise of {NOISE:g} m/s and rad/s added in every 4 ms; shaded 5 to 95 % and 25 to 75 %, "
-        f"black what was flown, the dotted line {1e3 * USEFUL_S:g} ms.",
-        f"The paper's own flights are not public; generated: {GENERATED}. The model predicts a flight of its own "
-        "there: how long it is useful for a drone is not seen from it, only from real flights (--real, --flights).",
+        f"{SIMULATIONS} simulations from the measured state with the logged commands. Parameters vary within 2 %, the "
+        f"centre of gravity within 2 mm; noise of {NOISE:g} m/s and rad/s is added every 4 ms. Shaded: 5 to 95 % and "
+        f"25 to 75 %; black: the measured flight; dotted line: {1e3 * USEFUL_S:g} ms.",
+        f"The paper's own flights are not public. Generated: {GENERATED}. It was simulated with the model's own "
+        "constants, so it does not show how long the model is useful for a drone; only real flights do (--real, "
+        "--flights).",
     ]
     flown = {"generated": (model, own)}
     flights = real_flights(real)
@@ -120,16 +122,16 @@ def _manoeuvre(
         heavier = model.with_values("weighed, with two decks", mass=REAL_MASS_KG)
         flown["real"] = heavier, _pieces(flights, size)
         text.append(
-            f"Real: {len(flights)} flights of {SOURCE}; of each the piece that fits the manoeuvre best, shown the best "
-            "of all. Mass as weighed, every other constant the paper's. The paper's parameters are those of another "
-            "drone: without refitting, these commands lead the simulations elsewhere (docs/real-flights.md), and no "
-            "spread of 2 % covers that."
+            f"Real: {len(flights)} flights of {SOURCE}; from each flight the part that fits the manoeuvre best, of "
+            "which the best is shown. The mass is the weighed mass; every other constant is the paper's. The paper's "
+            "parameters are those of another drone: without a new fit, the simulations diverge from these flights "
+            "(docs/real-flights.md), and a spread of 2 % does not cover the difference."
         )
     else:
         text.append(SKIPPED)
     if given is not None:
         flown["given"] = given.drone("cfb-guards"), _pieces(given.logs, size)
-        text.append(f"Given: {given.said()}; every other constant the paper's.")
+        text.append(f"Given: {given.said()}; every other constant is the paper's.")
     found = {}
     rows = [
         Row("simulations", "4096", str(SIMULATIONS), kind="input"),
@@ -141,10 +143,10 @@ def _manoeuvre(
             kind="input",
         ),
     ]
-    until = f"here until half of the simulations are off by more than {LOST_DEG:g} deg"
+    until = f"here: until half of the simulations have an attitude error above {LOST_DEG:g} deg"
     for which, (drone, pieces) in flown.items():
         if not pieces:
-            raise CfbError(f"{name}: none of the flights {which} begins a manoeuvre from hover; give others.")
+            raise CfbError(f"{name}: none of the {which} flights begins a manoeuvre from hover; give other flights.")
         found[which] = piece = bands(drone, *pieces[0])
         if which == "generated":
             shown = _shown(_useful(piece))
@@ -157,7 +159,7 @@ def _manoeuvre(
         velocity, attitude, rate = piece.off(USEFUL_S)
         rows.append(
             Row(
-                f"median simulation off after {1e3 * USEFUL_S:g} ms ({which}, {piece.name})",
+                f"error of the median simulation after {1e3 * USEFUL_S:g} ms ({which}, {piece.name})",
                 "",
                 f"{velocity:.2g} m/s, {attitude:.2g} deg, {rate:.2g} rad/s",
                 kind="own" if which == "generated" else "result",
@@ -186,7 +188,7 @@ def _spread() -> str:
 
 
 def _useful(piece: Bands) -> float:
-    """Until when less than half of the simulations are lost, s; infinite where that is all the time."""
+    """Time at which half of the simulations are lost, s; infinite if fewer are lost at all times."""
     lost = np.flatnonzero(piece.lost() > 0.5)
     return float(piece.time[lost[0]]) if len(lost) else np.inf
 
@@ -196,7 +198,7 @@ def _shown(horizon: float) -> str:
 
 
 def _pieces(logs: Sequence[FlightLog], size: Callable[[FlightLog, slice], float]) -> list[tuple[FlightLog, float]]:
-    """Of each flight the time at which the manoeuvre is largest that begins from hover, the largest first."""
+    """For each flight, the start of the largest manoeuvre that begins from hover; the largest of all flights first."""
     found = []
     for log in logs:
         gaps, best = log.time[log.gaps()], (-np.inf, 0.0)
@@ -212,14 +214,14 @@ def _pieces(logs: Sequence[FlightLog], size: Callable[[FlightLog, slice], float]
 
 
 def bands(model, log: FlightLog, start: float, count: int = SIMULATIONS, seed: int = 0) -> Bands:
-    """Simulate a piece of a flight many times with randomised parameters and noise.
+    """Simulate a part of a flight many times with randomised parameters and noise.
 
     Args:
         model: `ModelFile` of the drone.
         log: the flight.
-        start: s of log time.
-        count: simulations.
-        seed: of parameters and noise.
+        start: start in the log's time, s.
+        count: number of simulations.
+        seed: seed of parameters and noise.
     """
     import jax
     import jax.numpy as jnp
@@ -245,20 +247,20 @@ def bands(model, log: FlightLog, start: float, count: int = SIMULATIONS, seed: i
     begun = _signals(*(np.asarray(x)[None, None] for x in (first.velocity, first.quaternion, first.body_rate)))
     simulated = np.concatenate([np.broadcast_to(begun, (count, 1, 9)), flown], axis=1)
     simulated[..., 3:6] = np.degrees(np.unwrap(np.radians(simulated[..., 3:6]), axis=1))
-    # Pose and velocity are late against the gyro: each of the nine is read at the time its row tells of.
+    # Pose and velocity lag the gyro, so they are read from rows that are later by the delay.
     at = np.arange(0.0, REACH_S + 1e-9, float(np.median(np.diff(log.time))))
     seen = _signals(log.velocity, log.quaternion, log.body_rate)
     seen[:, 3:6] = np.degrees(np.unwrap(np.radians(seen[:, 3:6]), axis=0))
     late = [np.interp(start + at + delay * (i < 6), log.time, seen[:, i]) for i in range(9)]
     measured = np.stack(late, axis=1)
-    # Turned by whole turns to where the simulations begin.
+    # Shift the angles by whole turns to the initial angles of the simulations.
     measured[:, 3:6] -= 360.0 * np.round((measured[0, 3:6] - simulated[0, 0, 3:6]) / 360.0)
     return Bands(log.name, start, nominal.dt * np.arange(steps + 1), simulated, at, measured)
 
 
 @cache
 def _fly():
-    """One compiled program for all pieces of flights."""
+    """The compiled simulation, shared by all parts of flights."""
     import equinox as eqx
     import jax
 

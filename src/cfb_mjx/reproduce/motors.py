@@ -1,4 +1,4 @@
-"""Motor and rotor: the step response with T and K, and the curves of thrust and torque."""
+"""Motor and rotor: the step response with fitted T and K, and the thrust and torque curves."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from cfb_mjx.reproduce.flights import REAL_MASS_KG, SKIPPED, SOURCE, real_flight
 from cfb_mjx.reproduce.item import Result, Row, with_std, write_csv
 
 BENCH = (
-    "The paper's bench data are not public: these come with the project (`data/bench`), made by another program from "
-    "the paper's own equations with noise added. They show that the estimator gives back what went in; they are no "
-    "second measurement of the drone."
+    "The paper's bench data are not public. The bench data used here come with the project (`data/bench`); another "
+    "program made them from the paper's equations, with added noise. They show that the estimator recovers the "
+    "constants with which they were made; they are not a second measurement of the drone."
 )
 PAPER = {"motor_time_constant": ("T, s", 0.050), "motor_gain": ("K, rad/s", 2900.0)}
 CUBICS = {"thrust": (("N", 1.0), (-0.23, 0.562, -0.043)), "torque": (("1e-4 N m", 1e4), (-3.4, 8.7, 2.9))}
 SHOWN_S, FITTED = 2.0, 2
-"""How much of a flight is shown, and how many are fitted: one would do."""
+"""Shown time of a flight, s, and number of fitted flights (one would be enough)."""
 LOW_PASS_HZ = 8.0
-"""Below it force and rotor speeds of the real flights are compared: what rotors shake is not thrust."""
+"""Cut-off frequency for comparing force and rotor speeds of real flights, to remove vibrations of the rotors."""
 
 
 def motor_step(folder: Path, real: Path | None) -> Result:
-    """Rotor speed after steps of the command, with T and K fitted."""
+    """Fit T and K to the rotor speed after steps of the command."""
     from cfb_mjx.logs.bench_tables import MotorRecord, read_bench, record_of
     from cfb_mjx.parameters import load_model_file
     from cfb_mjx.sysid.rotors.motor_replay import replay
@@ -41,9 +41,9 @@ def motor_step(folder: Path, real: Path | None) -> Result:
         fits["real flights"] = fit_motors([not_none(record_of(log)) for log in flights], nominal, offset=True)
         text.append(
             f"Right: the same fit to real flights ({', '.join(log.name for log in flights)}) of {SOURCE}, of which two "
-            "seconds are shown. There the "
-            "command is not compensated for the battery, whose voltage is lower than full, and the steady speed is "
-            "affine in it: K and the offset belong together."
+            "seconds are shown. In these flights the command is not compensated for the battery voltage, which is "
+            "below its maximum, and the steady speed is an affine function of the command: K and the offset belong "
+            "together."
         )
     else:
         text.append(SKIPPED)
@@ -85,7 +85,7 @@ def _draw_steps(shown: dict, path: Path) -> None:
     with context():
         figure = new_figure(4.6 * len(shown), 3.4)
         for axis, (name, r) in zip(figure.subplots(1, len(shown), squeeze=False)[0], shown.items(), strict=True):
-            # Of a flight the two seconds in which the command moves most.
+            # For a flight, the two seconds in which the command varies most.
             first = 0 if name == "bench" else _liveliest(r.time, r.command)
             here = (r.time >= r.time[first]) & (r.time <= r.time[first] + SHOWN_S)
             time = r.time[here] - r.time[first]
@@ -109,7 +109,7 @@ def _liveliest(time: np.ndarray, command: np.ndarray) -> int:
 
 
 def rotor_curves(folder: Path, real: Path | None) -> Result:
-    """Thrust and torque of a rotor, their cubics, and what other sources say of the same rotor."""
+    """Fit cubics to thrust and torque of a rotor, and compare them with other sources for the same rotor."""
     import jax.numpy as jnp
 
     from cfb_mjx.logs.bench_tables import MapTable, read_bench
@@ -147,14 +147,14 @@ def rotor_curves(folder: Path, real: Path | None) -> Result:
             [np.where(inside, coefficients @ powers, np.nan), np.full_like(speed, np.nan)]
         )
         text.append(
-            f"Real flights, {SOURCE}: accelerometer along z times {REAL_MASS_KG:g} kg against the four rotor speeds, "
-            f"below {LOW_PASS_HZ:g} Hz, a cubic through the origin by least squares; {rms:.3g} N rms remain. Torque "
-            "cannot be measured that way."
+            f"Real flights, {SOURCE}: the accelerometer along z times {REAL_MASS_KG:g} kg is fitted with a cubic "
+            f"through the origin in the four rotor speeds, below {LOW_PASS_HZ:g} Hz, by least squares; {rms:.3g} N rms "
+            "remain. Torque cannot be measured in this way."
         )
         for at in (1000.0, 1700.0, 2300.0):
             if low <= at <= high:
                 i = int(np.argmin(np.abs(speed - at)))
-                why = "another drone, its own propellers, flying and not on a bench"
+                why = "another drone with its own propellers, in flight and not on a bench"
                 paper, ours = curves["paper"][0][i], curves["real flights"][0][i]
                 rows.append(
                     Row(f"thrust at {speed[i]:.0f} rad/s, N (real flights)", f"{paper:.3f}", f"{ours:.3f}", why)
@@ -180,7 +180,7 @@ def rotor_curves(folder: Path, real: Path | None) -> Result:
 
 
 def _thrust_in_flight(flights) -> tuple[np.ndarray, float, float, float]:
-    """Cubic (3,) of s^3, s^2, s [N], the rotor speeds it holds between, and the rms of what remains, N."""
+    """Coefficients (3,) of s^3, s^2, s, N; lower and upper limit of the rotor speeds, rad/s; rms of the residual, N."""
     from scipy.signal import butter, sosfiltfilt
 
     design, force, speeds = [], [], []
@@ -223,7 +223,7 @@ def _draw_curves(speed: np.ndarray, curves: dict, fitted: dict, path: Path) -> N
             axis.plot(of.rotor_speed, 1e3 * of.value, "o", markersize=3, markerfacecolor="none", color=MEASURED,
                       label="bench points (generated)")  # fmt: skip
             for label, both in curves.items():
-                # Eight times the others' torque: it would hide them.
+                # The brushed rotor's torque is eight times that of the others and would hide them.
                 if np.isfinite(both[i]).any() and (label, name) != ("brushed", "torque"):
                     axis.plot(speed, 1e3 * both[i], label=label, **looks[label])
             axis.set_xlabel("rotor speed, rad/s")

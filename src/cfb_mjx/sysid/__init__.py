@@ -1,4 +1,4 @@
-"""Judging and fitting the model on flights."""
+"""System identification: evaluate and fit the model on flights."""
 
 from cfb_mjx.sysid.evaluation import HORIZONS, Evaluation, evaluate
 from cfb_mjx.sysid.windows import Windows, find_windows

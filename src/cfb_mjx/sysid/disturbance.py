@@ -1,4 +1,4 @@
-"""What an `Observer` found, as part of a model: it pushes, turns and fades."""
+"""Disturbances estimated by an `Observer`, as an effect of a model that decays during the prediction."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from cfb_mjx.sysid.observer import Observer
 
 
 class Disturbance(Effect):
-    """Adds what an `Observer` found to a model: no physical effect, so it is not in the catalogue.
+    """Adds the estimates of an `Observer` to a model. It is not a physical effect and not in the catalogue.
 
-    Remembered are the quick and the slow angular acceleration, the specific force and the error of the steady rotor
-    speeds (`Observed.memory`); each fades with its own correlation time.
+    Its memory holds the fast and the slow angular acceleration, the specific force and the error of the steady rotor
+    speeds (`Observed.memory`). Each decays with its own correlation time.
     """
 
     name: ClassVar[str] = "observed_disturbance"
@@ -32,7 +32,7 @@ class Disturbance(Effect):
 
     @classmethod
     def of(cls, observer: Observer) -> Disturbance:
-        """With the correlation times of ``observer``."""
+        """Disturbance with the correlation times of ``observer``."""
         o = observer
         times = o.torque_time, o.trim_time, o.force_time, o.rotor_offset_time
         torque, trim, force, rotors = (jnp.asarray(t, jnp.result_type(float)) for t in times)
@@ -52,7 +52,8 @@ class Disturbance(Effect):
         drone = condition.parameters
         push = force * drone.mass
         turn = Vec.unstack(drone.inertia).map(lambda inertia, a: inertia * a, torque + trim)
-        # The force was seen at the rotors' centre but must not turn the drone: the gyro has told what does.
+        # The force was measured at the rotors' centre. It must not turn the drone, because the angular accelerations
+        # were estimated from the gyro, so apply it at the centre of gravity.
         return Wrench(wrench.force + push, wrench.torque + turn + Vec.unstack(drone.center_of_gravity).cross(push))
 
     def advance(self, condition: Condition, acceleration: Vec, dt: Any) -> Memory:

@@ -1,4 +1,4 @@
-"""How well a model predicts flights: the default evaluation (protocol in DESIGN 5, ``docs/evaluation.md``)."""
+"""Evaluate how well a model predicts flights in open loop (protocol in ``docs/evaluation.md``)."""
 
 from __future__ import annotations
 
@@ -21,36 +21,52 @@ from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 from cfb_mjx.sysid.windows import Windows, find_windows
 
 HORIZONS = (0.05, 0.1, 0.2, 0.5)
+"""Default prediction horizons, s."""
 VARIANTS = ("commands_in", "rotor_speed_in", "hold")
+"""Kinds of prediction: from commands, from measured rotor speeds, and the baseline `hold`."""
 OBSERVED = ("commands_in_observer", "rotor_speed_in_observer")
-"""Two more where an observer helped."""
+"""Additional kinds of prediction if there is an observer."""
 
 
 @dataclass(frozen=True)
 class LogEvaluation:
-    """Windows of one log, what each variant predicted there and its errors; None where it cannot be had."""
+    """Predictions of the W windows of one log.
+
+    Attributes:
+        log: the flight.
+        delay: age of pose and velocity in its rows, s.
+        gyro_delay: age of the gyro reading in its rows, s.
+        windows: as recorded.
+        measured: (W,) whether rotor speed was measured throughout the window.
+        predictions: predicted states (W, H, ...) by variant; None if the variant is not available.
+        errors: errors (W, H) by variant and quantity, as of `metrics.errors`; None if the variant is not available.
+    """
 
     log: FlightLog
     delay: float
     gyro_delay: float
     windows: Windows
     measured: np.ndarray
-    """(W,) whether rotor speed was measured throughout the window."""
     predictions: dict[str, State | None]
     errors: dict[str, dict[str, np.ndarray] | None]
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Prediction errors of one model on several logs."""
+    """Prediction errors of one model on several logs.
+
+    Attributes:
+        logs: results of each log.
+        horizons: prediction horizons, s.
+        variants: kinds of prediction that were made.
+    """
 
     logs: tuple[LogEvaluation, ...]
     horizons: tuple[float, ...]
     variants: tuple[str, ...] = VARIANTS
-    """The kinds of prediction that were made."""
 
     def metrics(self, variant: str) -> dict[str, float] | None:
-        """Metrics of a variant over all windows of all logs; None where no log allows it."""
+        """Metrics of a variant over all windows of all logs; None if the variant is available for no log."""
         parts = self._errors(variant)
         if not parts:
             return None
@@ -58,21 +74,21 @@ class Evaluation:
         return metrics.metrics(pooled, self.horizons)
 
     def intervals(self, variant: str) -> dict[str, list[float]] | None:
-        """95 % bootstrap intervals of `metrics`."""
+        """95 % bootstrap intervals of `metrics`; None if the variant is available for no log."""
         parts = self._errors(variant)
         return metrics.intervals(parts, self.horizons) if parts else None
 
     def _errors(self, variant: str) -> list[dict[str, np.ndarray]]:
-        """Of each log that allows the variant."""
+        """Errors of each log for which the variant is available."""
         return [errors for log in self.logs if (errors := log.errors[variant]) is not None]
 
     @property
     def each(self) -> tuple[Evaluation, ...]:
-        """The same of every log alone."""
+        """Evaluations of the single logs."""
         return tuple(replace(self, logs=(log,)) for log in self.logs)
 
     def to_json(self) -> dict:
-        """The structure of ``cfb evaluate --json`` (DESIGN 6), plus ``intervals``."""
+        """The content of ``cfb evaluate --json``."""
 
         def block(evaluation: Evaluation) -> dict:
             return {"windows": sum(len(log.windows) for log in evaluation.logs)} | {
@@ -96,21 +112,26 @@ def evaluate(
     over: Devices | None = None,
     keep_diverged: bool = False,
 ) -> Evaluation:
-    """Predict every window of every log, open loop, and compare with what was measured.
+    """Predict every window of every log in open loop, and compare the predictions with the measurements.
 
-    Rotor speed at a window's start is estimated by the motor model driven with the commands since the log began.
-    Integration is by RK4 on steps that end at every row, whatever the model's own integrator: its error is far
-    below the sensors' noise. Run it with x64 enabled for full precision.
+    The rotor speed at a window's start is estimated by the motor model, driven with the commands since the start of the
+    log. The integrator is RK4 with steps that end at every row, regardless of the model's own integrator; its error is
+    far below the sensors' noise. Run with x64 enabled for full precision.
 
-    With an ``observer`` the variants `OBSERVED` are added: the same predictions with the disturbances it estimated
-    from data before each window's start. With sensor ``faults`` the model flies what a healthy chain would have
-    recorded, and its predictions are compared with what this one records. The windows of every log are divided ``over``
-    devices; the replay of the log before them is not, which is one walk along its rows.
-
-    With ``keep_diverged`` errors are NaN where the model diverged, for a search that passes such a model over.
+    Args:
+        model: the drone.
+        logs: flights with different names.
+        horizons: prediction horizons, s, ascending.
+        progress: called with (done, total) after each log.
+        observer: if given, the variants `OBSERVED` are added: the same predictions with disturbances that the observer
+            estimated from data before each window's start.
+        faults: of the sensors. They are removed from the inputs of a prediction and applied to its result, which is
+            compared with the log as recorded.
+        over: devices over which the windows are divided. The replay of a log up to the windows is not divided.
+        keep_diverged: return non-finite errors where the model diverges, instead of raising an error.
 
     Raises:
-        CfbError: two logs of one name, no log allows a window, or a prediction that is no number.
+        CfbError: two logs have the same name, no log allows a window, or the model diverges.
     """
     require_own_names(logs)
     precise = Quadrotor(model.parameters, model.effects, body=model.body, integrator="rk4", rotor_loads="instant")
@@ -131,7 +152,7 @@ def evaluate(
 
 
 def before_and_after(before: Evaluation, after: Evaluation) -> dict:
-    """Metrics of two models on the same flights, in JSON terms: what each predicts, and `hold`."""
+    """Metrics of two models and of `hold` on the same flights, as a JSON-compatible dictionary."""
     return {
         "hold": before.metrics("hold"),
         "before": before.metrics("commands_in"),
@@ -149,14 +170,14 @@ def _refuse_diverged(result: LogEvaluation) -> None:
         if np.any(lost):
             of = result.windows.start[result.measured] if variant.startswith("rotor") else result.windows.start
             raise CfbError(
-                f"{result.log.name}: the model diverges: {np.sum(lost)} of {len(lost)} predictions ({variant}) are no "
-                f"numbers, the first from {of[lost][0]:.2f} s on; check its parameters and effects."
+                f"{result.log.name}: the model diverges: {np.sum(lost)} of {len(lost)} predictions ({variant}) are not "
+                f"finite, the first from {of[lost][0]:.2f} s on; check its parameters and effects."
             )
 
 
 @dataclass(frozen=True)
 class _Recording:
-    """A log before anything is predicted: its windows as recorded, and as a healthy chain would have recorded them."""
+    """A log and its windows, as recorded and with the sensor faults removed."""
 
     as_logged: FlightLog
     log: FlightLog
@@ -168,7 +189,7 @@ class _Recording:
 
     @property
     def flight(self) -> Flight | None:
-        """The rows prepared, where there is something to predict."""
+        """The prepared rows; None if there are no windows."""
         return prepare_flight(self.log, self.delay, self.gyro_delay) if len(self.windows) else None
 
     @classmethod
@@ -216,7 +237,7 @@ def _evaluate_log(
 def _measured_in(
     model: Quadrotor, windows: Windows, measured: np.ndarray, memory: tuple, over: Devices | None
 ) -> State | None:
-    """Predictions with measured rotor speeds in, of the windows where they were measured."""
+    """Predictions from measured rotor speeds, for the windows in which these were measured."""
     if not measured.any():
         return None
     return predict(model, select(windows, measured), memory=jax.tree.map(lambda x: x[measured], memory), over=over)
@@ -232,7 +253,7 @@ def _observed(
     observer: Observer,
     over: Devices | None,
 ) -> dict[str, State | None]:
-    """The two variants with what ``observer`` knows at the windows' starts."""
+    """The variants `OBSERVED`: predictions with the observer's estimates at the windows' starts."""
     known = at_starts(observe(model, log, delay, observer), log, windows)
     windows, model = replace(windows, body_rate=known.body_rate), observed_model(model, observer)
     return {

@@ -1,10 +1,11 @@
-"""One model of a type of drone, from fits of several: what all have in common, and how far they differ.
+"""Model of a type of drone from fits of several drones: common values and the spread between drones.
 
-Every drone is fitted on its own with the same numbers. A number of drone i is ``m + d_i + e_i``: ``m`` that of the
-type, ``d_i`` the drone's own part, of standard deviation ``spread``, ``e_i`` the fit's error, whose covariance is
-known. The spread follows from the scatter of the fits less what their errors explain (Hedges and Olkin, Statistical
-Methods for Meta-Analysis, 1985, ch. 9), number by number; the type's numbers then are the generalised least-squares
-mean with the whole covariance of every fit, so that what one fit cannot tell apart is told by the others.
+Every drone is fitted on its own with the same parameters. A parameter of drone i is ``m + d_i + e_i``: ``m`` is the
+value of the type, ``d_i`` the drone's deviation with standard deviation ``spread``, and ``e_i`` the error of the fit,
+whose covariance is known. For each parameter, the spread is the scatter of the fits minus the part that their errors
+explain (Hedges and Olkin, Statistical Methods for Meta-Analysis, 1985, ch. 9). The values of the type are the
+generalised least-squares mean with the full covariance of every fit, so parameters that one fit cannot separate are
+separated by the others.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from cfb_mjx.sysid.refinement import Number, Refinement
 
 @dataclass(frozen=True)
 class OfDrone:
-    """What was fitted to one drone.
+    """Fit of one drone.
 
     Attributes:
         name: of the drone.
-        numbers: what was fitted.
-        values: of them.
-        covariance: of their errors; zero where one stands at a bound.
+        numbers: the n fitted parameters.
+        values: (n,) of the parameters.
+        covariance: (n, n) of their errors; zero for a parameter at a bound.
     """
 
     name: str
@@ -39,7 +40,7 @@ class OfDrone:
 
     @classmethod
     def fitted(cls, name: str, fit: Refinement) -> OfDrone:
-        """From a fit: its deviations, which heed that windows overlap, with its correlation."""
+        """Create from a refinement, with its standard deviations (which account for overlapping windows)."""
         deviations = np.nan_to_num(fit.deviations)
         covariance = np.nan_to_num(fit.correlation) * np.outer(deviations, deviations)
         return cls(name, fit.numbers, fit.values, covariance)
@@ -47,14 +48,14 @@ class OfDrone:
 
 @dataclass(frozen=True)
 class Fleet:
-    """The type of drone.
+    """Parameters of a type of drone.
 
     Attributes:
-        numbers: that were fitted to the drones.
-        values: of the type.
-        std: of the values.
-        spread: standard deviation between drones.
-        drones: how many tell each number.
+        numbers: the n fitted parameters.
+        values: (n,) of the type.
+        std: (n,) standard deviations of the values.
+        spread: (n,) standard deviations between drones.
+        drones: (n,) number of drones to which each parameter was fitted.
     """
 
     numbers: tuple[Number, ...]
@@ -64,10 +65,10 @@ class Fleet:
     drones: Float[np.ndarray, " n"]
 
     def mappings(self, source: str) -> list[dict[str, Any]]:
-        """Its effects as a model file has them, each with ``uncertainty`` and ``spread``.
+        """Effects in the format of a model file, each with ``uncertainty`` and ``spread``.
 
         Args:
-            source: of the numbers, for the file.
+            source: origin of the values, for the file.
         """
         found = {}
         for number, value, std, spread in zip(self.numbers, self.values, self.std, self.spread, strict=True):
@@ -87,17 +88,18 @@ class Fleet:
 
 
 def fleet(drones: Sequence[OfDrone], own: Collection[str] = ()) -> Fleet:
-    """What several drones of a type have in common.
+    """Combine the fits of several drones of one type.
 
     Args:
-        drones: fits of the same numbers; one that a drone lacks is told by the others.
-        own: effects that are a drone's alone: the type's value is neutral, the spread the scatter about it.
+        drones: fits of the same parameters; a parameter may be missing in some of them.
+        own: names of effects that are specific to a drone. The type's value is neutral, and the spread is the scatter
+            about it.
 
     Raises:
-        CfbError: fewer than two drones.
+        CfbError: there are fewer than two drones.
     """
     if len(drones) < 2:
-        raise CfbError("one drone says nothing of how drones differ; give the fits of at least two.")
+        raise CfbError("the spread between drones cannot be determined from one; give the fits of at least two.")
     numbers = tuple(dict.fromkeys(_key(n) for drone in drones for n in drone.numbers))
     places = [[numbers.index(_key(n)) for n in drone.numbers] for drone in drones]
     count = len(numbers)
@@ -111,7 +113,7 @@ def fleet(drones: Sequence[OfDrone], own: Collection[str] = ()) -> Fleet:
     free = np.where(alone, told, np.maximum(told - 1, 1))
     scatter = np.nansum((values - about) ** 2, axis=0) / free
     between = np.maximum(scatter - np.nanmean(errors, axis=0), 0.0)
-    # What neither scatters nor is unsure (all fits at one bound) still needs a scale.
+    # A parameter with neither scatter nor uncertainty (all fits at one bound) still needs a positive variance.
     least = np.array([1e-6 * n.scale for n in numbers]) ** 2
     matrix, pull = np.zeros((count, count)), np.zeros(count)
     for drone, at in zip(drones, places, strict=True):
@@ -127,5 +129,5 @@ def fleet(drones: Sequence[OfDrone], own: Collection[str] = ()) -> Fleet:
 
 
 def _key(number: Number) -> Number:
-    """The number whatever its bounds."""
+    """The parameter with standard bounds, so that parameters with different bounds compare equal."""
     return Number(number.effect, number.field, number.index, -1.0, 1.0)

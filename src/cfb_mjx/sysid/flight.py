@@ -1,4 +1,4 @@
-"""A log made ready for replay: every column at the time of its row, padded to whole blocks of rows."""
+"""Prepare a log for replay: every column at the time of its row, padded to whole blocks of rows."""
 
 from __future__ import annotations
 
@@ -19,61 +19,69 @@ from cfb_mjx.model.state import AnyArray
 from cfb_mjx.parameters import Parameters
 
 ROWS = 512
-"""Rows that are looked at together: about two seconds at 250 Hz. Flights are padded to a multiple of it."""
+"""Rows per block: about two seconds at 250 Hz. Flights are padded to a multiple of it."""
 LENGTHS = (2560, 4608, 7680)
-"""Rows to which `lengthened` pads (beyond, a multiple of the last): few shapes, for which programs are cached."""
+"""Numbers of rows to which `lengthened` pads (or a multiple of the last): few shapes, so programs are reused."""
 WARM_UP = 0.3
-"""After the start and after every gap rotor speeds are not known from commands for so long, s: six motor lags."""
+"""Time after the start and after every gap in which rotor speeds are not yet known from commands, s: six motor lags."""
 MEASURED_SHARE = 0.98
-"""Rotor speeds are used where every motor has at least this share of valid readings."""
+"""Rotor speeds are used if every motor has at least this share of valid readings."""
 _VOLTAGE_SMOOTHING = 0.02
-"""Time constant, s. Short: a longer one, where the rotors feel the dips under load, makes `battery_sag` look weaker."""
+"""Time constant of the voltage's low-pass filter, s. It is short, because smoothing the dips under load would make
+`battery_sag` look weaker."""
 
 
 class Flight(eqx.Module):
-    """N rows of one log; the padding repeats the last row with zero time between."""
+    """Rows of one log with all columns at the rows' own times; the padding repeats the last row with zero intervals."""
 
     time: Float[AnyArray, " n"]
-    """Since the log's time zero, s."""
+    """Log time, s."""
     interval: Float[AnyArray, " n"]
-    """To the next row, s; 0 at the last and in the padding."""
+    """Time to the next row, s; 0 at the last row and in the padding."""
     position: Float[AnyArray, "n 3"]
+    """At the row's time, with ``pose_delay`` removed, m."""
     velocity: Float[AnyArray, "n 3"]
+    """At the row's time, m/s."""
     quaternion: Float[AnyArray, "n 4"]
-    """Pose and velocity when the row's time stamp was written, not ``pose_delay`` before."""
+    """At the row's time."""
     body_rate: Float[AnyArray, "n 3"]
+    """At the row's time, with ``gyro_delay`` removed, rad/s."""
     specific_force: Float[AnyArray, "n 3"]
+    """m/s^2."""
     command: Float[AnyArray, "n 4"]
+    """0 to 1."""
     rotor_speed: Float[AnyArray, "n 4"]
-    """Measured, rad/s; 0 where not."""
+    """Measured, rad/s; 0 if not measured."""
     measured: Float[AnyArray, ""]
-    """1 where the log has rotor speeds throughout."""
+    """1 if all motors' rotor speeds were measured throughout."""
     voltage: Float[AnyArray, " n"]
-    """Of the battery, V, smoothed over past rows; NaN where not measured."""
+    """Battery voltage, smoothed over past rows, V; NaN if not measured."""
     fresh: Float[AnyArray, " n"]
-    """1 at the first row and at the first after a gap."""
+    """1 at the first row and at the first row after a gap."""
     valid: Float[AnyArray, " n"]
-    """1 where what the model predicts can be compared with the row."""
+    """1 where the model's prediction can be compared with the row."""
 
 
 def delay_of(log: FlightLog, parameters: Parameters) -> float:
-    """Age of pose and velocity in a row, s: as the log says, else as the model does."""
+    """Age of pose and velocity in a row, s: the log's value, or the model's if the log does not state it."""
     delay = log.observation_delay
     return float(parameters.pose_delay) if delay is None else float(delay)
 
 
 def usual_delay(logs: Sequence[FlightLog], parameters: Parameters) -> float:
-    """One `delay_of` for several logs: the median of what they say."""
+    """Median of the distinct ages of pose and velocity that the logs state, s; the model's value if none does."""
     delays = {log.observation_delay for log in logs if log.observation_delay is not None}
     return float(np.median(list(delays))) if delays else float(parameters.pose_delay)
 
 
 def with_gyro_in_time(log: FlightLog, gyro_delay: float) -> FlightLog:
-    """The log with every body rate in the row at whose time it was measured.
+    """Remove the delay of the gyro: shift every body rate to the row at whose time it was measured.
+
+    Rows whose reading lies behind a gap are removed.
 
     Args:
         log: the flight.
-        gyro_delay: age of the gyro's reading in a row, s. Rows whose reading lies behind a gap are left out.
+        gyro_delay: age of the gyro reading in a row, s.
     """
     if gyro_delay == 0:
         return log
@@ -84,12 +92,12 @@ def with_gyro_in_time(log: FlightLog, gyro_delay: float) -> FlightLog:
 
 
 def prepare_flight(log: FlightLog, delay: float, gyro_delay: float) -> Flight:
-    """Rows of a log at their own time.
+    """Prepare a log for replay.
 
     Args:
         log: the flight.
         delay: age of pose and velocity in a row, s.
-        gyro_delay: age of the gyro's reading in a row, s.
+        gyro_delay: age of the gyro reading in a row, s.
     """
     n, time = len(log), log.time
     gaps = log.gaps()
@@ -99,7 +107,7 @@ def prepare_flight(log: FlightLog, delay: float, gyro_delay: float) -> Flight:
     since = time - time[np.maximum.accumulate(np.where(fresh > 0, np.arange(n), 0))]
     ends = np.append(time[gaps], time[-1])
     until = ends[np.searchsorted(ends, time)] - time
-    # Pose at a row's own time is read from later rows, which must not lie behind a gap.
+    # The pose at a row's own time is interpolated between later rows, which must not lie behind a gap.
     valid = (since >= WARM_UP) & (until >= max(delay, gyro_delay))
 
     def late(values, by=delay):
@@ -124,7 +132,7 @@ def prepare_flight(log: FlightLog, delay: float, gyro_delay: float) -> Flight:
 
 
 def lengthened(flight: Flight, beside: Any) -> tuple[Flight, Any]:
-    """A flight, and arrays with a row for each of its rows, padded to one of `LENGTHS`."""
+    """Pad a flight, and the arrays in ``beside`` that have the same number of rows, to one of `LENGTHS`."""
     n = len(flight.time)
     length = next((x for x in LENGTHS if x >= n), -(-n // LENGTHS[-1]) * LENGTHS[-1])
     return _padded(flight, length), jax.tree.map(lambda x: last_repeated(x, length), beside)
@@ -138,7 +146,7 @@ def _padded(flight: Flight, length: int) -> Flight:
 
 
 def _rotor_speed(log: FlightLog) -> tuple[np.ndarray, bool]:
-    """Measured rotor speeds with short holes bridged, and whether all motors were measured throughout."""
+    """Measured rotor speeds with invalid readings interpolated, and whether all motors were measured throughout."""
     if log.rotor_speed is None:
         return np.zeros((len(log), 4)), False
     out = log.rotor_speed.copy()
@@ -151,7 +159,7 @@ def _rotor_speed(log: FlightLog) -> tuple[np.ndarray, bool]:
 
 
 def _smoothed_voltage(log: FlightLog) -> np.ndarray:
-    """Voltage over past rows only: it serves at the start of a prediction too."""
+    """Battery voltage smoothed over past rows only, because it is also used at the start of a prediction."""
     if log.battery_voltage is None:
         return np.full(len(log), np.nan)
     good = np.isfinite(log.battery_voltage)

@@ -1,19 +1,19 @@
-"""What an on-board estimator with a flow deck does to the logged attitude: tilt that no gyro ever saw.
+"""Model of the tilt error that an on-board estimator with a flow deck adds to the logged attitude.
 
-Such a Kalman filter compares the velocity it predicts with what the flow says, and corrects its velocity and its
-attitude alike. Where the prediction leaves out the drag that the accelerometer feels across the thrust, or the flow is
-stretched, the two never agree, and the logged attitude leans away from the true one. Along each horizontal axis, with
-the lean e of the logged attitude beyond the true one, the error u of the estimated velocity against the flow's, and two
-gains K and L,
+Such a Kalman filter compares its predicted velocity with the flow measurement and corrects both velocity and attitude.
+If the prediction ignores the drag across the thrust that the accelerometer measures, or if the flow is stretched, the
+two never agree, and the logged attitude leans away from the true one. For each horizontal axis, let e be the lean of
+the logged attitude relative to the true one, u the error of the estimated velocity relative to the flow, and K and L
+two gains. Then
 
     e' = -K u,   u' = (a - r c) - s (a - g e) - L u
 
-where a is the specific force turned by the logged attitude (a - g e is the true acceleration), c its part across the
-thrust, r the share of that part which the prediction ignores and s the scale of the flow. So e follows
+where a is the specific force rotated by the logged attitude (a - g e is the true acceleration), c its part across the
+thrust, r the share of c that the prediction ignores, and s the scale of the flow. So e is
 ((s - 1) a + r c) / (s g) through a second-order low-pass of natural frequency sqrt(K s g) and damping ratio
 L / (2 sqrt(K s g)).
 
-The Crazyflie's filter is that of M. Mueller, M. Hamer, R. D'Andrea, Fusing ultra-wideband range measurements with
+The filter of the Crazyflie is that of M. Mueller, M. Hamer, R. D'Andrea, Fusing ultra-wideband range measurements with
 accelerometers and rate gyroscopes for quadrocopter state estimation, ICRA 2015. In flight its firmware predicts from
 thrust alone: r = 1.
 """
@@ -34,28 +34,28 @@ from cfb_mjx.logs.rotation import conjugate, exponential, multiply, rotation_vec
 
 GRAVITY = 9.81
 SPAN = 0.5
-"""s over which the attitude is compared with the gyro."""
+"""Time span over which attitude and gyro are compared, s."""
 STRIDE = 5
-"""Every so many rows a span begins that counts."""
+"""Number of rows between the starts of two spans."""
 LEAST_SPANS = 100
-"""In all logs together; fewer say nothing."""
+"""Minimum number of spans in all logs together."""
 LOW, HIGH = (0.2, 0.1, -2.0), (40.0, 20.0, 3.0)
 STARTS = ((1.5, 1.0, 0.5), (5.0, 1.0, 0.5), (12.0, 1.0, 0.5))
-"""Natural frequency, rad/s, damping ratio and share ignored: bounds, and where the search begins."""
+"""Bounds and initial values of natural frequency, rad/s, damping ratio, and ignored share."""
 
 
 @dataclass(frozen=True)
 class FlowEstimator:
-    """Of an on-board estimator, as its attitude, the gyro and the accelerometer tell.
+    """Parameters of an on-board estimator, fitted to its attitude, the gyro and the accelerometer.
 
     Attributes:
         scale: of the flow, as given.
-        natural_frequency: of its corrections of the tilt, rad/s.
-        damping_ratio: of these.
-        ignored: share of the specific force across the thrust that its prediction leaves out.
+        natural_frequency: of the corrections of the tilt, rad/s.
+        damping_ratio: of the corrections of the tilt.
+        ignored: share of the specific force across the thrust that the prediction ignores.
         ignored_std: standard deviation of that share.
-        corrected: rms tilt that the estimator adds to what the gyro saw within `SPAN`, rad.
-        explained: share of that variance which this estimator explains.
+        corrected: rms tilt that the estimator adds to that of the gyro within `SPAN`, rad.
+        explained: share of the variance of this tilt that the fit explains.
     """
 
     scale: float
@@ -69,36 +69,43 @@ class FlowEstimator:
 
 @dataclass(frozen=True)
 class _Seen:
-    """A log on an even grid: horizontal specific force and its part across the thrust, m/s^2, and tilt beyond the
-    gyro's, rad, all (n, 2)."""
+    """A log on an even grid of n rows.
+
+    Attributes:
+        step: of the grid, s.
+        force: (n, 2) horizontal specific force, m/s^2.
+        across: (n, 2) horizontal part of the specific force across the thrust, m/s^2.
+        beyond: (n, 2) accumulated tilt of the attitude beyond that of the gyro, rad.
+        begins: rows at which spans begin.
+    """
 
     step: float
     force: np.ndarray
     across: np.ndarray
     beyond: np.ndarray
     begins: np.ndarray
-    """Rows at which spans begin."""
 
     @property
     def rows(self) -> int:
+        """Number of rows of a span."""
         return max(2, round(SPAN / self.step))
 
     def over_spans(self, lean: np.ndarray) -> np.ndarray:
-        """What (n, 2) gained over the spans, beside its mean."""
+        """Changes of a tilt (n, 2) over the spans, minus their mean."""
         gained = lean[self.begins + self.rows] - lean[self.begins]
         return gained - gained.mean(axis=0)
 
 
 def fit_flow_estimator(logs: Sequence[FlightLog], scale: float = 1.0, ignored: float | None = None) -> FlowEstimator:
-    """Fit an estimator to how the logged attitude departs from the gyro.
+    """Fit the parameters of an on-board estimator to the deviation of the logged attitude from the gyro.
 
-    Neither a model of the drone nor position and velocity take part. A stretched flow and ignored drag turn the
-    attitude much alike where all motion is of one frequency, so only one of the two is fitted.
+    No model of the drone, position or velocity is needed. If all motion has one frequency, a stretched flow and ignored
+    drag have nearly the same effect on the attitude. Therefore the scale is given and not fitted.
 
     Args:
         logs: flights with attitude, gyro and accelerometer, of one estimator.
         scale: of the flow.
-        ignored: share of the specific force across the thrust that the prediction leaves out; None: fitted.
+        ignored: share of the specific force across the thrust that the prediction ignores; None: it is fitted.
 
     Raises:
         CfbError: too little flight without a gap.
@@ -117,7 +124,7 @@ def fit_flow_estimator(logs: Sequence[FlightLog], scale: float = 1.0, ignored: f
 
     bounds = LOW[:free], HIGH[:free]
     found = min((least_squares(missed, start[:free], bounds=bounds) for start in STARTS), key=lambda fit: fit.cost)
-    # Spans overlap: so many of them tell what one does.
+    # The spans overlap; this is the number of spans per independent one.
     repeats = seen[0].rows / STRIDE
     spread = np.linalg.pinv(found.jac.T @ found.jac) * np.mean(found.fun**2) * repeats
     return FlowEstimator(
@@ -139,10 +146,10 @@ def _seen(log: FlightLog) -> _Seen:
     rate, felt = interpolate(log.time, log.body_rate, grid), interpolate(log.time, log.specific_force, grid)
     turned = exponential(0.5 * (rate[1:] + rate[:-1]) * step)
     more = rotation_vector(multiply(conjugate(turned), multiply(conjugate(quaternion[:-1]), quaternion[1:])))
-    # A constant turn in body axes is the gyro's bias.
+    # Remove the gyro's bias: a constant rotation in body axes.
     about = to_world(quaternion[1:], more - np.median(more, axis=0))
     about = np.cumsum(np.concatenate([np.zeros((1, 3)), about]), axis=0)
-    # To turn about y by a little is to lean along x; about x, along -y.
+    # A small rotation about y is a lean along x; one about x is a lean along -y.
     beyond = np.stack([about[:, 1], -about[:, 0]], axis=1)
     rows = max(2, round(SPAN / step))
     begins = np.arange(0, max(len(grid) - rows, 0), STRIDE)
@@ -154,7 +161,7 @@ def _seen(log: FlightLog) -> _Seen:
 
 
 def _lean(one: _Seen, scale: float, frequency: float, damping: float, ignored: float) -> np.ndarray:
-    """Lean of the logged attitude beyond the true one, (n, 2) rad."""
+    """Modelled lean (n, 2) of the logged attitude relative to the true one, rad."""
     target = ((scale - 1) * one.force + ignored * one.across) / (scale * GRAVITY)
     low_pass = bilinear([frequency**2], [1.0, 2 * damping * frequency, frequency**2], 1 / one.step)
     return lfilter(*low_pass, target, axis=0, zi=lfilter_zi(*low_pass)[:, None] * target[:1])[0]

@@ -1,4 +1,4 @@
-"""Prediction errors and their statistics, with the key names of the JSON results."""
+"""Prediction errors and their statistics, with the keys of the JSON results."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ STATISTICS = {
     "median": np.median,
 }
 BLOCK = 4
-"""Consecutive windows resampled together: windows overlap for 0.3 s, so neighbours are not independent."""
+"""Number of consecutive windows per bootstrap block: windows overlap by 0.3 s, so neighbours are not independent."""
 
 
 def errors(windows: Windows, predicted: State) -> dict[str, np.ndarray]:
-    """Error of each window at each horizon, (W, H): vector norms, attitude as geodesic angle in degrees.
+    """Errors (W, H) of each window at each horizon: vector norms, and for attitude the geodesic angle in degrees.
 
-    Not finite where the prediction diverged.
+    They are not finite where the prediction diverged.
     """
     with np.errstate(over="ignore", invalid="ignore"):
         return _errors(windows, predicted)
@@ -38,7 +38,7 @@ def _errors(windows: Windows, predicted: State) -> dict[str, np.ndarray]:
 
 
 def geodesic_deg(p: AnyArray, q: AnyArray) -> np.ndarray:
-    """Angle of the rotation between two unit quaternions, degrees; precise for small angles too."""
+    """Angle of the rotation between two unit quaternions, degrees; accurate for small angles too."""
     # |p - q| and |p + q| are 2 sin and 2 cos of a quarter of the angle; arccos would lose half the digits near zero.
     near = np.linalg.norm(p - q, axis=-1)
     far = np.linalg.norm(p + q, axis=-1)
@@ -62,7 +62,7 @@ def intervals(
     counts = [len(e["position"]) for e in per_log]
     total = sum(counts)
     offsets = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    # Blocks wrap around within their log, so every window is equally likely to be drawn.
+    # Blocks wrap around within their log, so all windows are equally likely to be drawn.
     firsts = np.repeat(offsets, counts)
     lengths = np.repeat(counts, counts)
     within = np.arange(total) - firsts

@@ -1,9 +1,9 @@
-"""The rules of the IDSIA nano-drone benchmark, for this library's models.
+"""The IDSIA nano-drone benchmark for this library's models.
 
-Busetto et al., "Nonlinear system identification for a nano-drone benchmark", Control Engineering Practice 172, 2026:
-from every row of a flight 50 steps at 100 Hz are predicted, with measured rotor speeds as input; errors are the mean
-norms of position, velocity, attitude (geodesic, rad) and body rate after h = 1, 10 and 50 steps, and their sums over
-h = 1 to 50. What is taken over and what differs is in ``docs/nanodrone.md``.
+Busetto et al., "Nonlinear system identification for a nano-drone benchmark", Control Engineering Practice 172, 2026.
+From every row of a flight, 50 steps at 100 Hz are predicted from measured rotor speeds. The errors are the mean norms
+of position, velocity, attitude (geodesic, rad) and body rate after h = 1, 10 and 50 steps, and their sums over
+h = 1 to 50. ``docs/nanodrone.md`` lists what is the same and what differs here.
 """
 
 from __future__ import annotations
@@ -32,36 +32,39 @@ from cfb_mjx.sysid.replay import remembered_along
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 
 STEPS = 50
+"""Number of predicted steps."""
 INTERVAL = 0.01
-"""Of the rows, s."""
+"""Time between rows, s."""
 SHOWN = (1, 10, 50)
-"""Steps ahead that are reported one by one."""
+"""Numbers of steps ahead whose errors are reported individually."""
 BLOCK = 1024
-"""Windows predicted together."""
+"""Number of windows predicted at once."""
 QUANTITIES = {"position": "m", "velocity": "mps", "attitude": "rad", "rate": "radps"}
+"""Quantities of the benchmark and their units."""
 THRUST, GRAVITY = 3.72e-8, 9.81
-"""Of the paper's row *physics*: thrust of a rotor over its squared speed, N s^2, and m/s^2."""
+"""Constants of the paper's row *physics*: thrust of a rotor over its squared speed, N s^2, and gravity, m/s^2."""
 PUBLISHED: dict[str, tuple[float, float, float, float]] = {
     "naive": (17.79, 38.92, 8.21, 29.09),
     "physics": (2.322, 10.62, 5.101, 29.09),
     "physics + residual": (2.363, 10.40, 6.15, 28.99),
     "LSTM": (5.97, 16.72, 5.65, 35.84),
 }
-"""Sums over h of the errors of position [m], velocity [m/s], attitude [rad] and body rate [rad/s] in the paper, on its
-own test flights: another trajectory."""
+"""Sums over h of the errors of position, m, velocity, m/s, attitude, rad, and body rate, rad/s, published in the paper.
+They are of the paper's own test flights, which follow another trajectory."""
 DECLARED = "cfb-guards"
+"""Name of the declared model."""
 PLANT = "cfb-idsia"
-"""Fitted to flights of the benchmark's drone, none of them its test flights."""
+"""Name of the model fitted to flights of the benchmark's drone, without its test flights."""
 
 
 @dataclass(frozen=True)
 class Starts:
-    """Windows of one flight: W starts, S = `STEPS` steps.
+    """W windows of one flight, each of S = `STEPS` steps.
 
     Attributes:
-        row: (W,) row each window starts from.
-        truth: position, velocity, quaternion and body rate of every row, (n, 3 or 4).
-        rotor_speed: (n, 4) rad/s, known by the row's time.
+        row: (W,) row at which each window starts.
+        truth: measured position, velocity, quaternion and body rate of every row, (n, 3 or 4).
+        rotor_speed: (n, 4) rad/s, using no later rows.
     """
 
     row: np.ndarray
@@ -72,19 +75,23 @@ class Starts:
         return len(self.row)
 
     def ahead(self) -> tuple[np.ndarray, ...]:
-        """What was measured 1 to S steps after each start, (W, S, 3 or 4)."""
+        """Measurements 1 to S steps after each start, (W, S, 3 or 4)."""
         index = self.row[:, None] + np.arange(1, STEPS + 1)
         return tuple(x[index] for x in self.truth)
 
 
 def find_starts(log: FlightLog, stride: int = 1) -> Starts:
-    """Every ``stride``-th row with 50 rows after it, none of them missing.
+    """Find the windows: every ``stride``-th row that is followed by 50 rows without a gap.
+
+    Args:
+        log: the flight.
+        stride: number of rows between windows.
 
     Raises:
         CfbError: the log is not sampled at 100 Hz or has no rotor speeds.
     """
     if abs(log.nominal_interval - INTERVAL) > 1e-3:
-        raise CfbError(f"{log.name}: sampled every {log.nominal_interval:g} s; the benchmark wants rows every 0.01 s.")
+        raise CfbError(f"{log.name}: sampled every {log.nominal_interval:g} s; the benchmark needs rows every 0.01 s.")
     speed = causal_rotor_speed(log)
     if speed is None:
         raise CfbError(f"{log.name}: the benchmark needs rotor speeds of all motors throughout the flight.")
@@ -95,7 +102,12 @@ def find_starts(log: FlightLog, stride: int = 1) -> Starts:
 
 
 def errors(starts: Starts, predicted: tuple[np.ndarray, ...]) -> dict[str, np.ndarray]:
-    """Norms of the errors of a prediction (position, velocity, quaternion, body rate; (W, S, .)), each (W, S)."""
+    """Norms (W, S) of the errors of a prediction, by quantity; the attitude error is the geodesic angle, rad.
+
+    Args:
+        starts: the windows.
+        predicted: position, velocity, quaternion and body rate, (W, S, 3 or 4).
+    """
     true = starts.ahead()
     norm = [np.linalg.norm(p - t, axis=-1) for p, t in zip(predicted, true, strict=True)]
     norm[2] = np.radians(geodesic_deg(predicted[2], true[2]))
@@ -103,7 +115,7 @@ def errors(starts: Starts, predicted: tuple[np.ndarray, ...]) -> dict[str, np.nd
 
 
 def metrics(error: dict[str, np.ndarray]) -> dict[str, float]:
-    """``<quantity>_mean_<unit>@<h>`` and ``<quantity>_sum_<unit>`` of mean errors over all windows."""
+    """Mean errors over all windows: ``<quantity>_mean_<unit>@<h>``, and their sums ``<quantity>_sum_<unit>``."""
     found = {}
     for quantity, unit in QUANTITIES.items():
         mean = error[quantity].mean(axis=0)
@@ -113,22 +125,22 @@ def metrics(error: dict[str, np.ndarray]) -> dict[str, float]:
 
 
 def naive(starts: Starts) -> tuple[np.ndarray, ...]:
-    """Nothing changes."""
+    """Baseline in which the state does not change."""
     return tuple(np.repeat(x[starts.row][:, None], STEPS, axis=1) for x in starts.truth)
 
 
 def hold(starts: Starts) -> tuple[np.ndarray, ...]:
-    """Constant velocity and constant body rate."""
+    """Baseline with constant velocity and constant body rate."""
     position, velocity, quaternion, rate = naive(starts)
     time = (INTERVAL * np.arange(1, STEPS + 1))[:, None]
     return position + velocity * time, velocity, multiply(quaternion, exponential(rate * time)), rate
 
 
 def physics(starts: Starts) -> tuple[np.ndarray, ...]:
-    """What the paper's row *physics* is: thrust moves the drone, and its body rate stays what it is.
+    """The paper's row *physics*: thrust accelerates the drone, and the body rate is constant.
 
-    Its rate errors are those of *naive* to the last digit, and the paper says why: torques from squared rotor speeds
-    predicted turns worse than none, so angular acceleration is zero.
+    Its rate errors equal those of *naive* to the last digit. The paper explains why: torques from squared rotor speeds
+    predicted the rotation worse than no torque, so the angular acceleration is set to zero.
     """
     position, velocity, quaternion, rate = (x[starts.row] for x in starts.truth)
     half, whole = exponential(rate * (INTERVAL / 2)), exponential(rate * INTERVAL)
@@ -146,7 +158,7 @@ def physics(starts: Starts) -> tuple[np.ndarray, ...]:
 
 @dataclass(frozen=True)
 class Contestant:
-    """What is judged: a model, with an observer or without, and the faults it knows of the recording chain."""
+    """A model to be judged, with an optional observer and with the sensor faults of the recording."""
 
     model: Quadrotor
     observer: Observer | None = None
@@ -154,23 +166,28 @@ class Contestant:
 
     @classmethod
     def of(cls, described: ModelFile, observer: Observer | None = None, where: str = "") -> Contestant:
-        """The model of a file, with the sensor faults it lists.
+        """Contestant from a model file, with the sensor faults that the file lists.
+
+        Args:
+            described: the model file.
+            observer: optional observer.
+            where: name of the file, for messages.
 
         Raises:
-            CfbError: effects or faults that make no sense; ``where`` is the file.
+            CfbError: effects or faults of the file are invalid.
         """
         faults = SensorFaults.from_mappings(described.effects, where or f"model {described.name}")
         return cls(Quadrotor.from_file(described), observer, faults)
 
 
 def usual_contestants(model: str) -> dict[str, Contestant]:
-    """Who stands beside a model: the library's own drone with the benchmark's mass, and the fitted plant.
+    """Contestants for a comparison: the declared drone with the benchmark's mass, the fitted plant, and a given model.
 
     Args:
-        model: preset or model YAML; like the plant it is judged alone and with an observer.
+        model: preset or model YAML. Like the plant, it is judged with and without an observer.
 
     Raises:
-        CfbError: a bad model.
+        CfbError: the model is invalid.
     """
     declared = load_model_file(DECLARED).with_values("the benchmark's description", mass=VEHICLE_MASS)
     found = {"declared": Contestant.of(declared)}
@@ -182,7 +199,7 @@ def usual_contestants(model: str) -> dict[str, Contestant]:
 
 
 def published_rows() -> dict[str, dict[str, float]]:
-    """What was `PUBLISHED`, named as `metrics` are."""
+    """The results `PUBLISHED` in the paper, with the keys of `metrics`."""
     return {
         name: {f"{quantity}_sum_{unit}": x for (quantity, unit), x in zip(QUANTITIES.items(), sums, strict=True)}
         for name, sums in PUBLISHED.items()
@@ -190,13 +207,17 @@ def published_rows() -> dict[str, dict[str, float]]:
 
 
 def predict(contestant: Contestant, log: FlightLog, starts: Starts):
-    """A contestant's prediction: position, velocity, quaternion and body rate, (W, S, 3 or 4).
+    """Predict all windows of a flight: position, velocity, quaternion and body rate, (W, S, 3 or 4).
 
-    A window starts from its row; in the step after row k the rotors turn as row k says. A stretch of the velocity
-    column is taken out of the row, which needs earlier ones at most, and put back into what is predicted; where it
-    moves the position alone, its scale is this flight's own, as earlier rows tell it; lags of
-    sensors are left alone, for rows later than a window's start would be needed. An observer adds the disturbance and
-    the filtered body rate it knows at that row.
+    In the step after row k, the rotor speeds are those of row k. A stretch of the velocity column is removed from the
+    initial state and applied to the prediction, which requires earlier rows only. If the stretch affects only the
+    position, its scale is estimated from the earlier rows of this flight. Lags of sensors are not corrected, because
+    this would require later rows. An observer adds its estimates of disturbance and body rate at the initial row.
+
+    Args:
+        contestant: model, observer and sensor faults.
+        log: the flight.
+        starts: windows of the flight.
     """
     model, observer, faults = contestant.model, contestant.observer, contestant.faults
     carried = faults.stretch.memory(log.time, log.velocity)[starts.row]
@@ -207,7 +228,7 @@ def predict(contestant: Contestant, log: FlightLog, starts: Starts):
     began = velocity, carried
     memory = _memory(model, log, starts.row)
     if observer is not None:
-        # Pose is read without its delay: to allow for it, rows later than a window's start would be needed.
+        # The delay of the pose is not corrected, because this would require rows later than a window's start.
         known = jax.tree.map(lambda x: x[starts.row], observe(model, log, 0.0, observer))
         rate, memory = known.body_rate, (*memory, known.memory(rotors=False))
         model = observed_model(model, observer)
@@ -230,10 +251,10 @@ def predict(contestant: Contestant, log: FlightLog, starts: Starts):
 
 
 def _stretch_of_flight(faults: SensorFaults, log: FlightLog, starts: Starts) -> tuple:
-    """Positions that move as the logged velocity says, and the stretch of each window, by this flight's own scale.
+    """Positions consistent with the logged velocity, and the stretch of each window, with this flight's own scale.
 
-    Another trajectory or height is another stretch. None where velocity and position were in step, and where the
-    velocity alone is stretched: that changes what the drone does, not only where it is said to be.
+    The stretch depends on trajectory and height. Both are None if velocity and position are consistent, or if only the
+    velocity is stretched, which affects the drone's motion and not only its logged position.
     """
     stretch = faults.stretch
     if stretch.none or faults.with_attitude is None:
@@ -274,13 +295,20 @@ def benchmark(
     stride: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict:
-    """Judge ``contestants`` beside `naive`, `hold` and `physics` on every flight.
+    """Compare contestants with the baselines `naive`, `hold` and `physics` on flights.
+
+    Args:
+        logs: flights at 100 Hz with rotor speeds.
+        contestants: by name.
+        stride: number of rows between windows.
+        progress: called with (done, total) after each flight.
 
     Returns:
-        ``windows``; `metrics` over all windows of all flights under ``rows`` by name; ``flights`` with both of each.
+        ``windows``, the number of windows; ``rows``, `metrics` over all windows of all flights by name; and
+        ``flights``, both of these for each flight.
 
     Raises:
-        CfbError: a log that is not of the benchmark, or none long enough.
+        CfbError: a log does not suit the benchmark, or none is long enough.
     """
     found: dict[str, dict[str, dict[str, np.ndarray]]] = {}
     for index, log in enumerate(logs):

@@ -1,14 +1,14 @@
-"""A disturbance observer: what a flight's own past says about the next half second.
+"""Disturbance observer: estimates slowly varying torques and forces from a flight's past, to improve predictions.
 
-Real drones fly under torques and forces no model knows, and these change slowly. Kalman filters walk along the log.
-Per body axis one holds the body rate with two wandering angular accelerations, a quick one and a slow one (trim), and
-one the wandering error of the specific force; per motor, where rotor speed was measured, one holds the error of the
-modelled rotor speed and of its steady value. The body's filters are driven by the model beside the flight (`replay`).
-What they know at a window's start is added to the prediction and fades with its own correlation time
+Real drones are subject to torques and forces that no model describes and that vary slowly. Kalman filters run along the
+log. For each body axis, one filter estimates the body rate and two angular accelerations, a fast and a slow one (trim),
+and another one the error of the specific force. For each motor whose rotor speed was measured, a filter estimates the
+error of the modelled rotor speed and of its steady value. The filters of the body use the model's replay of the flight
+(`replay`). The estimates at a window's start are added to the prediction and decay with their correlation times
 (``docs/nanodrone.md``).
 
-Causal: an estimate rests on gyro, accelerometer, commands, voltage and rotor speeds up to its row. Attitude and
-velocity enter through the model's effects only, read ``pose_delay`` late as a window's initial state is.
+The observer is causal: an estimate uses gyro, accelerometer, commands, voltage and rotor speeds up to its row. Attitude
+and velocity enter only through the model's effects, with ``pose_delay`` removed as for a window's initial state.
 """
 
 from __future__ import annotations
@@ -34,57 +34,57 @@ from cfb_mjx.sysid.replay import Lane, Replay, replays
 from cfb_mjx.sysid.windows import Windows
 
 RIDGE = 1e-3
-"""Weight of the prior that holds the logarithms of noise levels, per row of a fit: levels the data say nothing about
-stay where they were."""
+"""Weight, per row of a fit, of the prior on the logarithms of the noise levels. Levels that the data do not determine
+keep their initial values."""
 
 AGREES = 0.05
-"""For so long, s, what a model misses of its own angular acceleration stays about the same: the motors' lag."""
+"""Time over which the model's relative error of angular acceleration is correlated, s: the motors' lag."""
 TURN = 10.0
-"""Angular acceleration at which ``rate_share`` is meant, rad/s^2."""
+"""Angular acceleration to which ``rate_share`` refers, rad/s^2."""
 
 
 class Observer(eqx.Module):
     """Noise levels of the filters: standard deviations and correlation times.
 
-    As they are they predict real flights of the Crazyflie Brushless best half a second ahead (`observer_tuning`, on the
-    flights ``docs/closing-real-flights.md`` learns from).
+    The default values give the best half-second predictions on real flights of the Crazyflie Brushless
+    (`observer_tuning`, on the flights used for fitting in ``docs/closing-real-flights.md``).
     """
 
     gyro: float = 0.08
-    """White noise of a gyro row, rad/s."""
+    """White measurement noise of the gyro per row, rad/s."""
     rate_walk: float = 0.2
     """White angular acceleration, rad/s per square root of a second."""
     rate_share: float = 0.4
-    """What the model may miss of its own angular acceleration, as a share, at `TURN`; it grows in proportion, for hard
-    turns tell less of what wanders."""
+    """Relative error of the model's angular acceleration, at `TURN`. It is proportional to the angular acceleration,
+    because fast manoeuvres reveal less about the disturbance."""
     torque: tuple[float, float, float] = (2.0, 2.0, 0.6)
-    """Quickly wandering angular acceleration, rad/s^2."""
+    """Fast disturbance: angular acceleration, rad/s^2."""
     torque_time: float = 0.25
-    """Its correlation time, s."""
+    """Correlation time of ``torque``, s."""
     trim: tuple[float, float, float] = (2.0, 2.0, 1.0)
-    """Slowly wandering angular acceleration, rad/s^2."""
+    """Slow disturbance: angular acceleration, rad/s^2."""
     trim_time: float = 200.0
-    """Its correlation time, s."""
+    """Correlation time of ``trim``, s."""
     accelerometer: float = 0.6
-    """White noise of an accelerometer row, m/s^2."""
+    """White measurement noise of the accelerometer per row, m/s^2."""
     force_share: float = 0.7
-    """What the model may miss of its own specific force beyond hover, as a share of it."""
+    """Relative error of the model's specific force in excess of hover."""
     force: tuple[float, float, float] = (0.05, 0.1, 0.6)
-    """Wandering specific force, m/s^2."""
+    """Disturbance of the specific force, m/s^2."""
     force_time: float = 0.4
-    """Its correlation time, s."""
+    """Correlation time of ``force``, s."""
     rotor: float = 10.0
-    """White noise of a rotor speed row, rad/s."""
+    """White measurement noise of the rotor speed per row, rad/s."""
     rotor_walk: float = 110.0
     """White rotor acceleration, rad/s per square root of a second."""
     rotor_offset: float = 15.0
-    """Wandering error of the steady rotor speed, rad/s."""
+    """Slowly varying error of the steady rotor speed, rad/s."""
     rotor_offset_time: float = 0.2
-    """Its correlation time, s."""
+    """Correlation time of ``rotor_offset``, s."""
 
 
 class _Levels(eqx.Module):
-    """The numbers of an `Observer` as arrays, those of the three axes as one."""
+    """The levels of an `Observer` as arrays; those of three axes in one array."""
 
     gyro: Array
     rate_walk: Array
@@ -116,35 +116,35 @@ FORECASTER = Observer(
     force_share=0.35,
     force=(0.05, 0.025, 1.2),
 )
-"""Levels of largest use beside a predictor, found by the sums of the nano-drone benchmark on the same flights: it has
-learnt to expect its own errors, so what it misses of its own angular acceleration fades sooner."""
+"""Levels for use with a predictor, tuned with the nano-drone benchmark's sums on the same flights. A predictor has been
+fitted to compensate its own errors, so its errors of angular acceleration decay sooner."""
 
 
 def usual_observer(kind: str) -> Observer:
-    """The levels to use beside a model of this kind (`ModelFile.kind`), if none were tuned for it."""
+    """Default levels for a model of this kind (`ModelFile.kind`)."""
     return FORECASTER if kind == "predictor" else Observer()
 
 
 class Observed(eqx.Module):
-    """What an observer knows at each row from that row and earlier ones; or at each window's start."""
+    """Estimates of an observer at each row, from that row and earlier ones; or at each window's start."""
 
     body_rate: Float[AnyArray, "n 3"]
-    """Filtered, rad/s."""
+    """Filtered body rate, rad/s."""
     angular_acceleration: Float[AnyArray, "n 3"]
-    """Of the model with the disturbances, over the last interval, rad/s^2."""
+    """Angular acceleration of the model with the disturbances over the last interval, rad/s^2."""
     torque: Float[AnyArray, "n 3"]
-    """Unmodelled angular acceleration that fades with ``torque_time``, rad/s^2."""
+    """Unmodelled angular acceleration that decays with ``torque_time``, rad/s^2."""
     trim: Float[AnyArray, "n 3"]
-    """The same, fading with ``trim_time``."""
+    """Unmodelled angular acceleration that decays with ``trim_time``, rad/s^2."""
     force: Float[AnyArray, "n 3"]
     """Unmodelled specific force, body axes, m/s^2."""
     rotor_speed: Float[AnyArray, "n 4"]
-    """From the commands, corrected by what was measured, rad/s."""
+    """Rotor speed from the commands, corrected by measurements, rad/s."""
     rotor_offset: Float[AnyArray, "n 4"]
-    """Error of the steady rotor speed, rad/s; zero where rotor speed was not measured."""
+    """Error of the steady rotor speed, rad/s; zero if rotor speed was not measured."""
 
     def memory(self, rotors: bool) -> tuple[AnyArray, AnyArray, AnyArray, AnyArray]:
-        """Of a `disturbance.Disturbance`, with or without ``rotors``' offsets."""
+        """Memory of a `disturbance.Disturbance`, with or without the offsets of the ``rotors``."""
         return self.torque, self.trim, self.force, self.rotor_offset * rotors
 
 
@@ -156,10 +156,10 @@ def observe(model: Quadrotor, log: FlightLog, delay: float, observer: Observer, 
         log: the flight, n rows.
         delay: age of pose and velocity in a row, s.
         observer: noise levels.
-        use_measured: let measured rotor speeds, where the log has them, drive the body and correct the motors.
+        use_measured: if the log has measured rotor speeds, drive the body with them and correct the motors by them.
 
     Returns:
-        NumPy arrays, one row per row of the log.
+        Estimates as NumPy arrays, one row per row of the log.
     """
     inputs = replay_inputs(log, delay, float(model.parameters.gyro_delay), use_measured)
     found = _observe(model, *_replayed(model, *inputs), _Levels.of(observer))
@@ -167,22 +167,29 @@ def observe(model: Quadrotor, log: FlightLog, delay: float, observer: Observer, 
 
 
 def at_starts(found: Observed, log: FlightLog, windows: Windows) -> Observed:
-    """What is known at the starts of W windows, fields (W, ...): the row before, the body rate carried on to t0."""
+    """Estimates at the starts of W windows, fields (W, ...): those of the row before, the body rate extrapolated to t0.
+
+    Args:
+        found: estimates at the rows of the log.
+        log: the flight.
+        windows: W windows of the log.
+    """
     here = jax.tree.map(lambda x: x[windows.row], found)
     since = (windows.start - log.time[windows.row])[:, None]
     return eqx.tree_at(lambda o: o.body_rate, here, here.body_rate + since * here.angular_acceleration)
 
 
 def fit_observer(model: Quadrotor, logs: Sequence[FlightLog], observer: Observer | None = None) -> Observer:
-    """Noise levels that make the innovations of the filters likeliest (maximum likelihood).
+    """Fit the noise levels by maximum likelihood of the filters' innovations.
 
     Args:
-        model: the drone, with the effects it will be used with.
-        logs: flights that will not be judged.
-        observer: where to start, and what to keep where the logs say nothing (rotors: logs without rotor speed).
+        model: the drone, with the effects with which it will be used.
+        logs: flights that are not used for evaluation.
+        observer: initial levels, which are kept where the logs do not determine them (those of the rotors, without
+            measured rotor speeds).
 
     Raises:
-        CfbError: no logs.
+        CfbError: there are no logs.
     """
     if not logs:
         raise CfbError("fit_observer needs at least one log.")
@@ -218,7 +225,7 @@ def fit_observer(model: Quadrotor, logs: Sequence[FlightLog], observer: Observer
 def replay_inputs(
     log: FlightLog, delay: float, gyro_delay: float, use_measured: bool = True
 ) -> tuple[Flight, np.ndarray]:
-    """The flight and the rotor speeds that drive the body; its ``measured`` says whether they do."""
+    """Prepared flight and rotor speeds (n, 4), rad/s, that drive the body; these are used if ``measured`` is 1."""
     flight = prepare_flight(log, delay, gyro_delay)
     driven = causal_rotor_speed(log) if use_measured else None
     used = 1.0 if driven is not None else 0.0
@@ -227,7 +234,7 @@ def replay_inputs(
 
 
 def causal_rotor_speed(log: FlightLog) -> np.ndarray | None:
-    """Measured rotor speeds, (n, 4) rad/s, invalid readings replaced by the last valid one; None if not measured."""
+    """Measured rotor speeds (n, 4), rad/s, invalid readings replaced by the last valid one; None if not measured."""
     if log.rotor_speed is None or (np.isfinite(log.rotor_speed).mean(axis=0) < MEASURED_SHARE).any():
         return None
     out = log.rotor_speed.copy()
@@ -239,7 +246,7 @@ def causal_rotor_speed(log: FlightLog) -> np.ndarray | None:
 
 
 def _replayed(model: Quadrotor, flight: Flight, driven: np.ndarray) -> tuple[Flight, np.ndarray, Replay]:
-    """A flight, the rotor speeds that drive it and what the model says of it, padded so that filters come compiled."""
+    """Flight, rotor speeds that drive it and the model's replay, padded so that compiled filters can be reused."""
     (said,) = replays(model, [Lane(flight, driven)])
     flight, (driven, said) = lengthened(flight, (driven, said))
     return flight, driven, said
@@ -253,7 +260,7 @@ def _observe(model: Quadrotor, flight: Flight, driven: AnyArray, said: Replay, o
 
 
 def _surprise(model: Quadrotor, flight: Flight, driven: AnyArray, said: Replay, observer: _Levels) -> Array:
-    """Negative log-likelihood of all innovations, without the constant."""
+    """Negative log-likelihood of all innovations, up to a constant."""
     _, errors = _body(model, flight, said, observer)
     _, motor_errors = _motors(model, flight, driven, said, observer)
 
@@ -266,12 +273,12 @@ def _surprise(model: Quadrotor, flight: Flight, driven: AnyArray, said: Replay, 
 
 
 def _before(x: AnyArray) -> Array:
-    """What was given for the interval after each row, for the interval before it."""
+    """Shift values for the interval after each row to the interval before each row."""
     return jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]])
 
 
 def _body(model: Quadrotor, flight: Flight, said: Replay, o: _Levels):
-    """Rate, angular acceleration, its unmodelled parts and the unmodelled force; innovations and variances."""
+    """Body rate, angular acceleration, its unmodelled parts, unmodelled force; and innovations with variances."""
 
     def axis(rate, model_rate, torque, trim):
         def row(carry, inputs):
@@ -287,7 +294,7 @@ def _body(model: Quadrotor, flight: Flight, said: Replay, o: _Levels):
             variance, error = p[0, 0] + o.gyro**2, gyro - x[0]
             gain = p[:, 0] / variance
             kept = x + gain * error, p - jnp.outer(gain, p[0])
-            # Behind a gap only the trim is still known.
+            # After a gap only the trim is still known.
             anew = jnp.stack([gyro, 0.0, x[2]]), jnp.diag(jnp.stack([o.gyro**2, torque**2, p[2, 2]]))
             x, p = jax.tree.map(lambda new, old: jnp.where(fresh > 0, new, old), anew, kept)
             total = alpha + jnp.where(fresh > 0, 0.0, x[1]) + x[2]
@@ -318,10 +325,10 @@ def _body(model: Quadrotor, flight: Flight, said: Replay, o: _Levels):
 
 
 def _motors(model: Quadrotor, flight: Flight, driven: AnyArray, said: Replay, o: _Levels):
-    """Rotor speed and the error of its steady value; innovations and variances.
+    """Rotor speed and the error of its steady value; and innovations with variances.
 
-    The error e of the modelled speed follows that of its steady value b as the motors follow their commands:
-    T e' = b - e. So nothing has to be known of what effects do to the motors.
+    The error e of the modelled speed follows the error b of its steady value with the motors' lag: T e' = b - e. So the
+    filter does not depend on how effects change the motors.
     """
     lag = jnp.mean(model.changed_parameters().motor_time_constant)
     used = flight.measured

@@ -1,8 +1,8 @@
-"""Noise levels of an `Observer` that predict best, by search over flights nobody judges.
+"""Search for the noise levels of an `Observer` that give the best predictions.
 
-The likeliest levels (`cfb_mjx.sysid.observer.fit_observer`) describe what disturbs the next row. Half a second on,
-most of that has faded, and what a model misses in hard turns is no disturbance at all: levels that predict best there
-trust quick changes less.
+The maximum-likelihood levels (`cfb_mjx.sysid.observer.fit_observer`) describe the disturbances up to the next row. Over
+half a second most of these decay, and a model's errors in fast manoeuvres are not disturbances. Therefore the levels
+that predict best respond less to fast changes.
 """
 
 from __future__ import annotations
@@ -21,19 +21,20 @@ from cfb_mjx.sysid.observer import Observer
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 
 FACTORS = (2.0, 1.5)
-"""Steps of the search: levels are multiplied and divided by the first until that helps no more, then by the next."""
+"""Factors of the search: levels are multiplied and divided by the first until nothing improves, then by the next."""
 LEAST = 1e-3
-"""A step must lower the score by this."""
+"""Smallest decrease of the score by a step."""
 HORIZON = 0.5
-"""Seconds ahead at which levels are judged."""
+"""Prediction horizon of the score, s."""
 STRIDE = 10
-"""Rows from window to window where the benchmark's rules judge."""
+"""Number of rows between windows in `benchmark_score`."""
 
 Level = tuple[str, int | None]
+"""Name of a field of `Observer`, and the axis; None: all axes, or a field without axes."""
 
 
 def levels_of(observer: Observer) -> list[Level]:
-    """Every level that may be moved: (field, None), and (field, axis) for each axis of those that have axes."""
+    """All levels: (field, None) for every field, and (field, axis) for each axis of fields that have axes."""
     found: list[Level] = []
     for field in dataclasses.fields(observer):
         value = getattr(observer, field.name)
@@ -44,7 +45,7 @@ def levels_of(observer: Observer) -> list[Level]:
 
 
 def scaled(observer: Observer, level: Level, factor: float) -> Observer:
-    """With one level (all its axes, or one) multiplied."""
+    """The observer with one level (one axis, or all) multiplied by a factor."""
     name, axis = level
     value = getattr(observer, name)
     if isinstance(value, tuple):
@@ -57,10 +58,16 @@ def scaled(observer: Observer, level: Level, factor: float) -> Observer:
 def score(
     model: Quadrotor, groups: Mapping[str, Sequence[FlightLog]], observer: Observer, faults: SensorFaults = HEALTHY
 ) -> float:
-    """Mean logarithm of the mean attitude and velocity errors at `HORIZON`, every group and kind counting alike.
+    """Mean logarithm of the mean attitude and velocity errors at `HORIZON`, over groups and kinds of prediction.
+
+    Args:
+        model: the drone.
+        groups: flights by kind of flight; all groups have the same weight.
+        observer: noise levels to judge.
+        faults: of the sensors.
 
     Raises:
-        CfbError: no group, or one in which no prediction window fits.
+        CfbError: there is no group, or a group without a prediction window.
     """
     if not groups:
         raise CfbError("Tuning an observer needs flights.")
@@ -75,10 +82,16 @@ def score(
 def benchmark_score(
     model: Quadrotor, groups: Mapping[str, Sequence[FlightLog]], observer: Observer, faults: SensorFaults = HEALTHY
 ) -> float:
-    """Mean logarithm of the nano-drone benchmark's sums (`cfb_mjx.sysid.nanodrone`), every group and quantity alike.
+    """Mean logarithm of the nano-drone benchmark's sums (`cfb_mjx.sysid.nanodrone`), over groups and quantities.
+
+    Args:
+        model: the drone.
+        groups: flights by kind of flight; all groups have the same weight.
+        observer: noise levels to judge.
+        faults: of the sensors.
 
     Raises:
-        CfbError: no group, or a flight that is not of the benchmark.
+        CfbError: there is no group, or a flight does not suit the benchmark.
     """
     if not groups:
         raise CfbError("Tuning an observer needs flights.")
@@ -100,20 +113,21 @@ def tune_observer(
     progress: Callable[[str], None] = lambda _: None,
     judge: Callable[..., float] = score,
 ) -> Observer:
-    """Move the levels one after another, again and again, until no step makes predictions better.
+    """Minimise a score over the noise levels by coordinate descent.
 
     Args:
-        model: the drone, with the effects it will be used with; run with x64 enabled.
-        groups: flights that will not be judged, by kind of flight, so that many gentle ones do not drown a wild one.
-        observer: where to start.
+        model: the drone, with the effects with which it will be used; run with x64 enabled.
+        groups: flights that are not used for evaluation, by kind of flight. All groups have the same weight, so many
+            gentle flights do not outweigh a few aggressive ones.
+        observer: initial levels.
         faults: of the sensors.
-        levels: which may be moved; by default all.
-        factors: steps, the largest first.
-        progress: told about every step taken.
-        judge: what to make small, `score` or `benchmark_score`.
+        levels: levels to tune; by default all.
+        factors: factors of the steps, the largest first.
+        progress: called with a message after each accepted step.
+        judge: score to minimise, `score` or `benchmark_score`.
 
     Raises:
-        CfbError: no flights, or a group in which no prediction window fits.
+        CfbError: there are no flights, or a group has no prediction window.
     """
     best = observer or Observer()
     lowest = judge(model, groups, best, faults)
@@ -128,7 +142,7 @@ def tune_observer(
         return lowest < before
 
     for factor in factors:
-        # A list: every level has its turn in every round.
+        # A list rather than a generator, so that every level is tried in every round.
         while any([moved(level, factor) or moved(level, 1 / factor) for level in moving]):
             pass
     return best

@@ -1,4 +1,4 @@
-"""Open-loop prediction of every window of a log at once."""
+"""Open-loop prediction of all windows of a log in batches."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ def predict(
     memory: tuple = (),
     over: Devices | None = None,
 ) -> State:
-    """Predict the measured states at the horizons.
+    """Predict the states at the horizons.
 
     Args:
-        model: the drone; its ``dt`` and ``substeps`` are not used, steps come from the log.
-        windows: W windows.
-        rotor_speed: (W, 4) rotor speeds at the window starts, rad/s, with the logged commands in; None feeds the
-            measured rotor speeds instead.
-        memory: what the effects remember at the window starts (`start_of_windows`).
-        over: devices to divide the windows over.
+        model: the drone; its ``dt`` and ``substeps`` are ignored, because the steps come from the log.
+        windows: W windows; W must not be 0.
+        rotor_speed: (W, 4) rotor speeds at the window starts, rad/s, for a prediction from the logged commands; None:
+            predict from the measured rotor speeds instead.
+        memory: memories of the effects at the window starts (`start_of_windows`).
+        over: devices over which to divide the windows.
 
     Returns:
-        `State` of numpy arrays (W, H, ...); W must not be 0.
+        Predicted states as NumPy arrays (W, H, ...).
     """
     measured = rotor_speed is None
     start = windows.rotor_speed[:, 0] if measured else rotor_speed
     inputs = windows.rotor_speed[:, 1:] if measured else windows.command
     state = State(*(getattr(windows, name) for name in _STATE), rotor_speed=start, memory=memory)
     count, width = windows.step.shape
-    # Blocks of one shape, whatever the logs: the program is compiled once and then comes from the cache.
+    # Blocks of a fixed shape: the program is compiled once and then comes from the cache.
     steps = STEPS_PER_BLOCK * -(-max(width, 1) // STEPS_PER_BLOCK)
     step = np.pad(windows.step, ((0, 0), (0, steps - width)))
     inputs = np.pad(inputs, ((0, 0), (0, steps - width), (0, 0)), mode="edge")
@@ -72,14 +72,14 @@ def _predict_batch(model: Quadrotor, state: State, step, inputs, measured: bool,
 
 
 def predict_one(model: Quadrotor, state: State, step, inputs, measured: bool) -> State:
-    """Trajectory (S + 1) of one window, the initial state first; differentiable.
+    """Trajectory of S + 1 states of one window, starting with the initial state; differentiable.
 
     Args:
         model: the drone.
         state: at the window's start.
-        step: (S,) integration steps, s; 0 where the window has ended.
-        inputs: (S, 4) commands held in each step, or rotor speeds at its end if ``measured``.
-        measured: what ``inputs`` are.
+        step: (S,) integration steps, s; 0 after the end of the window.
+        inputs: (S, 4) commands held during each step, or rotor speeds at its end, rad/s.
+        measured: whether ``inputs`` are rotor speeds.
     """
     center = Vec.unstack(model.changed_parameters().center_of_gravity)
 
@@ -97,9 +97,15 @@ def predict_one(model: Quadrotor, state: State, step, inputs, measured: bool) ->
 
 
 def start_of_windows(model: Quadrotor, log: FlightLog, windows: Windows, delay: float) -> tuple[np.ndarray, tuple]:
-    """Rotor speeds (W, 4) and memories of the effects (leading axis W) at the window starts.
+    """Rotor speeds (W, 4), rad/s, and memories of the effects (leading axis W) at the window starts.
 
-    Both come from the commands since the log began and from what the log measured before each start, never after.
+    Both are computed from the commands since the start of the log and from measurements before each window's start.
+
+    Args:
+        model: the drone.
+        log: the flight.
+        windows: W windows of the log.
+        delay: age of pose and velocity in a row, s.
     """
     flight = prepare_flight(log, delay, float(model.parameters.gyro_delay))
     return starts_of_windows(model, [log], [windows], [flight])[0]
@@ -108,9 +114,9 @@ def start_of_windows(model: Quadrotor, log: FlightLog, windows: Windows, delay: 
 def starts_of_windows(
     model: Quadrotor, logs: Sequence[FlightLog], windows: Sequence[Windows], flights: Sequence[Flight | None]
 ) -> list[tuple[np.ndarray, tuple]]:
-    """`start_of_windows` of several logs, walked along side by side.
+    """`start_of_windows` of several logs in parallel.
 
-    ``flights`` are the same logs, prepared; of a log without windows nothing is asked (None), and nothing comes back.
+    ``flights`` are the prepared logs; for a log without windows it may be None, and the result is empty.
     """
     there = [i for i, own in enumerate(windows) if len(own)]
     nothing: tuple[np.ndarray, tuple] = np.zeros((0, 4)), ()
@@ -120,7 +126,7 @@ def starts_of_windows(
     found = []
     for i, (speed, memory) in zip(there, known, strict=True):
         log, own = logs[i], windows[i]
-        # A start that is a row's own time may fall a rounding before it.
+        # A start at a row's own time may lie before it by a rounding error.
         since = np.maximum(own.start - log.time[own.row], 0.0)
         found.append((speed[own.row], jax.tree.map(lambda x, r=own.row: x[r], memory), log.command[own.row], since))
     ends = np.cumsum([len(own) for own in windows])
@@ -129,7 +135,7 @@ def starts_of_windows(
     inputs = speed, memory, np.clip(command, 0, 1), since
     parts = []
     for first in range(0, count, WINDOWS_PER_BLOCK):
-        # One program serves any number of windows.
+        # Padded to a fixed shape, so that one program serves any number of windows.
         block = jax.tree.map(lambda x, f=first: last_repeated(x[f : f + WINDOWS_PER_BLOCK], WINDOWS_PER_BLOCK), inputs)
         parts.append(jax.tree.map(np.asarray, _advance_rotors(rotors_alone(model), *block)))
     every = jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)
@@ -150,7 +156,7 @@ def _advance_rotors(model: Quadrotor, speed, memory, command, since):
 
 
 def hold(windows: Windows, horizons: tuple[float, ...]) -> State:
-    """The baseline that knows no physics: constant velocity and constant body rate, (W, H, ...)."""
+    """Baseline without physics: states (W, H, ...) at constant velocity and constant body rate."""
     time = np.asarray(horizons)[None, :, None]
     half = 0.5 * windows.body_rate[:, None] * time
     angle = np.linalg.norm(half, axis=-1, keepdims=True)
@@ -170,5 +176,5 @@ def hold(windows: Windows, horizons: tuple[float, ...]) -> State:
 
 
 def select(windows: Windows, chosen: np.ndarray) -> Windows:
-    """The windows where ``chosen`` (W,) is true."""
+    """The windows for which ``chosen`` (W,) is true."""
     return Windows(**{f.name: getattr(windows, f.name)[chosen] for f in dataclasses.fields(windows)})

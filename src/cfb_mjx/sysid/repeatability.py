@@ -1,4 +1,7 @@
-"""Flights of one reference, flown twice: the torque a model misses both times is no noise, and could be known."""
+"""Repeatability of a model's residual torque over two flights of the same reference.
+
+The part common to both flights is not noise, so a better model could predict it.
+"""
 
 from __future__ import annotations
 
@@ -15,25 +18,26 @@ from cfb_mjx.sysid.observer import replay_inputs
 from cfb_mjx.sysid.replay import Lane, replays
 
 CORNER = 6.0
-"""Hz. Above, the gyro's derivative is noise."""
+"""Cut-off frequency, Hz; above it the derivative of the gyro is mostly noise."""
 RATE = 100.0
+"""Rate to which the flights are resampled, Hz."""
 LONGEST_SHIFT = 6.0
-"""Flights of one reference are moved against each other by this at most, s, and by a third of the shorter at most."""
+"""Maximum time shift between the two flights, s; at most a third of the shorter flight."""
 SHORTEST = 6.0
-"""Flights shorter than this, s, say nothing."""
+"""Minimum duration of a flight, s."""
 EDGE = 1.0
-"""s at both ends that filters need."""
+"""Time at both ends where the filter is not valid, s."""
 
 
 @dataclass(frozen=True)
 class Repeated:
-    """What a model misses in two flights of one reference, roll, pitch, yaw.
+    """Comparison of a model's residual angular accelerations (roll, pitch, yaw) in two flights of one reference.
 
     Attributes:
-        correlation: (3,) of the two residual angular accelerations.
-        rms: (3,) their root mean square, rad/s^2; constants (a battery's place) are not part of it.
-        shared: (3,) their covariance, (rad/s^2)^2: what is missed both times.
-        distance: rms distance of the two paths, m: says whether it was one reference.
+        correlation: (3,) of the two residuals.
+        rms: (3,) root mean square of the residuals, rad/s^2, without their means (due to the battery's position).
+        shared: (3,) covariance of the two residuals, (rad/s^2)^2: the part common to both flights.
+        distance: rms distance of the two paths, m, which shows whether the reference was the same.
     """
 
     correlation: np.ndarray
@@ -45,10 +49,14 @@ class Repeated:
 def residual_angular_acceleration(model: Quadrotor, log: FlightLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Measured minus modelled angular acceleration along a flight, below `CORNER`.
 
-    The state comes from the log row by row, rotor speeds from it too where they were measured.
+    The state is read from the log at every row, and so are rotor speeds if they were measured.
+
+    Args:
+        model: the drone.
+        log: the flight.
 
     Returns:
-        (n,) time, s, evenly spaced; (n, 3) residual, rad/s^2; (n, 3) position, m.
+        Evenly spaced time (n,), s; residual (n, 3), rad/s^2; position (n, 3), m.
     """
     log = with_gyro_in_time(log, float(model.parameters.gyro_delay))
     (said,) = replays(model, [Lane(*replay_inputs(log, delay_of(log, model.parameters), 0.0))])
@@ -60,10 +68,15 @@ def residual_angular_acceleration(model: Quadrotor, log: FlightLog) -> tuple[np.
 
 
 def repeated(model: Quadrotor, one: FlightLog, other: FlightLog) -> Repeated:
-    """Compare what a model misses in two flights of one reference.
+    """Compare a model's residual angular accelerations in two flights of one reference, after aligning their paths.
+
+    Args:
+        model: the drone.
+        one: first flight.
+        other: second flight.
 
     Raises:
-        CfbError: flights too short.
+        CfbError: a flight is too short.
     """
     (_, a, path_a), (_, b, path_b) = (residual_angular_acceleration(model, log) for log in (one, other))
     shorter = min(len(a), len(b))
@@ -87,7 +100,7 @@ def _sampled(at: np.ndarray, time: np.ndarray, values: np.ndarray) -> np.ndarray
 
 
 def _overlap(count: int, other: int, shift: int) -> tuple[slice, slice]:
-    """Rows that lie side by side when the second flight is moved ``shift`` rows earlier."""
+    """Overlapping rows of both flights if the second one is moved ``shift`` rows earlier."""
     first, second = max(0, -shift), max(0, shift)
     length = min(count - first, other - second)
     return slice(first, first + length), slice(second, second + length)

@@ -1,9 +1,9 @@
-"""The model beside a flight: what it says the sensors should read, given where the drone really was.
+"""Replay: predict accelerations and rotor speeds of a model along a flight, with the body's state taken from the log.
 
-The body's state is taken from the log row by row, so nothing diverges and no feedback is broken; only what the log
-cannot show (rotor speeds from commands, memories of effects) is carried along. Every effect takes part with the very
-functions it has in simulation. Many flights, or one flight beside many models, are walked along side by side, `ROWS` at
-a time: one compiled program serves flights of any number and length.
+The state is read from the log at every row, so the prediction cannot diverge. Only what the log does not contain (rotor
+speeds from commands, memories of effects) is integrated. The effects use the same functions as in simulation. Many
+flights, or many models on one flight, are processed in parallel, `ROWS` rows at a time, so that one compiled program
+serves any number and length of flights.
 """
 
 from __future__ import annotations
@@ -35,58 +35,58 @@ from cfb_mjx.model.vector import Vec, rotate
 from cfb_mjx.sysid.flight import ROWS, Flight
 
 LANES = 8, 64
-"""So many are walked along side by side: the fewer if that is enough. One row of 64 lanes takes three times as long as
-one row of one."""
+"""Number of lanes processed in parallel; the smaller one if it suffices. One row of 64 lanes takes three times as long
+as one row of a single lane."""
 MOST = 500_000
-"""Rows walked along side by side, for many long recordings at once would fill the memory."""
+"""Maximum number of rows processed in parallel, which limits the memory."""
 
 
 def between(x):
-    """(n, ...) in the middle of the interval after each row, of NumPy's or jax's rows; the last row stays."""
+    """Values (n, ...) in the middle of the interval after each row; the last row is unchanged."""
     return 0.5 * (x + x[np.minimum(np.arange(1, len(x) + 1), len(x) - 1)])
 
 
 class Lane(NamedTuple):
-    """One flight beside one model."""
+    """One flight to be replayed by one model."""
 
     flight: Flight
     driven: AnyArray
     """(n, 4) rotor speeds that drive the body where the flight's were measured (`smoothed_rotor_speed`), rad/s."""
     lead: float = 0.0
-    """Share of the next row's command in the mean over an interval: commands sent between two rows are not in the log
-    (0: none are missing; about 1/4: every second one is)."""
+    """Share of the next row's command in the mean command over an interval, for commands that were sent between two
+    rows and are not in the log (0: none are missing; about 1/4: every second one is)."""
     effects: tuple[Effect, ...] | None = None
-    """In place of the model's, with other numbers."""
+    """Effects with other values, in place of the model's."""
 
 
 class Replay(NamedTuple):
-    """What a model predicts along a flight."""
+    """Predictions of a model along a flight."""
 
     rotor_speed: Float[AnyArray, "n 4"]
-    """From the commands alone, at each row, rad/s."""
+    """Rotor speed at each row from the commands alone, rad/s."""
     angular_acceleration: Float[AnyArray, "n 3"]
-    """Mean over the interval after a row, body axes, rad/s^2."""
+    """Mean over the interval after each row, body axes, rad/s^2."""
     specific_force: Float[AnyArray, "n 3"]
-    """At the rotors' centre in the middle of that interval, body axes, m/s^2."""
+    """At the rotors' centre, in the middle of the interval after each row, body axes, m/s^2."""
 
 
 def replays(model: Quadrotor, lanes: Iterable[Lane]) -> Iterator[Replay]:
-    """Replay flights, one after the other as they are asked for.
+    """Replay flights lazily, in the order of ``lanes``.
 
     Args:
         model: the drone with its effects.
-        lanes: flights, and with which numbers each.
+        lanes: flights, each with the effects' values to use.
     """
     return _walked(model, lanes, "sensors")
 
 
 def speeds_along(model: Quadrotor, flights: Sequence[Flight], lead: float = 0.0) -> list[np.ndarray]:
-    """Rotor speeds (n, 4) from commands at each row of flights, rad/s: the first that `remembered_along` returns.
+    """Rotor speeds (n, 4) from commands at each row of the flights, rad/s, as from `remembered_along`.
 
-    Of the body only what the rotors feel is walked along, a small part of the model.
+    Only the part of the model that acts on the rotors is evaluated.
     """
     alone = rotors_alone(model)
-    # Where what the rotors feel hangs on what the whole model misses, all of it is needed.
+    # An effect on the rotors whose memory depends on the model's residual needs the whole model.
     if any(_drives(effect) and overrides(effect, "follow") for effect in model.effects):
         return [speed for speed, _ in remembered_along(model, flights, lead)]
     return list(_walked(alone, [Lane(flight, flight.rotor_speed, lead) for flight in flights], "speed"))
@@ -97,18 +97,18 @@ def _drives(effect: Effect) -> bool:
 
 
 def remembered_along(model: Quadrotor, flights: Sequence[Flight], lead: float = 0.0) -> list[tuple[np.ndarray, tuple]]:
-    """Rotor speeds (n, 4) from commands, and the memories of all effects (leading axis n), at each row of flights."""
+    """Rotor speeds (n, 4) from commands, rad/s, and memories of all effects (leading axis n), at each row."""
     alone = rotors_alone(model)
     return list(_walked(alone, [Lane(flight, flight.rotor_speed, lead) for flight in flights], "memory"))
 
 
 def rotors_alone(model: Quadrotor) -> Quadrotor:
-    """The model however its body is integrated, for which one program serves all: rotors do not depend on that."""
+    """The model with default integration options, on which the rotors do not depend; one program then serves all."""
     return Quadrotor(model.parameters, model.effects, model.body, dt=model.dt, substeps=model.substeps)
 
 
 Wanted = Literal["sensors", "memory", "speed"]
-"""What is kept of every row: a `Replay`, rotor speeds and memories, or rotor speeds alone."""
+"""Output at every row: a `Replay`, rotor speeds and memories, or rotor speeds alone."""
 
 
 def _walked(model: Quadrotor, lanes: Iterable[Lane], wanted: Wanted) -> Iterator:
@@ -121,7 +121,7 @@ def _walked(model: Quadrotor, lanes: Iterable[Lane], wanted: Wanted) -> Iterator
 
 def _side_by_side(model: Quadrotor, some: list[Lane], wanted: Wanted) -> list:
     width = next(count for count in LANES if count >= len(some))
-    # The last lane is walked along more than once where there are fewer.
+    # Fill up with copies of the last lane.
     whole = some + some[-1:] * (width - len(some))
     numbers = [model.effects if lane.effects is None else lane.effects for lane in whole]
     effects = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *numbers)
@@ -130,7 +130,7 @@ def _side_by_side(model: Quadrotor, some: list[Lane], wanted: Wanted) -> list:
     longest = max(len(lane.flight.time) for lane in some)
     carry, pieces = None, []
     for first in range(0, longest, ROWS):
-        # One more, which says what happens in the interval after the last.
+        # One more row, for the interval after the last one.
         rows = _rows(whole, first, first + ROWS + 1)
         if carry is None:
             carry = _begin(model, effects, {key: x[:, :2] for key, x in rows.items()})
@@ -156,9 +156,9 @@ _READ = ("time", "interval", "position", "velocity", "quaternion", "body_rate", 
 
 
 def _rows(lanes: list[Lane], first: int, last: int) -> dict[str, np.ndarray]:
-    """Some rows of every lane's flight; behind its end the last one again, with no time between."""
+    """Rows [first, last) of every lane's flight; beyond its end, the last row with zero intervals."""
     rows = {id(lane.flight): np.minimum(np.arange(first, last), len(lane.flight.time) - 1) for lane in lanes}
-    # Often many lanes are of one flight.
+    # Many lanes often share one flight.
     flights = {id(lane.flight): lane.flight for lane in lanes}
     found = {}
     for key in _READ:
@@ -168,14 +168,14 @@ def _rows(lanes: list[Lane], first: int, last: int) -> dict[str, np.ndarray]:
 
 
 def _state(rows: Mapping[str, AnyArray]) -> State:
-    """The body in the middle of the intervals between rows."""
+    """State of the body in the middle of the intervals between rows."""
     names = ("position", "velocity", "quaternion", "body_rate", "driven")
     return State(*(0.5 * (rows[name][:-1] + rows[name][1:]) for name in names))
 
 
 @eqx.filter_jit
 def _begin(model: Quadrotor, effects: tuple[Effect, ...], rows: Mapping[str, AnyArray]):
-    """Rotor speeds and memories at the first of two rows, as after long steady flight, of every lane."""
+    """Initial rotor speeds and memories of every lane, as after a long steady flight at the first row."""
 
     def one(effects, rows):
         own = _with(model, effects)
@@ -185,7 +185,7 @@ def _begin(model: Quadrotor, effects: tuple[Effect, ...], rows: Mapping[str, Any
         start = begin(own, State(first.position, first.velocity, first.quaternion, first.body_rate, speed.stack()))
         return speed, unstack(start, center).memory
 
-    # Weak types would become strong after some rows, and the next be a program of its own.
+    # Weak types would become strong after some rows, which would require a second compilation.
     return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype), jax.vmap(one)(effects, rows))
 
 
@@ -195,7 +195,7 @@ def _with(model: Quadrotor, effects: tuple[Effect, ...]) -> Quadrotor:
 
 @eqx.filter_jit
 def _advance(model: Quadrotor, effects: tuple[Effect, ...], lead, measured, rows, carry, wanted: Wanted):
-    """Along some rows of every lane: what is carried on, and what is wanted of each of them."""
+    """Advance every lane by some rows; return the new carry and the output at each row."""
 
     def one(effects, lead, measured, rows, carry):
         return _along(_with(model, effects), lead, measured, rows, carry, wanted)
@@ -227,7 +227,7 @@ def _along(model: Quadrotor, lead: Array, share: Array, rows: dict[str, Array], 
         prepared = prepare(model, dt)
         path, moved = commanded_path(prepared, speed, memory, command)
         straight = rotors.path_between(prepared.rotors, here, there)
-        # Where rotor speed was measured it drives the body; the commands still tell the rotors' own model.
+        # Measured rotor speeds drive the body; the rotor model itself is still driven by the commands.
         body_speed = share * straight.middle + (1 - share) * path.middle
         rate = share * straight.rate_middle + (1 - share) * ((path.end - path.start) * prepared.rotors.inverse_dt)
         where = remembering(unstack(at, center), moved)
@@ -239,7 +239,7 @@ def _along(model: Quadrotor, lead: Array, share: Array, rows: dict[str, Array], 
             return (path.end, tuple(new if _drives(effect) else old for effect, new, old in pairs)), speed.stack()
         wrench = loaded(model, prepared.parameters, rotors.loads_at(prepared.rotors, body_speed, rate), seen)
         angular, force = at_rotor_center(prepared.parameters, wrench, where.body_rate)
-        # What remembers accelerations (a slung load) followed the drone, not the model of it.
+        # Memories that depend on accelerations (a slung load) follow the measured motion, not the model's.
         missed = rotate(where.quaternion, felt - force)
         moved = followed(prepared, seen, acceleration, missed)
         kept = jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec))
@@ -250,9 +250,14 @@ def _along(model: Quadrotor, lead: Array, share: Array, rows: dict[str, Array], 
 
 
 def smoothed_rotor_speed(flight: Flight, modelled: np.ndarray, width: float = 0.012) -> np.ndarray:
-    """Measured rotor speeds with the reading noise taken out: the model's, plus its error smoothed over ``width`` s.
+    """Reduce the noise of measured rotor speeds: the model's speeds plus their smoothed error.
 
-    Errors in a regressor pull what multiplies it towards zero, most of all the rotors' acceleration.
+    Noise in a regressor biases its coefficient towards zero; the rotors' acceleration is affected most.
+
+    Args:
+        flight: with measured rotor speeds.
+        modelled: (n, 4) rotor speeds from commands, rad/s.
+        width: standard deviation of the Gaussian filter of the error, s.
     """
     error = np.asarray(flight.rotor_speed) - np.asarray(modelled)
     step = float(np.median(np.asarray(flight.interval)[np.asarray(flight.interval) > 0]))

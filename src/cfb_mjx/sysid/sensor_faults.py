@@ -1,4 +1,4 @@
-"""What measuring does to a flight: lags, scales and shifts of columns, taken out before a model is judged."""
+"""Sensor faults of a recording: lags, scales and time shifts of columns, which are removed before a model is judged."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ATTRIBUTES = {
     "sensor_gyro_scale": {"scale": "gyro_scale"},
     "sensor_time_shift": {"shift": "motor_shift"},
 }
-"""Attributes of `SensorFaults` that hold the parameters of a fault of `SENSOR_FAULTS`."""
+"""Attributes of `SensorFaults` that hold the parameters of each fault of `SENSOR_FAULTS`."""
 LIMITS = {
     "delay": Limits(-0.5, 1.0, -0.05, 0.1),
     "velocity_scale": Limits(0.1, 10.0, 0.5, 2.0),
@@ -43,29 +43,31 @@ LIMITS = {
     "gyro_scale": Limits(0.1, 10.0, 0.5, 2.0),
     "motor_shift": Limits(-1.0, 1.0, -0.06, 0.06),
 }
-"""Where each attribute may lie."""
+"""Limits of each attribute."""
 FORMS = ("rise", "fade", "with_attitude")
-"""Of these, what says nothing without another."""
+"""Parameters that have no meaning without another parameter of the same fault."""
 STRETCH_STEP = 0.05
-"""Of a window, in which a stretched velocity is followed, s: far below the times such a stretch takes."""
+"""Time step at which a stretched velocity is integrated in a window, s: far below the time constants of a stretch."""
 
 
 @dataclass(frozen=True)
 class SensorFaults:
-    """Of a recording chain; the defaults are healthy.
+    """Faults of a recording chain; the default values are healthy.
 
     Attributes:
         delay: age of pose and velocity beyond the declared observation delay, s.
-        velocity_scale: logged velocity over true velocity, horizontally; and vertically too unless told otherwise.
-        vertical_scale: the same vertically, where an estimator (optical flow, say) stretches only one of the two.
-        velocity_rise: time after which the scale shows in the velocity column, s (`VelocityStretch`); None: at once.
-        velocity_fade: time after which it fades again, s; None: never.
-        with_attitude: 1 where the attitude leans along with the velocity, as that of an estimator does which corrects
-            both by the same flow: the drone's motion is then taken as logged, and only the position moves less than the
-            velocity says. None: the attitude is right, and the velocity alone is not.
+        velocity_scale: logged over true horizontal velocity; also vertical, unless ``vertical_scale`` is given.
+        vertical_scale: logged over true vertical velocity, for estimators (optical flow, for instance) that stretch
+            only one of the two.
+        velocity_rise: time constant with which the scale appears in the velocity column, s (`VelocityStretch`); None:
+            immediately.
+        velocity_fade: time constant with which it fades again, s; None: never.
+        with_attitude: 1 if the attitude leans consistently with the velocity, as with an estimator that corrects both
+            by the same flow. The drone's motion is then taken as logged, and only the position moves less than the
+            velocity. None: the attitude is right and only the velocity is wrong.
         gyro_lag: lag of the gyro column, s.
-        gyro_scale: logged body rate over true body rate.
-        motor_shift: how late command and rotor-speed columns are against all others, s (negative: early).
+        gyro_scale: logged over true body rate.
+        motor_shift: delay of the command and rotor-speed columns relative to all others, s (negative: early).
     """
 
     delay: float = 0.0
@@ -80,26 +82,29 @@ class SensorFaults:
 
     @property
     def healthy(self) -> bool:
-        """Whether there is nothing to take out."""
+        """Whether there are no faults."""
         return self == SensorFaults()
 
     @property
     def stretch(self) -> VelocityStretch:
-        """What is done to the velocity along the world's axes."""
+        """Stretch of the velocity column along the world axes."""
         vertical = self.velocity_scale if self.vertical_scale is None else self.vertical_scale
         scale = np.array([self.velocity_scale, self.velocity_scale, vertical])
         return VelocityStretch(scale, self.velocity_rise or 0.0, self.velocity_fade)
 
     @property
     def as_logged(self) -> SensorFaults:
-        """What is left where columns are taken as they were logged: a stretch of the velocity, the attitude with it."""
+        """Faults that remain if columns are used as logged: a stretch of the velocity, with a consistent attitude."""
         if self.stretch.none:
             return SensorFaults()
         return replace(self, delay=0.0, gyro_lag=0.0, gyro_scale=1.0, motor_shift=0.0, with_attitude=1.0)
 
     def unstretched(self, log: FlightLog) -> FlightLog:
-        """The log with velocity and position in step, which needs no later row: the stretch taken out of the velocity,
-        or, where the attitude leans along, put into the position."""
+        """Make velocity and position of a log consistent, using no later rows.
+
+        The stretch is removed from the velocity or, if the attitude leans consistently with it, applied to the
+        position.
+        """
         stretch = self.stretch
         if stretch.none:
             return log
@@ -110,8 +115,17 @@ class SensorFaults:
     def stretched(
         self, began: tuple[np.ndarray, np.ndarray], step: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse of `unstretched`, of positions and velocities (W, H, 3) after steps (H,), s, from how they
-        `began`."""
+        """Inverse of `unstretched` for predictions.
+
+        Args:
+            began: velocities and estimator memories at the windows' starts, from `began`.
+            step: (H,) time steps, s.
+            position: (W, H, 3) m.
+            velocity: (W, H, 3) m/s.
+
+        Returns:
+            Positions and velocities as this chain records them.
+        """
         first, memory = began
         velocity = np.concatenate([first[:, None], velocity], axis=1)
         if self.with_attitude is None:
@@ -120,7 +134,10 @@ class SensorFaults:
         return self.stretch.left(position, carried), velocity[:, 1:]
 
     def repaired(self, log: FlightLog) -> FlightLog:
-        """The log a healthy chain would have recorded; rows whose replacements lie in a gap or beyond the end go."""
+        """The log that a healthy chain would have recorded.
+
+        Rows whose replacements lie in a gap or beyond the ends of the log are removed.
+        """
         if self.healthy:
             return log
         log = self.unstretched(log)
@@ -140,7 +157,7 @@ class SensorFaults:
         if self.gyro_scale != 1.0:
             changes["body_rate"] = changes.get("body_rate", log.body_rate) / self.gyro_scale
         if self.motor_shift:
-            # Between rows a mean of the two commands, in the share of the interval each would hold.
+            # A command between rows is the mean of both, weighted by the share of the interval each would be held.
             changes["command"] = later(log.command, self.motor_shift)
             if log.rotor_speed is not None:
                 changes["rotor_speed"] = later(log.rotor_speed, self.motor_shift)
@@ -152,13 +169,13 @@ class SensorFaults:
         return log.replace(**changes).rows(keep)
 
     def reached(self, horizons: tuple[float, ...]) -> tuple[float, ...]:
-        """Ascending times after a window's start at which a prediction is needed to say what is recorded later."""
+        """Ascending times after a window's start at which predictions are needed for `as_recorded`, s."""
         between = () if self.stretch.constant else np.arange(STRETCH_STEP, max(horizons), STRETCH_STEP)
         lags = (0.0, self.delay, self.gyro_lag)
         return tuple(sorted({self._instant(h, lag) for h in (*horizons, *between) for lag in lags}))
 
     def began(self, log: FlightLog, windows: Windows, delay: float) -> tuple[np.ndarray, np.ndarray]:
-        """What `as_recorded` must know of the windows' starts: velocities (W, 3) and what their estimator carries.
+        """Velocities (W, 3) and estimator memories (W, 2, 3) at the windows' starts, for `as_recorded`.
 
         Args:
             log: as recorded.
@@ -170,7 +187,13 @@ class SensorFaults:
         return windows.velocity, memory.reshape(len(windows), 2, 3)
 
     def as_recorded(self, predicted: State, horizons: tuple[float, ...], began: tuple[np.ndarray, np.ndarray]) -> State:
-        """What this chain records at the horizons, from predictions (W, H) at `reached` times and how they `began`."""
+        """Apply the faults to predictions: the states (W, H, ...) that this chain records at the horizons.
+
+        Args:
+            predicted: states at the times of `reached`.
+            horizons: prediction horizons, s.
+            began: velocities and estimator memories at the windows' starts, from `began`.
+        """
         if self.healthy:
             return predicted
         times = self.reached(horizons)
@@ -191,7 +214,7 @@ class SensorFaults:
         return round(max(horizon - lag, 0.001), 9)
 
     def to_mappings(self) -> list[dict]:
-        """As listed among the effects of a model file."""
+        """The faults as listed among the effects of a model file."""
         found = []
         for name, fault in SENSOR_FAULTS.items():
             values = {key: getattr(self, attribute) for key, attribute in ATTRIBUTES[name].items()}
@@ -202,13 +225,17 @@ class SensorFaults:
 
     @classmethod
     def from_mappings(cls, items: Iterable[Mapping], where: str) -> SensorFaults:
-        """The faults among the effects of a model file.
+        """Read the faults among the effects of a model file.
+
+        Args:
+            items: effects of the file.
+            where: name of the file, for messages.
 
         Raises:
-            CfbError: a fault without its number, with something else, or with what cannot be; ``where`` is the file.
+            CfbError: a fault lacks its parameter, has an unknown one, or a value is impossible.
 
         Warns:
-            CfbWarning: unusual numbers.
+            CfbWarning: a value is unusual.
         """
         found = {}
         for item in items:
@@ -227,8 +254,8 @@ class SensorFaults:
                     or not math.isfinite(value)
                 ):
                     raise CfbError(
-                        f"{where}: effects.{name}.parameters.{key} = {value!r} must be a number that makes sense"
-                        f" ({name} has {' and '.join(known)})."
+                        f"{where}: effects.{name}.parameters.{key} = {value!r} is not valid; {name} has"
+                        f" {' and '.join(known)}, each of which must be a finite number."
                     )
                 unit = "1" if "scale" in known[key] or key == "with_attitude" else "s"
                 LIMITS[known[key]].check(value, f"{where}: effects.{name}.parameters.{key}", unit, warn=True)

@@ -1,8 +1,8 @@
-"""Whether a velocity column is stretched at all frequencies or in a band of them, told by the slope of its position.
+"""Fit of the frequency band in which a velocity column is stretched, by comparison with the derivative of the position.
 
-A constant scale is what close-loop looks for. Where it is found, an estimator that follows a stretched flow slowly, and
-is pulled back by its position, stretches only what lies between (`VelocityStretch`); this fits that band, and takes it
-only if flights it was not fitted to bear it out.
+The sensor check finds a constant scale. An estimator that follows a stretched flow slowly, and is pulled back by its
+position, stretches only a band of frequencies (`VelocityStretch`). The band is fitted if a scale was found, and
+accepted only if flights to which it was not fitted confirm it.
 """
 
 from __future__ import annotations
@@ -20,21 +20,29 @@ from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.velocity_stretch import lag_weights
 
 SLOW = 4.0
-"""Hz; the slope of a position shows no faster motion."""
+"""Highest frequency of the comparison, Hz; the derivative of the position is too noisy for faster motion."""
 MARGIN = 2.0
-"""Beside the ends of a flight and of its gaps, s: there the filters say nothing."""
+"""Margin at the ends of a flight and of its gaps, s, where the filters are not valid."""
 LEAST_FLIGHTS = 3
-"""Each in turn is judged by a fit to the others."""
+"""Smallest number of flights; each in turn is judged by a fit to the others."""
 BETTER, SURE = 0.1, 3.0
-"""Share of the error's variance that the band must take off where it was not fitted, and standard deviations of it."""
+"""Share of the error's variance that the band must remove in flights to which it was not fitted, and the significance
+of this share in standard deviations."""
 LOW, HIGH = (-0.5, 0.01, 0.05), (0.5, 2.0, 60.0)
 START = (0.1, 0.3, 0.8)
-"""Share of the logged velocity, rise and fade, s: bounds, and where the search begins."""
+"""Bounds and initial values of the share of the logged velocity, of rise, s, and of fade, s."""
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """One flight on an even grid: horizontal velocity as logged and, where it counts, what it has over the slope."""
+    """One flight on an even grid.
+
+    Attributes:
+        step: of the grid, s.
+        velocity: (n, 2) horizontal velocity as logged, m/s.
+        over: (n, 2) logged velocity minus the derivative of the position, low-passed, m/s.
+        counts: (n,) rows that are compared.
+    """
 
     step: float
     velocity: np.ndarray
@@ -42,13 +50,13 @@ class _Seen:
     counts: np.ndarray
 
     def missed(self, numbers: Sequence[float] | np.ndarray) -> np.ndarray:
-        """Left of ``over`` by a band (share, rise, fade)."""
+        """Part of ``over`` that a band (share, rise, fade) does not explain."""
         share, rise, fade = numbers
         slow = _lagged(self.velocity, self.step, rise)
         return self._left(share * (slow - _lagged(slow, self.step, fade)))
 
     def missed_by_scale(self, share: float) -> np.ndarray:
-        """Left of it where all motion is stretched alike."""
+        """Part of ``over`` that a constant scale does not explain."""
         return self._left(share * self.velocity)
 
     def _left(self, stretch: np.ndarray) -> np.ndarray:
@@ -56,10 +64,10 @@ class _Seen:
 
 
 def with_band(faults: SensorFaults, logs: Sequence[FlightLog]) -> SensorFaults:
-    """The same faults, a horizontal scale of the velocity replaced by a band where that is clearly what it is.
+    """Replace a constant horizontal scale of the velocity by a band if that is clearly better.
 
     Args:
-        faults: as sensors compared with each other tell (`check_sensors`).
+        faults: from the comparison of the sensors (`check_sensors`).
         logs: the flights, as recorded.
     """
     if faults.velocity_scale == 1.0:
@@ -81,14 +89,13 @@ def with_band(faults: SensorFaults, logs: Sequence[FlightLog]) -> SensorFaults:
 
 
 def explained(faults: SensorFaults, log: FlightLog) -> float:
-    """Share of the variance of what a horizontal velocity has over the slope of its position, below `SLOW`, that some
-    faults take out of it."""
+    """Share of the variance of velocity minus position derivative, horizontal and below `SLOW`, that faults explain."""
     before, after = _seen(log), _seen(faults.unstretched(log))
     return float(1 - np.mean(after.over[after.counts] ** 2) / np.mean(before.over[before.counts] ** 2))
 
 
 def _gain(others: list[_Seen], judged: _Seen) -> float:
-    """By which share a band leaves less of a flight than a scale, both fitted to other flights."""
+    """Share by which a band leaves less residual variance of a flight than a scale, both fitted to other flights."""
     along = [_slow(one.velocity, one.step)[one.counts].ravel() for one in others]
     over = [one.missed_by_scale(0.0) for one in others]
     share = float(sum(x @ y for x, y in zip(along, over, strict=True)) / sum(x @ x for x in along))

@@ -1,4 +1,4 @@
-"""A velocity column that is too large: what its estimator did to a velocity, undone and done again."""
+"""Model of a stretched velocity column, with its inverse: true to logged velocity and back."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 
 LOOK, NOISE = 0.5, 0.015
-"""Over so many seconds a position is held beside a velocity, and so far it errs meanwhile, m."""
+"""Time over which position and velocity are compared, s, and error of the position over that time, m."""
 BETWEEN, MOST = 0.1, 0.5
-"""Standard deviation between flights of the share that was never flown, and the most it may be."""
+"""Standard deviation between flights of the excess share of the velocity, and its largest value."""
 
 
 @dataclass(frozen=True)
 class VelocityStretch:
-    """Logged velocity over true velocity, of motion of any frequency or of a band of it.
+    """Stretch of the logged velocity, at all frequencies or in a band.
 
-    An estimator whose velocity follows a stretched flow only slowly, and is in the end pulled back by what its position
-    is corrected with, stretches neither quick nor slow motion: of the logged velocity v the share 1 - 1 / scale,
-    lagged by ``rise`` and less the same lagged by ``fade`` once more, was never flown.
+    An estimator whose velocity follows a stretched flow slowly, and is eventually pulled back by corrections of the
+    position, stretches neither fast nor slow motion. The excess in the logged velocity v is the share 1 - 1 / scale of
+    v, low-passed with time constant ``rise``, minus the same low-passed again with time constant ``fade``.
 
     Attributes:
-        scale: (3,) along the world's axes, where it is largest; or such of every row or window.
-        rise: s; 0: at once.
-        fade: s; None: never.
+        scale: (3,) logged over true velocity along the world axes, at its maximum; or one such row per row or window.
+        rise: time constant, s; 0: immediate.
+        fade: time constant, s; None: it never fades.
     """
 
     scale: np.ndarray
@@ -32,41 +32,52 @@ class VelocityStretch:
 
     @property
     def none(self) -> bool:
-        """Whether velocity is logged as it was."""
+        """Whether there is no stretch."""
         return bool((self.scale == 1.0).all())
 
     @property
     def constant(self) -> bool:
-        """Whether all motion is stretched alike, so that no row needs another."""
+        """Whether the stretch is the same at all frequencies, so that it has no memory."""
         return self.none or (self.rise == 0.0 and self.fade is None)
 
     def memory(self, time: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """What the estimator carries at every row, (N, 2, 3), from times (N,) and logged velocities (N, 3); its
-        history before the first row was like that row."""
+        """States (N, 2, 3) of the two low-pass filters at every row, starting in steady state at the first row.
+
+        Args:
+            time: (N,) s.
+            velocity: (N, 3) as logged, m/s.
+        """
         if self.constant:
             return np.zeros((len(time), 2, 3))
         first = velocity[0], np.zeros(3) if self.fade is None else velocity[0]
         return self.carried(np.stack(first)[None], np.diff(time), velocity[None])[0]
 
     def undone(self, time: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """True velocities, (N, 3), of logged ones; every row rests on itself and earlier ones."""
+        """True velocities (N, 3) from logged ones, using no later rows.
+
+        Args:
+            time: (N,) s.
+            velocity: (N, 3) as logged, m/s.
+        """
         if self.constant:
             return velocity / self.scale
         slow, slower = np.moveaxis(self.memory(time, velocity), 1, 0)
         return velocity - self._share * (slow - slower)
 
     def done(self, memory: np.ndarray, step: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """What is logged, (W, H + 1, 3), of true velocities of the same shape that follow each other by steps (H,), s.
+        """Logged velocities (W, H + 1, 3) from true ones.
 
         Args:
-            memory: (W, 2, 3) at the first of them.
+            memory: (W, 2, 3) filter states at the first velocity.
+            step: (H,) time steps between the velocities, s.
+            velocity: (W, H + 1, 3) true velocities, m/s.
         """
         if self.constant:
             return velocity * self.scale
         slow, slower = memory[:, 0], memory[:, 1]
         logged = [velocity[:, 0] + self._share * (slow - slower)]
         for i, h in enumerate(step):
-            # Logged velocity depends on both lags at the end of the step, and they on it: three linear equations.
+            # The logged velocity and both filter states at the end of the step solve three linear equations.
             keep, last, now = lag_weights(h, self.rise)
             known = keep * slow + last * logged[-1]
             keep, last, share = (1.0, 0.0, 0.0) if self.fade is None else lag_weights(h, self.fade)
@@ -78,10 +89,12 @@ class VelocityStretch:
         return np.stack(logged, axis=1)
 
     def carried(self, memory: np.ndarray, step: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """`memory` along logged velocities (W, H + 1, 3) that follow each other by steps (H,), s: (W, H + 1, 2, 3).
+        """Filter states (W, H + 1, 2, 3) along logged velocities.
 
         Args:
-            memory: (W, 2, 3) at the first of them.
+            memory: (W, 2, 3) filter states at the first velocity.
+            step: (H,) time steps between the velocities, s.
+            velocity: (W, H + 1, 3) as logged, m/s.
         """
         found = [memory]
         for i, h in enumerate(step):
@@ -95,29 +108,35 @@ class VelocityStretch:
         return np.stack(found, axis=1)
 
     def followed(self, position: np.ndarray, memory: np.ndarray) -> np.ndarray:
-        """Positions (..., 3) that move as the logged velocity says; what the stretch adds to them is bounded by what
-        its lags hold (..., 2, 3), or grows with the position where it never fades."""
+        """Positions (..., 3) that are consistent with the logged velocity.
+
+        The stretch adds a bounded amount to the position, or an amount proportional to it if the stretch never fades.
+
+        Args:
+            position: (..., 3) m.
+            memory: (..., 2, 3) filter states.
+        """
         if self.fade is None:
             return self.scale * (position - self._share * self.rise * memory[..., 0, :])
         return position + self._share * self.fade * memory[..., 1, :]
 
     def left(self, followed: np.ndarray, memory: np.ndarray) -> np.ndarray:
-        """The inverse of `followed`."""
+        """Inverse of `followed`: positions (..., 3) from those consistent with the logged velocity."""
         if self.fade is None:
             return followed / self.scale + self._share * self.rise * memory[..., 0, :]
         return followed - self._share * self.fade * memory[..., 1, :]
 
     def learned(self, time: np.ndarray, velocity: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """Horizontal scale of this flight as it is known at every row, (N, 3), from that row and earlier ones.
+        """Estimate this flight's horizontal scale recursively; each row of the result (N, 3) uses no later rows.
 
-        Over `LOOK` seconds the position moves less than the velocity says, by the share that was never flown times what
-        the lags carried meanwhile. The scale of other flights is where it begins; how far flights differ and how well
-        a position tells are `BETWEEN` and `NOISE`.
+        Over `LOOK` seconds the position moves less than the integrated logged velocity, in proportion to the excess
+        share. The estimate starts at the present scale. The prior deviation between flights is `BETWEEN`, the noise of
+        the position is `NOISE`.
 
         Args:
             time: (N,) s.
-            velocity: (N, 3) as logged, world.
-            position: (N, 3) as logged.
+            velocity: (N, 3) as logged, world axes, m/s.
+            position: (N, 3) as logged, m.
         """
         steps = np.diff(time)[:, None]
 
@@ -130,7 +149,7 @@ class VelocityStretch:
         else:
             never = by_velocity - self.rise * memory[:, 0]
         before = np.searchsorted(time, time - LOOK - 1e-6)
-        # Windows overlap: each row adds what one of them says, in the share that is new.
+        # The time spans overlap, so each row adds only the share of information that is new.
         new = np.minimum(np.diff(time, prepend=time[0]) / LOOK, 1.0)[:, None] * (before > 0)[:, None] / NOISE**2
         x = -(never - never[before])[:, :2]
         y = (position - position[before] - by_velocity + by_velocity[before])[:, :2]
@@ -147,7 +166,14 @@ class VelocityStretch:
 
 
 def lag_weights(step: float, time: float) -> tuple[float, float, float]:
-    """What a lagged value takes over a step of itself, of its input before and of its input after (linear between)."""
+    """Weights of a first-order low-pass over a step: of its state, its input before, and its input after the step.
+
+    The input is linear in between.
+
+    Args:
+        step: s.
+        time: time constant, s.
+    """
     if time == 0.0:
         return 0.0, 0.0, 1.0
     keep = np.exp(-step / time)

@@ -1,4 +1,4 @@
-"""Prediction windows of a log: where they start, what goes in, what must come out (evaluation protocol, DESIGN 5)."""
+"""Prediction windows of a log: their starts, inputs and true values (protocol in ``docs/evaluation.md``)."""
 
 from __future__ import annotations
 
@@ -10,32 +10,41 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.resample import interpolate
 
 FIRST_START = 0.6
+"""Start of the first window, s of log time."""
 START_SPACING = 0.2
+"""Time between the starts of two windows, s."""
 REACH = 0.53
-"""A window starts while t0 + REACH lies inside the log, s."""
+"""A window may start at t0 if t0 + REACH lies inside the log, s."""
 ROOM = 0.03
-"""What `REACH` holds of the age of readings, s; as much as they are older a window must end earlier."""
+"""Age of readings that `REACH` allows for, s; if readings are older, the last windows start earlier by the excess."""
 GAP_BEFORE, GAP_AFTER = 0.3, 0.5
+"""A window is skipped if a gap begins within this time before or after its start, s."""
 COMMAND_TICK = 0.001
-"""A command takes effect at the first tick at or after its row: the firmware's main loop runs at 1 kHz, and time stamps
-are no finer than that. It matters for jittered time stamps only (up to 3 % of an error)."""
+"""A command takes effect at the first tick at or after its row, because the firmware's main loop runs at 1 kHz. This
+matters only for jittered time stamps (up to 3 % of an error)."""
 LONGEST_STEP = 0.0051
-"""Rows further apart are integrated in equal substeps of at most this, s."""
+"""Maximum integration step, s; longer intervals between rows are divided into equal substeps."""
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Everything a batch of predictions needs; W windows, S steps (the shorter windows end in steps of length 0).
+    """Inputs and true values of W predictions of S steps; short windows end in steps of length 0.
 
     Attributes:
         start: (W,) window starts t0, s of log time.
-        position, velocity, quaternion, body_rate: (W, 3 or 4) measured state at t0.
+        position: (W, 3) measured at t0, m.
+        velocity: (W, 3) measured at t0, m/s.
+        quaternion: (W, 4) measured at t0.
+        body_rate: (W, 3) measured at t0, rad/s.
         row: (W,) row at or before t0.
         step: (W, S) integration steps, s; they end at every row and every horizon.
         command: (W, S, 4) command held during each step.
-        rotor_speed: (W, S + 1, 4) measured rotor speed at the step boundaries, rad/s, NaN where not measured.
+        rotor_speed: (W, S + 1, 4) measured rotor speed at the step boundaries, rad/s; NaN where not measured.
         at: (W, H) index of the state (0 = initial) at each horizon.
-        true_position, true_velocity, true_quaternion, true_body_rate: (W, H, 3 or 4) what was measured there.
+        true_position: (W, H, 3) measured at each horizon, m.
+        true_velocity: (W, H, 3) measured at each horizon, m/s.
+        true_quaternion: (W, H, 4) measured at each horizon.
+        true_body_rate: (W, H, 3) measured at each horizon, rad/s.
     """
 
     start: np.ndarray
@@ -58,8 +67,15 @@ class Windows:
 
 
 def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float, gyro_delay: float) -> np.ndarray:
-    """Window starts the protocol allows: (W,) s of log time, possibly none."""
-    # Logs count from zero even when their first sample comes a little later; others are taken from their first row.
+    """Window starts (W,) that the protocol allows, s of log time; possibly none.
+
+    Args:
+        log: the flight.
+        horizons: prediction horizons, s.
+        delay: age of pose and velocity in a row, s.
+        gyro_delay: age of the gyro reading in a row, s.
+    """
+    # Log time counts from zero even if the first sample is a little later; other logs count from their first row.
     origin = 0.0 if 0 <= log.time[0] < START_SPACING else log.time[0]
     ages = (0.0, delay, gyro_delay)
     reach = REACH + max(0.0, max(ages) - ROOM)
@@ -70,7 +86,7 @@ def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float, gyro_
     instants = np.array([start + age for start in (0.0, *horizons) for age in ages])
     allowed = [
         not np.any((begin >= t0 - GAP_BEFORE) & (begin <= t0 + GAP_AFTER))
-        # The edges of a gap count as covered: a reading there would rest on rounding.
+        # The edges of a gap count as part of it; otherwise a reading there would depend on rounding.
         and not np.any((begin[:, None] < t0 + instants + 1e-6) & (t0 + instants - 1e-6 < end[:, None]))
         for t0 in starts
     ]
@@ -89,9 +105,9 @@ def find_windows(
     Args:
         log: the flight.
         horizons: prediction horizons, s, ascending.
-        delay: age of pose and velocity in a row, s; commands are taken as current.
-        gyro_delay: age of the gyro's reading in a row, s.
-        starts: window starts, s, in place of those of `find_starts`.
+        delay: age of pose and velocity in a row, s; commands are current.
+        gyro_delay: age of the gyro reading in a row, s.
+        starts: window starts, s; by default those of `find_starts`.
     """
     starts = find_starts(log, horizons, delay, gyro_delay) if starts is None else starts
     ticks = np.ceil(log.time / COMMAND_TICK - 1e-6) * COMMAND_TICK
@@ -127,14 +143,14 @@ def find_windows(
 
 
 def _plan(ticks: np.ndarray, t0: float, horizons: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Step boundaries from t0 to the last horizon, the row whose command holds in each step, horizon indices.
+    """Step boundaries from t0 to the last horizon, the row whose command holds in each step, and horizon indices.
 
-    ``ticks`` are the instants the commands of the rows take effect.
+    ``ticks`` are the instants at which the rows' commands take effect.
     """
     ends = t0 + np.asarray(horizons)
     inside = ticks[np.searchsorted(ticks, t0 + 1e-9, side="right") : np.searchsorted(ticks, ends[-1] - 1e-9)]
     marks = np.unique(np.concatenate([[t0], inside, ends]))
-    # Two marks that differ by rounding only are one.
+    # Merge marks that differ only by rounding.
     marks = marks[np.concatenate([[True], np.diff(marks) > 1e-9])]
     pieces = np.ceil(np.diff(marks) / LONGEST_STEP - 1e-9).astype(int)
     nth = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
@@ -151,7 +167,7 @@ def _unit(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _measured_rotor_speed(log: FlightLog, instants: np.ndarray) -> np.ndarray:
-    """Linear between rows; NaN where more than two rows in a row lack a valid reading."""
+    """Rotor speeds at instants, linear between valid readings; NaN outside them and in holes longer than a gap."""
     if log.rotor_speed is None:
         return np.full((*instants.shape, 4), np.nan)
     out = np.empty((*instants.shape, 4))

@@ -1,4 +1,4 @@
-"""Figures and pages. Importing this package loads numpy only; matplotlib is loaded by the function that draws."""
+"""Figures and pages. Importing this package loads numpy only; drawing functions load matplotlib when called."""
 
 from cfb_mjx.view.page import Section, html_page
 from cfb_mjx.view.prediction import prediction_figure

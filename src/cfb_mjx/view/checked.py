@@ -1,4 +1,4 @@
-"""What the signals of a flight say about each other, drawn: measured changes over what should add up to them."""
+"""Figure and page of `cfb check`: measured changes of signals, and the integrals that should equal them."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ from cfb_mjx.view.page import Section, html_page
 
 _HEADER = ("comparison", "slope", "lag, ms", "correlation", "unexplained", "verdict")
 _WORDS = {
-    "displacement": ("moved", "velocity added up", "m"),
-    "attitude": ("attitude turned", "gyro added up", "rad"),
-    "velocity": ("velocity changed", "accelerometer added up", "m/s"),
+    "displacement": ("change of position", "integrated velocity", "m"),
+    "attitude": ("change of attitude", "integrated gyro", "rad"),
+    "velocity": ("change of velocity", "integrated accelerometer", "m/s"),
 }
 
 
 def checked_figure(
     compared: Mapping[str, Comparison], relations: Sequence[Relation], path: str | os.PathLike, title: str = ""
 ) -> None:
-    """Draw the comparisons of `cfb check`, a row each, a column per axis.
+    """Draw the comparisons of `cfb check`: one row per comparison, one column per axis.
 
     Args:
-        compared: by ``displacement``, ``attitude``, ``velocity``.
-        relations: what was found of them; panels that contradict are marked.
+        compared: the comparisons ``displacement``, ``attitude`` and ``velocity``.
+        relations: their results; panels of contradicting signals are marked.
         path: file to write, ``.svg``, ``.png`` or ``.pdf``.
-        title: heading.
+        title: title of the figure.
 
     Raises:
-        CfbError: an unknown ending, or the file cannot be written.
+        CfbError: the ending of ``path`` is not supported, or the file cannot be written.
     """
     path = style.check_path(path)
     found = {(r.name, r.axis): r for r in relations}
@@ -46,7 +46,7 @@ def checked_figure(
         for row, (name, c) in zip(panels, compared.items(), strict=True):
             measured, integrated, unit = _WORDS[name]
             for axis, panel in enumerate(row):
-                # Windows overlap by half; a gap of the log shows as a step in time.
+                # Break the line at gaps of the log, which show as larger steps between windows.
                 gap = np.concatenate([[False], np.diff(c.time) > 3 * np.median(np.diff(c.time))])
                 for values, label, colour, width in (
                     (c.measured, measured, style.MEASURED, 1.2),
@@ -75,10 +75,10 @@ def checked_figure(
 
 
 def checked_page(recordings: Sequence[Recording], path: str | os.PathLike) -> None:
-    """Write a page on recordings: what is known of each, its comparisons as a table and a figure.
+    """Write a page with a summary of each recording, and its comparisons as a table and a figure.
 
     Args:
-        recordings: refused ones too.
+        recordings: the recordings, including refused ones.
         path: file to write, ``.html``.
 
     Raises:
@@ -86,8 +86,8 @@ def checked_page(recordings: Sequence[Recording], path: str | os.PathLike) -> No
     """
     refused = sum(one.refusal is not None for one in recordings)
     lead = (
-        f"{len(recordings)} recordings, {refused} refused. Each pair of signals that should be one another's "
-        "derivative is compared over short windows."
+        f"{len(recordings)} recordings, {refused} refused. Each signal is compared with the integral of its derivative "
+        "over short windows."
     )
     with scratch() as folder:
         sections = [_section(one, Path(folder) / f"{number}.png") for number, one in enumerate(recordings)]
@@ -100,13 +100,13 @@ def _section(one: Recording, figure: Path) -> Section:
         if compared := comparisons(one.log):
             checked_figure(compared, one.verdict.relations, figure)
             figures = [(figure, f"measured and integrated signals of {one.path.name}")]
-        caption = "What the signals say about each other; unexplained from 0.2 on contradicts."
+        caption = "Comparisons of signals; two signals contradict each other if 0.2 or more is unexplained."
         tables = [(caption, _HEADER, _rows(one.verdict))]
     return Section(one.path.name, said, tables, figures)
 
 
 def _rows(verdict: Verdict) -> list[list[str]]:
-    """Of the table: a comparison each, and the motors."""
+    """Rows of the table: one per comparison, and the motors."""
     rows = [
         [
             f"{r.name} {r.axis}".strip(),

@@ -1,4 +1,4 @@
-"""The report of a closed loop: one page a stranger reads in two minutes, and a recording to look closer."""
+"""Write the report of a model correction: an HTML page, and a rerun recording of the residuals."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ def write_report(
     logs_fit: list[FlightLog],
     logs_held_out: list[FlightLog],
 ) -> None:
-    """Write ``report.html``, which needs nothing beside it, and ``residual.rrd`` into a folder.
+    """Write ``report.html``, which is self-contained, and ``residual.rrd`` into a folder.
 
     Args:
-        diagnosis: of `cfb_mjx.sysid.tracing.closing.close_loop`.
-        folder: an existing folder; each file in it is replaced whole or not at all.
+        diagnosis: result of `cfb_mjx.sysid.tracing.closing.close_loop`.
+        folder: an existing folder; each file in it is replaced atomically.
         facts: date, machine and versions, printed at the end.
-        logs_fit: flights that were learned from, as read.
-        logs_held_out: flights that were not, as read.
+        logs_fit: the fit flights, as read.
+        logs_held_out: the held-out flights, as read.
 
     Raises:
         CfbError: a file cannot be written, or rerun is not installed.
@@ -38,6 +38,6 @@ def write_report(
     with scratch() as drawn:
         figures = draw(diagnosis, Path(drawn))
         found = sections(diagnosis, figures, logs_fit, logs_held_out)
-        page = html_page(f"Closing the loop on {diagnosis.base.name}", verdict(diagnosis), found, facts)
+        page = html_page(f"Model correction of {diagnosis.base.name}", verdict(diagnosis), found, facts)
     write_recording(folder / "residual.rrd", diagnosis.held_out.rows, diagnosis.before, diagnosis.after)
     write_text(folder / "report.html", page)

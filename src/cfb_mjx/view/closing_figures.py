@@ -1,4 +1,4 @@
-"""Figures of the report of a closed loop: which there are, and what each of them shows."""
+"""Figures of the report of a model correction."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cfb_mjx.view import style
 BEFORE, AFTER = style.COLOURS["rotor_speed_in"], style.COLOURS["commands_in"]
 RANDOM = "#009E73"
 FEW = 2000
-"""Values below which bins are wider: one value per window instead of one per row."""
+"""Number of values below which bins are wider, as for residuals with one value per window instead of one per row."""
 _TITLES = {"position": "position, m", "velocity": "velocity, m/s", "attitude": "attitude, deg", "rate": "rate, rad/s"}
 
 
@@ -29,9 +29,9 @@ def errors_figure(before, after, floor: dict[str, float], random: dict[str, floa
 
     Args:
         before: `Evaluation` of the declared model.
-        after: of the corrected one.
+        after: `Evaluation` of the corrected model.
         floor: `noise_floor` of the sensors alone.
-        random: of the sensors and random disturbances.
+        random: `noise_floor` of the sensors and random disturbances.
         path: file to write.
     """
     series = (
@@ -49,7 +49,7 @@ def errors_figure(before, after, floor: dict[str, float], random: dict[str, floa
             for order, (label, evaluation, variant, colour, marker) in enumerate(series):
                 values, spans = evaluation.metrics(variant), evaluation.intervals(variant)
                 middle, ends = np.array([values[k] for k in keys]), np.array([spans[k] for k in keys]).T
-                # Side by side, or equal errors would hide each other.
+                # Offset in x, because equal errors would cover each other.
                 panel.errorbar(
                     horizons * (1 + 0.035 * (order - 1)),
                     middle,
@@ -79,13 +79,13 @@ def errors_figure(before, after, floor: dict[str, float], random: dict[str, floa
 
 
 def squared(unit: str) -> str:
-    """A unit as printed: with raised exponents."""
+    """Format a unit with superscript exponents."""
     return unit.replace("^2", "²")
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One residual axis against one signal, of two models on the same flights."""
+    """One residual axis against one signal, for two models on the same flights."""
 
     axis: str
     signal: str
@@ -94,15 +94,15 @@ class Panel:
 
 
 def binned_figure(panels: Sequence[Panel], labels: tuple[str, str], path: Path) -> None:
-    """Means of residuals in bins of a signal, with 95 % intervals, before and after.
+    """Draw means of residuals in bins of a signal, with 95 % intervals, before and after.
 
     Args:
-        panels: what to draw, side by side.
-        labels: of the two models; one without a label is not drawn.
+        panels: the panels, from left to right.
+        labels: labels of the two models; a model without a label is not drawn.
         path: file to write.
     """
     with style.context():
-        # Single panels would be blown up to the width of the page.
+        # At least three columns, because a single panel would be enlarged to the width of the page.
         width = 4.5 * max(len(panels), 3)
         figure = style.new_figure(width, 3.6)
         axes = figure.subplots(1, max(len(panels), 3), squeeze=False)[0]
@@ -118,7 +118,7 @@ def binned_figure(panels: Sequence[Panel], labels: tuple[str, str], path: Path) 
 
 def _binned(drawn, panel: Panel, labels: tuple[str, str]) -> None:
     signal = panel.before.drivers[panel.signal]
-    # Evenly spaced, or a flight that mostly hovers would have all its bins in the middle.
+    # Evenly spaced, because with equal counts a flight that mostly hovers would have all bins near zero.
     count = 6 if len(signal) < FEW else 12
     low, high = np.nanquantile(signal, [0.005, 0.995])
     edges = np.linspace(low, high, count + 1)
@@ -148,11 +148,13 @@ def _binned(drawn, panel: Panel, labels: tuple[str, str]) -> None:
 
 
 def matrix_figure(before: Structure, after: Structure, path: Path) -> None:
-    """Share of each residual's mean square that follows each signal, before and after, both of the mean square before.
+    """Draw the share of each residual's mean square that each signal explains, before and after.
+
+    Both are relative to the mean square before.
 
     Args:
-        before: structure of the declared model's residuals; rows that were not measured are left out.
-        after: of the corrected model's.
+        before: structure of the declared model's residuals; residuals that were not measured are left out.
+        after: structure of the corrected model's residuals.
         path: file to write.
     """
     shown = [i for i, size in enumerate(before.rms) if np.isfinite(size)]
@@ -184,13 +186,13 @@ def matrix_figure(before: Structure, after: Structure, path: Path) -> None:
 def spectra_figure(
     before: dict[str, tuple], after: dict[str, tuple], noise: dict[str, np.ndarray], units: dict[str, str], path: Path
 ) -> None:
-    """Power spectral density of every residual axis.
+    """Draw the power spectral density of every residual axis.
 
     Args:
-        before: frequency (Hz) and density by axis.
-        after: the same of the corrected model.
-        noise: density the sensors' white noise would leave, at the same frequencies.
-        units: of the axes.
+        before: axis to frequency (Hz) and density, for the declared model.
+        after: the same for the corrected model.
+        noise: axis to the density of the sensors' white noise, at the same frequencies.
+        units: axis to its unit.
         path: file to write.
     """
     from matplotlib.ticker import NullFormatter
@@ -210,7 +212,7 @@ def spectra_figure(
                 panel.plot(frequency, noise[axis], "--", color=style.MEASURED, lw=1.1, label="sensor noise")
             panel.set_xscale("log")
             panel.set_yscale("log")
-            # Far below everything else the filter alone is seen.
+            # Limit the range, because far below the other values only the filter's response is visible.
             low = min(before[axis][1].min(), after[axis][1].min())
             high = max(before[axis][1].max(), after[axis][1].max())
             panel.set_ylim(0.3 * low, 3 * max(high, 30 * low))
@@ -233,13 +235,13 @@ def spectra_figure(
 
 
 def panels_of(terms: list[Term], before: Pooled, after: Pooled, most: int) -> list[Panel]:
-    """One panel for each of the first terms: its axis against its signal.
+    """One panel for each of the first terms of a formula: its axis against its signal.
 
     Args:
-        terms: of a formula; constants follow nothing and have no panel.
-        before: residuals without them.
-        after: with them.
-        most: panels.
+        terms: terms of the formula; constants have no signal and therefore no panel.
+        before: residuals without the terms.
+        after: residuals with the terms.
+        most: largest number of panels.
     """
     found = []
     for term in [term for term in terms if term.signal != "1"][:most]:
@@ -250,7 +252,7 @@ def panels_of(terms: list[Term], before: Pooled, after: Pooled, most: int) -> li
 
 
 def signal_of(name: str, drivers: dict[str, np.ndarray]) -> np.ndarray:
-    """A signal of the formulas' library (`cfb_mjx.model.effects.formula`), from the drivers of residuals (N,)."""
+    """A signal of the formulas' terms (`cfb_mjx.model.effects.formula`), from the drivers of residuals (N,)."""
     known = {f"v_{a}": drivers[f"velocity {a}"] for a in "xyz"} | {f"w_{a}": drivers[f"rate {a}"] for a in "xyz"}
     known |= {f"n_{key}": drivers[f"rotor {key}"] / HOVER_SPEED for key in ("roll", "pitch", "yaw")}
     known |= {"n": drivers["rotor mean"] / HOVER_SPEED - 1, "1": np.ones_like(drivers["time"])}
@@ -261,24 +263,26 @@ def signal_of(name: str, drivers: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def _axis(term: Term, pooled: Pooled) -> str:
-    """The residual axis of a term: for the world's vertical that of the body, which stands upright while it hovers."""
+    """The residual axis of a term. For the world's vertical, the body's z axis, which is vertical in hover."""
     name = term.axis.replace("_", " ")
     return name if name in pooled.axes else name.removeprefix("world ")
 
 
 PANELS = 3
-"""Of one figure at most."""
+"""Largest number of panels of one figure."""
 Figures = dict[str, list[tuple[Path, str]]]
 
 
 def draw(diagnosis: Diagnosis, folder: Path) -> Figures:
-    """Figures as files with alternative texts.
-
-    Under ``errors``, ``residuals``, ``left``, ``unexplained`` (the last two if there is anything) and `key_of` effects.
+    """Draw all figures of a report.
 
     Args:
-        diagnosis: of the closed loop.
-        folder: to write into.
+        diagnosis: result of the model correction.
+        folder: folder to write into.
+
+    Returns:
+        Files with alternative texts under ``errors``, ``residuals``, ``left`` and ``unexplained`` (the last two only if
+        there is something to show), and for each effect under `key_of`.
     """
     held_out = diagnosis.held_out
     figures: Figures = {"errors": [(folder / "errors.svg", "held-out error against horizon, before and after")]}
@@ -302,20 +306,20 @@ def draw(diagnosis: Diagnosis, folder: Path) -> Figures:
     figures["residuals"] += _spectra(held_out, folder / "spectra.svg")
     after = held_out.structure[1]
     left = [(after.axes[i], after.signals[j]) for i, j in after.strongest(PANELS)]
-    # A mean has no signal to be drawn against; over time it shows as well as over any other.
+    # A mean (offset) has no signal, so it is drawn over time.
     panels = [
         Panel(axis, name if name in held_out.pair(axis)[0].drivers else "time", *held_out.pair(axis))
         for axis, name in left
     ]
     if panels:
-        # Beside what was there before, little of it would be seen.
+        # Without the residuals before, whose scale would hide the remaining structure.
         binned_figure(panels, ("", "after"), folder / "left.svg")
         figures["left"] = [(folder / "left.svg", "the strongest structure left in the residuals")]
     return figures
 
 
 def key_of(name: str) -> str:
-    """Under which an effect's figures stand, whatever it is called."""
+    """Key of an effect's figures; the prefix keeps it different from the other keys."""
     return f"effect {name}"
 
 
@@ -332,16 +336,16 @@ def _spectra(held_out: HeldOut, path: Path) -> list[tuple[Path, str]]:
 
 
 def _effect(diagnosis: Diagnosis, item: Reported) -> tuple[list[Panel], tuple[str, str]]:
-    """Where an effect shows: residuals of all flights without and with it, against the signal it follows."""
+    """Panels of an effect: residuals of all flights without and with it, against the signals on which they depend."""
     without = diagnosis.without(item)
     if without is None:
-        # A fault of pose or gyro hardly touches forces and torques; it spoils predictions.
+        # A fault of pose or gyro affects predictions, but hardly forces and torques.
         return _panels(*diagnosis.held_out.predictions, PREDICTION_BINS), ("before", "after")
     return _panels(*diagnosis.residuals(without)), (f"best model without {item.name}", "corrected model")
 
 
 def _terms(diagnosis: Diagnosis) -> tuple[list[Panel], tuple[str, str]]:
-    """Panels of the terms of a formula: on all flights, or on those that alone show them."""
+    """Panels of the terms of a formula: on all flights, or on the held-out flights if only those show them."""
     left = diagnosis.unexplained
     if left is not None and left.proposal is not None:
         both = diagnosis.residuals(left.proposal.without)

@@ -1,4 +1,4 @@
-"""The closed loop as a rerun recording: held-out flights with their residuals and predictions, before and after."""
+"""Rerun recording of a model correction: held-out flights with residuals and predictions, before and after."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from cfb_mjx.view.closing_figures import AFTER, BEFORE
 from cfb_mjx.view.recorder import AXES, LIGHT, Plot, Recorder, Tab, part, recording
 
 RATE, ROWS = 40.0, 1500
-"""Rows per second kept, and rows of all flights together at most: residuals are smoothed, and the file stays small."""
+"""Largest number of rows per second, and of rows in all flights. Residuals are smoothed, so few rows suffice."""
 FLIGHTS = 6
-"""Flights recorded at most."""
+"""Largest number of flights in a recording."""
 
 
 def write_recording(
@@ -24,13 +24,13 @@ def write_recording(
     """Write a recording that `rerun` opens.
 
     For each flight, under its name: ``residual/<axis>/before|after``, ``signal/<name>``, and in 3D the measured pose
-    and path with the predictions of both models from every window's start.
+    and path with the predictions of both models from the start of every window.
 
     Args:
         path: file to write, ``.rrd``.
-        rows: residuals of the held-out flights before and after, row by row of the same time.
+        rows: residuals of the held-out flights before and after, at the same times.
         before: evaluation of the declared model on the same flights, in the same order.
-        after: of the corrected model.
+        after: evaluation of the corrected model.
 
     Raises:
         CfbError: rerun is not installed or the file cannot be written.
@@ -48,9 +48,9 @@ def write_recording(
 
 
 def tab(log: FlightLog, root: str, more: tuple[Plot, ...] = ()) -> Tab:
-    """A flight beside its residuals, velocities and ``more``."""
+    """A tab with the flight in 3D and plots of ``more``, its residuals and its velocity."""
     residuals = tuple(
-        Plot(f"the model misses: {what}", tuple(f"{root}/residual/{key}_{axis}/**" for axis in "xyz"))
+        Plot(f"residual: {what}", tuple(f"{root}/residual/{key}_{axis}/**" for axis in "xyz"))
         for key, what in (("torque", "torque / inertia"), ("force", "force / mass"))
     )
     velocity = Plot("velocity, body axes", tuple(f"{root}/signal/velocity_{axis}" for axis in "xyz"))
@@ -61,13 +61,13 @@ def tab(log: FlightLog, root: str, more: tuple[Plot, ...] = ()) -> Tab:
 def record_residuals(
     recorder: Recorder, root: str, residuals: dict[str, tuple[Residuals, str | None]], rate: float
 ) -> None:
-    """Residuals of one flight, and the signals that could drive them.
+    """Record the residuals of one flight, and the signals on which they could depend.
 
     Args:
-        recorder: of the recording.
+        recorder: the open recording.
         root: entity of the flight.
-        residuals: by label, of the same rows, with a colour each; None: the colour of the axis.
-        rate: rows per second kept.
+        residuals: label to residuals (of the same rows) and colour; None: the colour of the axis.
+        rate: rows per second to keep.
     """
     first = next(iter(residuals.values()))[0]
     step = max(1, round(1 / (rate * float(np.median(np.diff(first.time))))))
@@ -89,19 +89,19 @@ def record_residuals(
 def record_flight(
     recorder: Recorder, root: str, evaluated: LogEvaluation, rate: float, thrust: np.ndarray | None = None
 ) -> None:
-    """The measured way and pose, and thrust (n, 4) [N] of every row of the log where that is known."""
+    """Record the measured path and pose, and the thrust (n, 4) [N] of every row of the log, if given."""
     log, world = evaluated.log, f"{root}/world"
     step = max(1, round(1 / (rate * max(log.nominal_interval, 1e-4))))
     recorder.world(world)
     recorder.line(f"{world}/measured_path", log.position[::step], LIGHT)
-    # Pose rows are late by the delay; the recording shows them when they were true.
+    # Pose rows lag by the delay; the recording shows them at the time at which they were true.
     time = log.time[::step] - evaluated.delay
     arrows = None if thrust is None else thrust[::step]
     recorder.drone(f"{world}/drone", time, log.position[::step], log.quaternion[::step], arrows)
 
 
 def record_predictions(recorder: Recorder, entity: str, evaluated: LogEvaluation, colour: str) -> None:
-    """From every window's start, where the model thinks the drone goes."""
+    """Record the predicted path from the start of every window."""
     said, windows = evaluated.predictions["commands_in"], evaluated.windows
     if said is not None:
         strips = np.concatenate([windows.position[:, None], np.asarray(said.position)], axis=1)
@@ -109,5 +109,5 @@ def record_predictions(recorder: Recorder, entity: str, evaluated: LogEvaluation
 
 
 def _plain(name: str) -> str:
-    """A name as part of an entity's path."""
+    """A name as one part of an entity's path, without blanks."""
     return name.replace(" ", "_")

@@ -1,4 +1,4 @@
-"""The sections of the report of a closed loop: what was found, what is left, what to fly next."""
+"""Sections of the report of a model correction: the effects found, the remaining error, and the next flights."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ UNIT = {"m": "m", "mps": "m/s", "deg": "deg", "radps": "rad/s"}
 def sections(
     diagnosis: Diagnosis, figures: Figures, logs_fit: list[FlightLog], logs_held_out: list[FlightLog]
 ) -> list[Section]:
-    """All of them, in the order they are read."""
+    """All sections, in the order of the report."""
     found = [_short(logs_fit, logs_held_out), _missing(diagnosis, figures), _errors(figures)]
     if diagnosis.unexplained is not None:
         found.append(_unexplained(diagnosis.unexplained, figures))
@@ -59,24 +59,25 @@ def _short(logs_fit: list[FlightLog], logs_held_out: list[FlightLog]) -> Section
     low, high = min(log.position[:, 2].min() for log in logs), max(log.position[:, 2].max() for log in logs)
     rows = np.median([1 / log.nominal_interval for log in logs])
     text = (
-        f"{len(logs_fit)} flights to learn from ({seconds[0]:.0f} s) and {len(logs_held_out)} to be judged on "
-        f"({seconds[1]:.0f} s), {rows:.0f} rows per second; up to {speed:.1f} m/s and {turn:.1f} rad/s, {low:.2f} to "
-        f"{high:.2f} m high. Rotor speed was measured in {_how_many(logs, 'rotor_speed')} of them, the battery's "
+        f"{len(logs_fit)} fit flights ({seconds[0]:.0f} s) and {len(logs_held_out)} held-out flights "
+        f"({seconds[1]:.0f} s), {rows:.0f} rows per second; up to {speed:.1f} m/s and {turn:.1f} rad/s, at heights of "
+        f"{low:.2f} to {high:.2f} m. Rotor speed was measured in {_how_many(logs, 'rotor_speed')} of them, the battery "
         f"voltage in {_how_many(logs, 'battery_voltage')}. Each flight is listed below."
     )
     return Section("What was measured", [text])
 
 
 TOGETHER = (
-    "No single effect made predictions better than holding velocity and body rate, so all that a drone usually lacks "
-    "was fitted together, what only some drones have was tried beside it, and what did not earn its place was taken "
-    "out again. Motors come from commands and measured rotor speeds; everything else from predictions, commands in and "
-    "rotor speeds in. How much an error grows without an effect: the others have moved to make up for it. Standard "
-    "deviations come from the scatter between stretches of flight; what the model declares, its mass above all, is "
-    "taken as exact. No flight tells more mass from less thrust: where thrust_scale is fitted, payload is not looked "
-    "for; where it is declared, one per cent of thrust is one per cent of the drone's weight in a load. Predictions "
-    "under a controller ask for too much inertia and damping. Accelerations, from row to row, do not, and where the "
-    "two contradict each other a number stands in for something else."
+    "No single effect made predictions better than holding velocity and body rate. Therefore all effects that most "
+    "drones have were fitted together, effects that only some drones have were tried in addition, and effects that did "
+    "not improve the model enough were removed again. Motors were fitted to commands and measured rotor speeds, "
+    "everything else to predictions, commands in and rotor speeds in. The growth of an error without an effect is "
+    "measured after the other effects were fitted again. Standard deviations come from the scatter between stretches "
+    "of flight; declared constants, above all the mass, are taken as exact. Flights cannot distinguish more mass from "
+    "less thrust: if thrust_scale is fitted, payload is not searched for; if it is declared, an error of one per cent "
+    "in it changes a load by one per cent of the drone's weight. Predictions of flights under feedback overestimate "
+    "inertia and damping. Accelerations, computed from row to row, do not; where the two contradict each other, the "
+    "number compensates for something else."
 )
 
 
@@ -108,15 +109,15 @@ def _missing(diagnosis: Diagnosis, figures: Figures) -> Section:
     shown = [figure for item in diagnosis.reported for figure in figures.get(key_of(item.name), [])]
     if shown:
         paragraphs.append(
-            "Figures, one row each: mean residual (measured minus modelled) in bins of the signal it follows, with "
-            "95 % intervals; zero is a perfect model. Effects: force, torque or rotor speed in all flights. Faults of "
-            "the recording: predictions of the held-out flights 0.2 s ahead."
+            "Figures, one row each: mean residual (measured minus modelled) in bins of the signal on which it depends, "
+            "with 95 % intervals; a perfect model gives zero. Effects: force, torque or rotor speed in all flights. "
+            "Faults of the recording: predictions of the held-out flights 0.2 s ahead."
         )
     return Section("What was found", paragraphs, [(caption, head, rows)], shown)
 
 
 def _held(diagnosis: Diagnosis) -> str:
-    """Which declared effects a fit of all at once left as they were, or within what drones of the type differ."""
+    """Sentences on the declared effects in a joint fit: unchanged, changed within the spread of the type, removed."""
     judged = {item.name for item in (*diagnosis.reported, *diagnosis.unconfirmed)}
     together = not_none(diagnosis.together)
     present, typical = set(diagnosis.hypothesis.present), together.typical
@@ -125,25 +126,27 @@ def _held(diagnosis: Diagnosis) -> str:
     fit = together.fit
     edge = [n.name for n in fit.numbers if n.effect in moved and fit.at_bound(n)]
     text = f" Held as the model declares them: {', '.join(held)}." if held else ""
-    text += f" Moved within the spread of the type: {', '.join(moved)}." if moved else ""
-    text += f" At the edge of it, so that this drone is unlike the type: {', '.join(edge)}." if edge else ""
+    text += f" Changed within the spread of the type: {', '.join(moved)}." if moved else ""
+    text += f" At the edge of the spread, so this drone differs from its type: {', '.join(edge)}." if edge else ""
     gone = diagnosis.dropped
     motors = " (the motors' constants were fitted anew)" if diagnosis.motors else ""
-    return text + (f" Declared by the model, but nothing asks for it{motors}: {', '.join(gone)}." if gone else "")
+    return text + (
+        f" Declared by the model, but not supported by the flights{motors}: {', '.join(gone)}." if gone else ""
+    )
 
 
 def _sentence(item: Reported, which: str = "one") -> str:
     text = f"{item.name}: {meaning(item.name)}; {strength(item)}."
     if is_fault(item.name):
-        text += " A fault of the recording, not of the drone: it is taken out before the physics is judged."
+        text += " A fault of the recording, not of the drone: it is removed before the physics is examined."
     elif documented(item.name) not in ("", meaning(item.name)):
         text += f" In the model: {documented(item.name)}."
     if item.found is not None:
-        text += f" Without it {which} prediction error of the fit flights grows by {_grows(item.found.buys)}."
+        text += f" Without it, {which} prediction error of the fit flights grows by {_grows(item.found.buys)}."
         text += _where(item)
         if item.asked:
             told = (f"{a.name} {with_error(a.value, a.std)}{' (a contradiction)' * a.contradicts}" for a in item.asked)
-            text += f" Accelerations alone ask for {', '.join(told)}."
+            text += f" Accelerations alone give {', '.join(told)}."
         if item.found.confusable:
             names = ", ".join([item.name, *item.found.confusable])
             text += f" These flights cannot tell which of this set it is: {names}."
@@ -158,12 +161,12 @@ DOMAINS = {
 
 
 def _where(item: Reported) -> str:
-    """In which domains the evidence of the held-out flights lies, those of a tenth of it and more."""
+    """Sentence on the domains with the evidence of the held-out flights, those with at least a tenth of it."""
     domains = {} if item.verdict is None else item.verdict.domains or {}
     if not domains:
         return ""
     if sum(domains.values()) <= 0:
-        return " Row by row the held-out flights are explained no better with it: only predictions ask for it."
+        return " It does not explain the rows of the held-out flights better; only predictions improve with it."
     gains = {name: gain for name, gain in domains.items() if gain > 0}
     shares = {name: gain / sum(gains.values()) for name, gain in gains.items()}
     named = [f"{DOMAINS[n]} ({100 * s:.0f} %)" for n, s in sorted(shares.items(), key=lambda p: -p[1]) if s >= 0.1]
@@ -171,18 +174,19 @@ def _where(item: Reported) -> str:
 
 
 def _grows(buys: float) -> str:
-    """A share of the error without an effect, as growth of the error with it."""
+    """Growth of the error with an effect, from the share of the error without it that the effect removes."""
     growth = 1 / max(1 - buys, 1e-9) - 1
     return f"{100 * growth:.0f} %" if growth < 2 else f"a factor of {1 + growth:.1f}"
 
 
 def _errors(figures: Figures) -> Section:
     text = (
-        "Open-loop predictions of flights nothing was fitted to, commands in. Bars are 95 % bootstrap intervals over "
-        "windows. Hold: constant velocity and body rate. Noise floor (dashed): what a perfect model would score, "
-        "because its start and the truth are measured; white noise of each column carried forward to first order "
-        "(gyro noise times horizon adds to attitude, a wrong attitude tilts the thrust, and so on). Dotted: the same "
-        "with forces and torques that wander at random, as large and as fast as the residuals left on these flights."
+        "Open-loop predictions of held-out flights, commands in. Bars are 95 % bootstrap intervals over windows. Hold: "
+        "constant velocity and body rate. Noise floor (dashed): the error of a perfect model, which is not zero "
+        "because the initial state and the reference are measured. It is the white noise of each column, propagated to "
+        "first order (gyro noise times horizon adds to attitude, a wrong attitude tilts the thrust, and so on). "
+        "Dotted: the same with random disturbance forces and torques, as large and as fast as the residuals that "
+        "remain on these flights."
     )
     return Section("Error on held-out flights", [text], figures=figures["errors"])
 
@@ -228,7 +232,7 @@ def _speed_in(before: dict, after: dict) -> Table:
         quantity, _, unit = key.partition("@")[0].split("_")
         cells = [f"{before[key]:.3g}", f"{after[key]:.3g}", change(before[key], after[key])]
         rows.append([f"{quantity}, {UNIT[unit]}", f"{1e3 * float(key.partition('@')[2][:-1]):.0f} ms", *cells])
-    caption = "The same with measured rotor speed in instead of commands: motors and their controllers play no part"
+    caption = "The same with measured rotor speeds instead of commands: motors and their controllers have no influence"
     return caption, ["error of", "ahead", "before", "after", "change"], rows
 
 
@@ -236,13 +240,14 @@ def _unexplained(found: Unexplained, figures: Figures) -> Section:
     texts = ["A structured residual remains that no effect of the catalogue accounts for."]
     if found.proposal is not None:
         texts[0] += (
-            " Terms that describe it were fitted blindly and are part of the corrected model: a description of the "
-            "data, not physics."
+            " Terms that describe it were fitted without a physical model and are part of the corrected model. They "
+            "describe the data; they are not physics."
         )
     if found.held_out_only:
         texts[0] += (
-            " Only the held-out flights show it: they do what the others hardly did. Terms that describe it were "
-            "fitted to them, so nothing is left to judge these by, and they are no part of the corrected model."
+            " Only the held-out flights show it, because they contain motion that the fit flights hardly contain. The "
+            "terms that describe it were fitted to the held-out flights, so they cannot be validated and are not part "
+            "of the corrected model."
         )
     rows = [[text] for text in found.formulas]
     tables = [("Terms", ["term"], rows)] if rows else []
@@ -251,12 +256,13 @@ def _unexplained(found: Unexplained, figures: Figures) -> Section:
 
 def _residuals(held_out: HeldOut, figures: Figures) -> Section:
     paragraphs = [
-        "Residuals of the held-out flights are measured minus modelled, given where the drone really was: torque (as "
-        "angular acceleration, from the gyro), force (specific force, from the accelerometer; body axes), rotor speed "
-        "(where measured) and the prediction 0.2 s ahead. Both sides pass through one zero-phase Gaussian of 20 ms.",
-        "First figure: how much of each residual's mean square a signal explains on stretches left out, in % of the "
-        "mean square before; blanks are below 3 %. Offset: its mean. A column that stays dark on the right is "
-        "something not accounted for. Second figure: spectra, with what white noise of the sensors leaves.",
+        "Residuals of the held-out flights are measured minus modelled, given the measured state: torque (as angular "
+        "acceleration, from the gyro), force (specific force, from the accelerometer; body axes), rotor speed (where "
+        "measured) and the prediction 0.2 s ahead. Measured and modelled values pass through the same zero-phase "
+        "Gaussian filter of 20 ms.",
+        "First figure: share of each residual's mean square that a signal explains on stretches left out, in % of the "
+        "mean square before; blanks are below 3 %. Offset: its mean. A column that stays dark on the right shows "
+        "structure that the model does not explain. Second figure: spectra, with the sensors' white noise.",
     ]
     before, after = held_out.structure
     units = held_out.pooled[0].units | held_out.predictions[0].units
@@ -283,8 +289,11 @@ def _measured(diagnosis: Diagnosis, logs_fit: list[FlightLog], logs_held_out: li
         for name, (value, std) in diagnosis.trace.sensors.measured.items()
     ]
     delay = 1e3 * diagnosis.trace.search.delay
-    text = f"Pose and velocity rows are taken to be {delay:.0f} ms late, as declared; the rest is compared below."
-    sensors = ("Sensors compared with each other, no model involved", ["fault", "found"], looked)
+    text = (
+        f"Pose and velocity rows are assumed to be {delay:.0f} ms late, as declared. The other faults are estimated by "
+        "comparing the sensors."
+    )
+    sensors = ("Sensors compared with each other, without a model", ["fault", "found"], looked)
     return Section("Flights and sensors", [text], [("Flights", head, rows), sensors])
 
 
@@ -294,8 +303,9 @@ def _yes(column) -> str:
 
 def _refused(diagnosis: Diagnosis) -> Section:
     text = (
-        "Every effect of the catalogue was tried in every round, on blocks of the fit flights left out. To be reported "
-        "it must be significant there, lower a prediction error, and stand on the held-out flights."
+        "Every effect of the catalogue was tried in every round, on left-out blocks of the fit flights. To be "
+        "reported, an effect must be significant there, reduce a prediction error, and be confirmed on the held-out "
+        "flights."
     )
     head = ["effect", "gain, nats", "p", "why not"]
     caption = "Effects not reported, at their last try (gain in log-likelihood on blocks left out)"
@@ -320,11 +330,11 @@ def _per_log(diagnosis: Diagnosis) -> Section:
 
 
 UNSURE = 0.2
-"""Relative standard deviation above which more flights of an effect's kind are asked for."""
+"""Relative standard deviation above which more flights that excite an effect are suggested."""
 
 
 def what_is_left(diagnosis: Diagnosis) -> list[str]:
-    """Paragraphs on structure that remains, and on where the remaining error comes from."""
+    """Paragraphs on the structure that remains in the residuals, and on the sources of the remaining error."""
     after = diagnosis.held_out.structure[1]
     strongest = after.strongest(3)
     if strongest:
@@ -357,15 +367,15 @@ def _budget(diagnosis: Diagnosis) -> str:
         ):
             found.append(f"{quantity} {100 * min(1.0, floor**2 / errors[key] ** 2):.0f} %")
     return (
-        f"Where the remaining error comes from: of its square {horizon:g} s ahead, sensor noise makes "
-        f"{', '.join(sensors)}. Sensor noise together with forces and torques that wander as these residuals do makes "
-        f"{', '.join(wandering)}. What wanders without following a measured signal no model predicts; any structure "
-        "named above is part of it and could still be taken out."
+        f"Sources of the remaining error: sensor noise makes up these shares of its square, {horizon:g} s ahead: "
+        f"{', '.join(sensors)}. Sensor noise together with random forces and torques like these residuals makes up "
+        f"{', '.join(wandering)}. No model predicts disturbances that depend on no measured signal. Structure named "
+        "above is part of these disturbances and could still be modelled."
     )
 
 
 def next_flights(diagnosis: Diagnosis) -> list[str]:
-    """Flights that would tell what is not known well enough yet, each with its reason, the most useful first."""
+    """Suggested flights for what is not known well enough yet, each with its reason, the most useful first."""
     flights: dict[str, list[str]] = {}
 
     def fly(what: str, because: str) -> None:
@@ -378,7 +388,10 @@ def next_flights(diagnosis: Diagnosis) -> list[str]:
             fly(experiment(name), f"this shows {name}, and not {others}")
         command = separating([item.name, *rivals], "model.yaml") if rivals else None
         if command is not None:
-            fly(f"what `{command}` writes", f"it looks for the flight that tells {item.name} from {', '.join(rivals)}")
+            fly(
+                f"the trajectory that `{command}` writes",
+                f"it is chosen to distinguish {item.name} from {', '.join(rivals)}",
+            )
         main = max(numbers(item), key=lambda number: abs(number.value))
         if main.std > UNSURE * abs(main.value):
             share = 100 * main.std / max(abs(main.value), 1e-300)
@@ -388,7 +401,7 @@ def next_flights(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.unexplained is not None and diagnosis.unexplained.held_out_only:
         fly(
             "more flights like the held-out ones, some of them to fit to",
-            f"what they show is in no model yet: {diagnosis.unexplained.where}",
+            f"no model has the structure in them yet: {diagnosis.unexplained.where}",
         )
     after = diagnosis.held_out.structure[1]
     for i, j in after.strongest(3):
@@ -397,11 +410,11 @@ def next_flights(diagnosis: Diagnosis) -> list[str]:
     logs = [*diagnosis.trace.search.logs, *diagnosis.held_out.search.logs]
     for column, name, why in (
         ("rotor_speed", "rotor speed", "it separates the motors from the aerodynamics"),
-        ("battery_voltage", "the battery's voltage", "without it battery_sag cannot be seen"),
+        ("battery_voltage", "the battery's voltage", "without it battery_sag cannot be found"),
     ):
         lacking = sum(getattr(log, column) is None for log in logs)
         if lacking:
             fly(f"any flight with {name} logged, which {lacking} of {len(logs)} lack", why)
     if not flights:
-        return ["Flights unlike these: faster, lower, longer. What was not flown was not tested."]
+        return ["Different flights: faster, lower, longer. The model was tested only on motion that was flown."]
     return [f"{what[0].upper()}{what[1:]}. Why: {'; '.join(why)}." for what, why in flights.items()]

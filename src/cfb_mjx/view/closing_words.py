@@ -1,4 +1,4 @@
-"""What the report of a closed loop says in words: verdicts, numbers with units, and flights that would tell more."""
+"""Wording of the report of a model correction: verdict, numbers with units, and suggested experiments."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _COMPONENTS = {2: ("x", "y"), 3: ("x", "y", "z"), 4: ("M1", "M2", "M3", "M4")}
 
 
 def separating(names: list[str], model: str) -> str | None:
-    """The command that finds the flight to tell some effects apart; None where flying does not."""
+    """The command that finds a trajectory to distinguish effects; None if one of them is not in the catalogue."""
     if not set(names) <= set(CATALOGUE):
         return None
     plugged = "".join(f" --plugin {shlex.quote(str(file))}" for file in plugins.files())
@@ -37,50 +37,50 @@ def separating(names: list[str], model: str) -> str | None:
 
 
 def is_fault(name: str) -> bool:
-    """Whether a name is one of the recording's faults and not physics."""
+    """Whether a name is a fault of the recording, not a physical effect."""
     return name in SENSOR_FAULTS
 
 
 def meaning(name: str) -> str:
-    """What an effect or fault is, in half a sentence."""
+    """Short phrase that explains an effect or fault."""
     if is_fault(name):
         return SENSOR_FAULTS[name].meaning
     return KNOWN[name].meaning or documented(name) or name.replace("_", " ")
 
 
 def documented(name: str) -> str:
-    """The line that documents an effect: its docstring's first paragraph."""
+    """First paragraph of an effect's docstring, without the full stop."""
     return " ".join((KNOWN[name].__doc__ or "").split("\n\n")[0].split()).rstrip(".")
 
 
 def experiment(name: str) -> str:
-    """Flights that tell about an effect or fault."""
+    """Flights that excite an effect or fault, in words."""
     return (SENSOR_FAULTS if is_fault(name) else KNOWN)[name].experiment or f"flights that excite {name}"
 
 
 def unit_of(name: str, field: str) -> str:
-    """Unit of a parameter of an effect or fault; empty for plain ratios."""
+    """Unit of a parameter of an effect or fault; empty for dimensionless parameters."""
     unit = SENSOR_FAULTS[name].unit if is_fault(name) else KNOWN[name].units.get(field, "1")
     return "" if unit == "1" else unit.replace("^2", "²")
 
 
 @dataclass(frozen=True)
 class Number:
-    """One number of an effect as printed, in a unit that needs no exponent."""
+    """One number of an effect as printed, in a unit of suitable size."""
 
     label: str
     value: float
     std: float
     unit: str
     plausible: tuple[float, float] | None
-    """Range the catalogue calls plausible; None for faults of the recording."""
+    """Plausible range of the catalogue; None for faults of the recording."""
 
     def __str__(self) -> str:
         return with_error(self.value, self.std, self.unit)
 
 
 def numbers(item: Reported) -> list[Number]:
-    """Every number of an effect or fault."""
+    """All numbers of an effect or fault."""
     found = []
     prior = {} if is_fault(item.name) else KNOWN[item.name].prior
     for field, value in item.parameters.items():
@@ -97,13 +97,13 @@ def numbers(item: Reported) -> list[Number]:
 
 
 def readable(unit: str, size: float) -> tuple[float, str]:
-    """Factor and unit in which a small number reads well: ms, mm and g for what is far below s, m and kg."""
+    """Factor and unit for printing: ms, mm and g for values below half a s, m or kg."""
     smaller = {"s": "ms", "m": "mm", "kg": "g"}
     return (1e3, smaller[unit]) if unit in smaller and size < 0.5 else (1.0, unit)
 
 
 def with_error(value: float, std: float, unit: str = "") -> str:
-    """value ± std unit with as many digits as the deviation allows."""
+    """Format as ``value ± std unit``, with the number of digits that the standard deviation justifies."""
     unit = f" {unit}" if unit else ""
     if not np.isfinite(std) or std <= 0:
         return f"{value:.3g}{unit}"
@@ -115,7 +115,7 @@ def with_error(value: float, std: float, unit: str = "") -> str:
 
 
 def probability(p: float) -> str:
-    """A p-value as printed."""
+    """Format a p-value."""
     return f"{p:.1g}" if p > 1e-300 else "< 1e-300"
 
 
@@ -125,13 +125,13 @@ def strength(item: Reported) -> str:
 
 
 def change(before: float, after: float) -> str:
-    """A relative change as printed."""
+    """Format a relative change."""
     share = round(100 * (after / before - 1))
     return f"{share:+d} %" if share else "0 %"
 
 
 def verdict(diagnosis: Diagnosis) -> str:
-    """What was found, in a sentence or two."""
+    """Summary of the result in one or two sentences."""
     physics = [item for item in diagnosis.reported if not is_fault(item.name)]
     faults = [item for item in diagnosis.reported if is_fault(item.name)]
     parts = []
@@ -150,9 +150,9 @@ def verdict(diagnosis: Diagnosis) -> str:
         named = "; ".join(f"{item.name}, {meaning(item.name)}: {strength(item)}" for item in faults)
         parts.append(f"The recording is at fault, not the physics: {named}.")
         if not physics and diagnosis.unexplained is None:
-            parts.append("Of the physics nothing is missing beyond chance.")
+            parts.append("In the physics, nothing is missing beyond chance.")
     if diagnosis.unexplained is not None:
-        parts.append(f"Something is left that no effect of the catalogue accounts for: {diagnosis.unexplained.where}.")
+        parts.append(f"Structure is left that no effect of the catalogue accounts for: {diagnosis.unexplained.where}.")
     elif not diagnosis.reported:
         parts.append("Nothing is missing beyond chance.")
     if diagnosis.reported or diagnosis.unexplained is not None:
@@ -161,16 +161,16 @@ def verdict(diagnosis: Diagnosis) -> str:
 
 
 SHOWN = 3
-"""Effects that the first paragraph names when there are many."""
+"""Largest number of effects that the first paragraph explains."""
 
 
 def _many(diagnosis: Diagnosis, physics: list[Reported]) -> str:
-    """What a drone has that lacks much at once, how much it buys, and what to do."""
+    """Summary of a joint fit of many effects: the effects, the errors before and after, and advice."""
     first = "; ".join(f"{item.name} ({meaning(item.name)})" for item in physics[:SHOWN])
     more = [item.name for item in physics[SHOWN:]]
     count = f"{len(physics)} effects" if len(physics) != 1 else "one effect"
-    motors = ", beside motors of its own" if diagnosis.motors else ""
-    has = f"The drone flies with {count} the model lacks{motors}; what buys most: {first}"
+    motors = ", and its motors differ from the model's" if diagnosis.motors else ""
+    has = f"The drone flies with {count} the model lacks{motors}; the most important: {first}"
     has += f"; then {', '.join(more)}." if more else "."
     horizon = f"@{max(diagnosis.before.horizons):g}s"
     keys = {"attitude": ("attitude_mean_deg", "deg"), "velocity": ("velocity_mean_mps", "m/s")}
@@ -190,16 +190,16 @@ def _many(diagnosis: Diagnosis, physics: list[Reported]) -> str:
     bound = [number for item in diagnosis.reported for number in item.at_bound]
     do = "Fly and train with model.yaml"
     if bound:
-        do += f"; do not trust as physics what stands at the edge of what is plausible ({', '.join(bound)})"
+        do += f"; do not trust as physics the numbers at the edge of their plausible range ({', '.join(bound)})"
     other = [item.name for item in diagnosis.reported if any(each.contradicts for each in item.asked)]
     if other:
         no = ", nor" if bound else "; do not trust as physics"
-        do += f"{no} what the accelerations contradict ({', '.join(other)})"
+        do += f"{no} the effects that the accelerations contradict ({', '.join(other)})"
     return f"{has} On held-out flights {errors}. {do}."
 
 
 def _interval(item: Reported) -> str:
-    """The 95 % interval of an effect with one number."""
+    """The 95 % interval of an effect with one number; empty for several numbers."""
     found = numbers(item)
     if len(found) != 1:
         return ""
@@ -208,7 +208,7 @@ def _interval(item: Reported) -> str:
 
 
 def _bought(diagnosis: Diagnosis) -> str:
-    """The largest drop of a held-out error at the longest horizon."""
+    """Sentence on the largest reduction of a held-out error at the longest horizon."""
     before, after = (not_none(found.metrics("commands_in")) for found in (diagnosis.before, diagnosis.after))
     horizon = f"@{max(diagnosis.before.horizons):g}s"
     keys = [key for key in before if "_rmse_" in key and key.endswith(horizon)]

@@ -1,4 +1,4 @@
-"""What the library does, on one page."""
+"""Page of `cfb demo`: predictions, randomised drones and a real flight."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ QUANTITIES = (
     ("attitude", "deg", "deg"),
     ("rate", "radps", "rad/s"),
 )
-"""Name, unit in keys, unit."""
+"""Name, unit in JSON keys, unit as printed."""
 _VARIANTS = {"commands_in": "model, commands in", "rotor_speed_in": "model, rotor speed in", "hold": "hold"}
 
 
 def demo_page(result: dict[str, Any], folder: Path) -> str:
-    """The page.
+    """Build the page of the demonstration.
 
     Args:
-        result: of `cfb_mjx.demo.demonstrate`, with ``environment`` and ``wall_s``.
-        folder: of the figures.
+        result: result of `cfb_mjx.demo.demonstrate`, with ``environment`` and ``wall_s``.
+        folder: folder of the figures.
+
+    Returns:
+        The HTML as text.
     """
     flight, flown, real = result["flight"], result["rollouts"], result["real"]
     distance, tilt = flown["distance_m@0.5s"], flown["tilt_deg@0.5s"]
@@ -36,11 +39,11 @@ def demo_page(result: dict[str, Any], folder: Path) -> str:
             f"One flight, predicted by {result['model']}",
             [
                 flight["origin"],
-                f"Every 0.2 s of {flight['duration_s']:.1f} s of flight the model starts from the measured state and "
-                "predicts half a second without looking again. Commands in: it receives what the motors were told. "
-                "Rotor speed in: it receives the measured rotor speeds, so the motor model plays no part. Hold: "
-                "constant velocity and constant body rate, the baseline that knows no physics. In the figure a "
-                "prediction starts at an open circle; one that diverges leaves its panel.",
+                f"Every 0.2 s of {flight['duration_s']:.1f} s of flight, the model starts from the measured state and "
+                "predicts half a second without feedback. Commands in: its input is the motor commands. Rotor speed "
+                "in: its input is the measured rotor speeds, so the motor model has no influence. Hold: constant "
+                "velocity and constant body rate, a baseline without physics. In the figure, a prediction starts at an "
+                "open circle; a prediction that diverges leaves its panel.",
             ],
             [errors(flight)],
             [(folder / "prediction.png", "Measured flight with open-loop predictions; error against horizon")],
@@ -48,17 +51,17 @@ def demo_page(result: dict[str, Any], folder: Path) -> str:
         Section(
             f"{flown['drones']} randomised drones",
             [
-                "All start from the same measured state and receive the same commands of the flight, half a second "
-                "without feedback. Mass, inertia, motors, thrust, torque and centre of gravity are drawn from the "
-                "paper's ranges. A centre of gravity a few millimetres off is enough to tip a drone over that nobody "
-                "steers; a controller trained on such drones has to hold all of them.",
-                f"Each flies {flown['steps']} steps of {flown['step_s'] * 1e3:g} ms; every "
-                f"{flown['kept_every']}th state is kept for the figure. Keeping the last state only is faster: see cfb "
+                "All drones start from the same measured state and receive the same commands of the flight, for half a "
+                "second without feedback. Mass, inertia, motors, thrust, torque and centre of gravity are drawn from "
+                "the paper's ranges. Without feedback, an error of a few millimetres in the centre of gravity makes a "
+                "drone tip over. A controller trained on such drones must stabilise all of them.",
+                f"Each drone flies {flown['steps']} steps of {flown['step_s'] * 1e3:g} ms; every "
+                f"{flown['kept_every']}th state is kept for the figure. Keeping only the last state is faster: see cfb "
                 "bench.",
             ],
             [
                 (
-                    "Throughput, and where the drones are after 0.5 s",
+                    "Throughput, and position and tilt of the drones after 0.5 s",
                     ["", "value"],
                     [
                         ["steps per second (best of 3 runs)", f"{flown['steps_per_s'] / 1e6:.1f} million"],
@@ -79,9 +82,9 @@ def demo_page(result: dict[str, Any], folder: Path) -> str:
                 f"A real flight: {real['log']}",
                 [
                     real["verdict"],
-                    f"The vehicle weighs {real['mass_kg'] * 1e3:g} g and the mass is set to that; every other constant "
-                    "is the declared one. The attitude is open-loop unstable, so a small error of torque grows "
-                    "quickly. Errors like these are what refitting the model to logs is for.",
+                    f"The vehicle weighs {real['mass_kg'] * 1e3:g} g, and the model's mass is set to that; every other "
+                    "constant is the declared one. The attitude is open-loop unstable, so a small error of torque "
+                    "grows quickly. Fitting the model to logs reduces such errors.",
                 ],
                 [errors(real)],
                 [(folder / "real.png", "Real flight with open-loop predictions; error against horizon")],
@@ -89,12 +92,15 @@ def demo_page(result: dict[str, Any], folder: Path) -> str:
         )
     else:
         sections.append(Section("A real flight", [f"Skipped: {real['skipped']}"]))
-    lead = f"What the declared model predicts, how fast it runs, and where it fails. Made in {result['wall_s']:.0f} s."
+    lead = (
+        "Predictions of the declared model, its speed, and a flight on which it fails. "
+        f"Made in {result['wall_s']:.0f} s."
+    )
     return html_page("cfb_mjx demo", lead, sections, result["environment"])
 
 
 def error_rows(result: dict[str, Any]) -> list[list[str]]:
-    """One row per quantity and variant: RMS error at every horizon, with its interval."""
+    """One row per quantity and variant: RMS error at every horizon, with its bootstrap interval."""
     rows = []
     for quantity, unit, label in QUANTITIES:
         for variant, name in _VARIANTS.items():

@@ -1,4 +1,4 @@
-"""A manoeuvre as it would fly: commands, tilt, body rate, height, over all its repetitions."""
+"""Figure of a simulated excitation manoeuvre: commands, tilt, body rate and height of all its repetitions."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def excitation_figure(
 
     Args:
         calm: one repetition without noise or disturbance.
-        flown: the simulated flight.
+        flown: the simulated flight with all repetitions.
         path: file to write, ``.svg``, ``.png`` or ``.pdf``.
-        limits: dashed lines: ``tilt`` deg, ``rate`` rad/s, ``height`` m below the start.
-        title: heading.
+        limits: values of the dashed lines: ``tilt`` deg, ``rate`` rad/s, ``height`` m below the start.
+        title: title of the figure.
 
     Raises:
-        CfbError: an unknown ending, or the file cannot be written.
+        CfbError: the ending of ``path`` is not supported, or the file cannot be written.
     """
     path = style.check_path(path)
     with style.context():
@@ -66,7 +66,7 @@ def excitation_figure(
 
 
 def _window(experiment: Experiment, start: int) -> tuple[np.ndarray, slice]:
-    """Times since ``start`` and the ticks drawn."""
+    """Times since tick ``start``, and the slice of ticks to draw."""
     before, after = (round(t / TICK) for t in SHOWN)
     rows = slice(max(start - before, 0), min(start + experiment.length + after, len(experiment.time)))
     return experiment.time[rows] - experiment.time[start], rows

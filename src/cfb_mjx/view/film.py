@@ -1,6 +1,6 @@
-"""A flight as a film, drawn by MuJoCo: the drone above its floor, the way it went, the thrust of each rotor.
+"""Film a flight with MuJoCo: the drone above the floor, its path, and the thrust of each rotor.
 
-Off-screen, by EGL or OSMesa, whichever this machine has.
+Rendering is off-screen, with EGL or OSMesa, whichever is available.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cfb_mjx.files import replacing, require_ending, shipped
 
 SUFFIXES = (".mp4", ".gif")
 SIZE, RATE = (640, 480), 25.0
-"""Pictures: width and height, and how many per second."""
+"""Width and height of the frames in pixels, and frames per second."""
 _WAY_POINTS = 400
 _BACKENDS = ("egl", "osmesa")
 _SKY = '<asset><texture type="skybox" builtin="flat" rgb1=".86 .91 .96" width="32" height="192"/>'
@@ -40,10 +40,10 @@ class Path3D(NamedTuple):
 
 
 def check_film(path: str | Path) -> Path:
-    """The path, if its ending names a film.
+    """The path, if its ending is a supported format of films.
 
     Raises:
-        CfbError: another ending.
+        CfbError: the ending is not supported.
     """
     return require_ending(path, SUFFIXES, f"a film must end in {' or '.join(SUFFIXES)}")
 
@@ -60,16 +60,16 @@ def write_film(
 
     Args:
         path: file to write, ``.mp4`` or ``.gif``.
-        flight: what is filmed; pictures are taken of the row next to their time.
+        flight: the flight; each frame shows the first row at or after its time.
         size: width and height, pixels; even numbers.
-        rate: pictures per second.
-        speed: 0.25 is slow motion.
-        azimuth_deg: where the camera looks, from x towards y: at 180 it looks along -x, y points to the right and
-            flips about x are seen face on.
+        rate: frames per second.
+        speed: playback speed; 0.25 is slow motion.
+        azimuth_deg: viewing direction of the camera, from x towards y. At 180 it looks along -x, y points to the right,
+            and flips about x are seen face on.
 
     Raises:
-        CfbError: no OpenGL that draws off-screen, no ffmpeg for ``.mp4``, an ending that is no film, or a file that
-            cannot be written.
+        CfbError: there is no OpenGL for off-screen rendering, no ffmpeg for ``.mp4``, the ending is not supported, or
+            the file cannot be written.
     """
     path = check_film(path)
     if len(flight.time) < 2:
@@ -84,7 +84,7 @@ def write_film(
 
 
 def _pictures(path: Path, flight: Path3D, size, rate: float, azimuth_deg: float) -> np.ndarray:
-    """Pictures (n, height, width, 3), drawn in a process of its own with the first OpenGL that works."""
+    """Frames (n, height, width, 3), rendered in a separate process with the first OpenGL backend that works."""
     with tempfile.TemporaryDirectory(prefix="cfb-film-") as folder:
         job = Path(folder) / "job.npz"
         np.savez(job, **_job(flight, size, rate, azimuth_deg))
@@ -106,13 +106,13 @@ def _pictures(path: Path, flight: Path3D, size, rate: float, azimuth_deg: float)
 
 
 def _job(flight: Path3D, size, rate: float, azimuth_deg: float) -> dict[str, Any]:
-    """What `render` needs."""
+    """Input of `render`: frames, camera and path."""
     duration = flight.time[-1] - flight.time[0]
     times = flight.time[0] + np.arange(int(duration * rate) + 1) / rate
     rows = np.searchsorted(flight.time, times).clip(0, len(flight.time) - 1)
     stride = max(1, len(flight.time) // _WAY_POINTS)
     low, high = flight.position.min(axis=0), flight.position.max(axis=0)
-    # Far enough for all of the way to be in the picture, unless that would make the drone a dot.
+    # The camera is far enough to show the whole path, unless the drone would become too small.
     reach = float(np.clip(np.linalg.norm(high - low), 0.5, 3.0))
     middle = 0.5 * (low + high)
     near = np.linalg.norm(flight.position[rows] - middle, axis=1) < 1.2 * reach
@@ -131,7 +131,7 @@ def _job(flight: Path3D, size, rate: float, azimuth_deg: float) -> dict[str, Any
 
 
 def _ffmpeg(path: Path) -> str:
-    """The encoder: the system's, or the one of imageio-ffmpeg."""
+    """Path of the encoder: the system's ffmpeg, or the one of imageio-ffmpeg."""
     if found := shutil.which("ffmpeg"):
         return found
     try:
@@ -153,7 +153,7 @@ def _write_mp4(encoder: str, path: Path, pictures: np.ndarray, size, rate: float
 def _write_gif(path: Path, pictures: np.ndarray, rate: float) -> None:
     from PIL import Image
 
-    # Of a picture most is sky and floor; this method keeps the colours of what is small as well.
+    # Most of a frame is sky and floor; this method also keeps the colours of small objects.
     method, plain = Image.Quantize.MAXCOVERAGE, Image.Dither.NONE
     images = [Image.fromarray(p).quantize(64, method=method, dither=plain) for p in pictures]
     images[0].save(path, format="GIF", save_all=True, append_images=images[1:], duration=round(1e3 / rate), loop=0)

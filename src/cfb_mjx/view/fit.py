@@ -1,4 +1,4 @@
-"""A fit in one picture: estimates with their intervals, what they share, and the held-out error before and after."""
+"""Figure of a fit: estimates with intervals, their correlation, and the held-out error before and after."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _ESTIMATORS = {"innovation": "one-step innovations", "shooting": "multiple shoot
 
 
 def fit_figure(result: Fit, other: Fit | None, before, after, path: str | os.PathLike) -> None:
-    """Draw what `cfb fit` prints.
+    """Draw the results of `cfb fit`.
 
     Args:
         result: the fit.
-        other: the other estimator's fit, drawn beside it; or None.
-        before: `cfb_mjx.sysid.evaluate` of the model that was started from, on held-out data.
-        after: the same of the fitted model.
+        other: the fit of the other estimator, drawn next to it; or None.
+        before: `cfb_mjx.sysid.evaluate` of the initial model on held-out data.
+        after: the same for the fitted model.
         path: file to write, ``.svg``, ``.png`` or ``.pdf``.
 
     Raises:
@@ -56,9 +56,9 @@ def _draw_estimates(panel, result: Fit, other: Fit | None) -> None:
             (row, fitted.estimates[name]) for row, name in zip(rows, names, strict=True) if name in fitted.estimates
         ]
         if not shown:
-            panel.plot([], [], marker, color=colour, label=f"{_ESTIMATORS[fitted.estimator]}: tells none of these")
+            panel.plot([], [], marker, color=colour, label=f"{_ESTIMATORS[fitted.estimator]}: estimates none of these")
             continue
-        # Offsets have no ratio to a preset of zero: they are shown in their own standard deviations from it.
+        # An offset has no ratio to a preset of zero, so its change is shown in units of its standard deviation.
         panel.errorbar(
             [_change(e) for _, e in shown],
             [row + shift for row, _ in shown],
@@ -79,7 +79,7 @@ def _draw_estimates(panel, result: Fit, other: Fit | None) -> None:
     panel.set_xlabel("change from the preset, % (95 % interval)")
     panel.set_title("estimates")
     if other is not None:
-        # Below the axis label, as far as the correlation's labels reach.
+        # Below the axis label, level with the tick labels of the correlation.
         panel.legend(loc="upper left", bbox_to_anchor=(-0.35, -0.22), fontsize=8)
 
 

@@ -1,4 +1,4 @@
-"""Flights of a controller: where they went, how fast, and what was commanded."""
+"""Figure of the flights of a controller: position, speed and commands over time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from cfb_mjx.view.style import check_path, context, new_figure, save
 
 _SHOWN = 60
-"""More lines than this hide each other."""
+"""Largest number of flights in the figure; more lines would cover each other."""
 
 
 def flight_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
@@ -19,7 +19,7 @@ def flight_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
         flown: a `cfb_mjx.train.flying.Flight` with axes (drones, steps).
         dt: time between two commands, s.
         path: figure to write.
-        title: above it.
+        title: title of the figure.
     """
     path = check_path(path)
     rows = [

@@ -1,4 +1,4 @@
-"""Flights of a controller as a rerun recording: drones in 3D, their ways, set-point, thrust, commands and rates."""
+"""Rerun recording of a controller's flights: drones and paths in 3D, set-point, thrust, commands and rates."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from cfb_mjx.view.recorder import Plot, Tab, recording
 from cfb_mjx.view.style import COLOURS
 
 DRONES = 40
-"""Drones recorded at most."""
+"""Largest number of drones in a recording."""
 _MOTORS = ("M1", "M2", "M3", "M4")
 
 
 def write_flight_recording(path: str | Path, flown, dt: float, thrust=None) -> None:
     """Write a recording that `rerun` opens.
 
-    Every drone has its pose and way under ``world/<number>``, the set-point is ``world/set-point``; commands, body
-    rates and velocities of the first are under ``signal``.
+    Every drone has its pose and path under ``world/<number>``; the set-point is ``world/set-point``. Commands, body
+    rates and velocities of the first drone are under ``signal``.
 
     Args:
         path: file to write, ``.rrd``.
         flown: a `cfb_mjx.train.flying.Flight` with axes (drones, steps).
         dt: time between two commands, s.
-        thrust: (drones, steps, 4) N; arrows on the first drone. None: none.
+        thrust: (drones, steps, 4) N, drawn as arrows on the first drone; None: no arrows.
 
     Raises:
         CfbError: rerun is not installed or the file cannot be written.
@@ -37,7 +37,7 @@ def write_flight_recording(path: str | Path, flown, dt: float, thrust=None) -> N
         "velocity": (np.asarray(flown.velocity)[0], ("x, m/s", "y, m/s", "z, m/s")),
     }
     plots = tuple(Plot(name, (f"signal/{_entity(name)}/**",)) for name in signals)
-    # What has failed may be anywhere, or nowhere.
+    # Drones that failed may be far away or have NaN positions.
     well = position[np.isfinite(position).all(axis=-1) & ~np.asarray(flown.failed)]
     seen = np.stack([well.min(axis=0), well.max(axis=0)]) if len(well) else None
     with recording("cfb_fly", [Tab("flight", "world", plots, seen)], path) as recorder:

@@ -1,4 +1,4 @@
-"""Flips as the paper shows them: the path in the YZ plane, the roll angle and the rates over time."""
+"""Figure of flips, as in the paper: the path in the YZ plane, roll angle, roll rate and vertical speed over time."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ def flip_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
     """Draw flips.
 
     Args:
-        flown: a `cfb_mjx.train.flying.Flight` of `cfb_mjx.train.flips.flips`, axes (drones, steps).
+        flown: a `cfb_mjx.train.flying.Flight` from `cfb_mjx.train.flips.flips`, axes (drones, steps).
         dt: time between two commands, s.
         path: figure to write.
-        title: above it.
+        title: title of the figure.
     """
     path = check_path(path)
     position, velocity, rate = (np.asarray(x)[:_SHOWN] for x in (flown.position, flown.velocity, flown.body_rate))
@@ -64,7 +64,7 @@ def flip_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
 
 
 def draw_path(axis, flown, dt: float, alpha: float = 1.0) -> None:
-    """The way of flips in the YZ plane until they are back, and the drone on it, a bar, if it is one flight."""
+    """Draw the paths of flips in the YZ plane; for a single flight also the drone, as a bar."""
     position, until = np.asarray(flown.position)[:_SHOWN], round(_watched(flown, dt) / dt)
     way = position[:, :until]
     if len(way) == 1:
@@ -88,7 +88,7 @@ def draw_path(axis, flown, dt: float, alpha: float = 1.0) -> None:
 
 
 def _apart(way: np.ndarray, angle: np.ndarray) -> list[int]:
-    """Where to draw the drone: a few centimetres or an eighth of a turn from where it was drawn last."""
+    """Rows at which the drone is drawn: 8 cm or an eighth of a turn from the last one."""
     kept = [0]
     for i in range(1, len(way)):
         moved, turned = np.linalg.norm(way[i] - way[kept[-1]]), abs(angle[i] - angle[kept[-1]])
@@ -98,7 +98,7 @@ def _apart(way: np.ndarray, angle: np.ndarray) -> list[int]:
 
 
 def _watched(flown, dt: float) -> float:
-    """Until when flights are shown, s: a second and a half after the last of them is to be caught."""
+    """End of the shown time, s: 1.5 s after the last flight has ended its turn."""
     before = (np.asarray(flown.watched) <= TURN).sum(axis=-1).max() * dt
     return min(before + 1.5, dt * flown.position.shape[-2])
 

@@ -1,4 +1,4 @@
-"""Flights of a controller as files: figure, recording, film, log."""
+"""Write the flights of a controller as figure, recording, film or log."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cfb_mjx.view.flight_recording import write_flight_recording
 from cfb_mjx.view.flip import flip_figure
 
 HEIGHT_M = 1.0
-"""Of the target above the floor of a film; flips are flown `FLOOR_M` above it."""
+"""Height of the target above the floor of a film, m; flips are shown `FLOOR_M` above it."""
 
 
 def write_flights(
@@ -31,21 +31,21 @@ def write_flights(
     video: Path | None = None,
     log: Path | None = None,
 ) -> None:
-    """Write what was asked for.
+    """Write the requested files.
 
     Args:
         flown: flights, axes (drones, steps).
         dt: time between two commands, s.
-        nominal: the model, whose thrust curve the arrows have.
-        title: of the figure.
-        flips: whether these are flips.
-        figure: draw the flights here.
-        recording: write the flights here, for rerun.
-        video: film the first flight here.
-        log: write the first flight here as a flight log.
+        nominal: model whose thrust curve gives the thrust arrows.
+        title: title of the figure.
+        flips: whether the flights are flips.
+        figure: file of the figure; None writes none.
+        recording: file of the rerun recording; None writes none.
+        video: file of a film of the first flight; None writes none.
+        log: file of a flight log of the first flight; None writes none.
 
     Raises:
-        CfbError: a file cannot be written, or what it needs is not installed.
+        CfbError: a file cannot be written, or a program or library for it is not installed.
     """
     parameters = nominal.changed_parameters()
     if figure is not None:
@@ -61,7 +61,7 @@ def write_flights(
 
 
 def _first(flown: Flight, dt: float, thrust: np.ndarray, height_m: float) -> Path3D:
-    """The first flight as it is filmed; of a drone that is lost, until then."""
+    """The first flight, for a film; if the drone is lost, up to that time."""
     rows = slice(steps_flown(flown))
     position = np.asarray(flown.position[0], float) + np.array([0.0, 0.0, height_m])
     time = dt * (1 + np.arange(len(position)))

@@ -1,4 +1,4 @@
-"""The learning curve of a training, as a figure and for TensorBoard."""
+"""Learning curve of a training, as a figure and as TensorBoard events."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _PANELS = (
 
 
 def learning_figure(rows: list[dict[str, float]], path: str | Path, title: str = "") -> None:
-    """Draw what flights were judged by, and the loss, over commands flown, seconds on top.
+    """Draw the scores of test flights and the loss over the number of commands flown.
 
     Args:
-        rows: of `cfb_mjx.train.run.train`.
+        rows: rows of the learning curve, from `cfb_mjx.train.run.train`.
         path: figure to write.
-        title: above it.
+        title: title of the figure; the training time is added to it.
     """
     panels = [panel for panel in _PANELS if panel[0] in rows[0]]
     with context():
@@ -48,7 +48,11 @@ def learning_figure(rows: list[dict[str, float]], path: str | Path, title: str =
 
 @contextmanager
 def learning_events(folder: Path | None) -> Iterator[Callable[[int, Mapping[str, float]], None]]:
-    """What writes numbers over commands flown for TensorBoard; without a folder nothing is written."""
+    """Context manager that gives a function to log numbers over commands flown for TensorBoard.
+
+    Args:
+        folder: folder of the events; with None, the function writes nothing.
+    """
     if folder is None:
         yield lambda commands, numbers: None
         return
@@ -58,7 +62,7 @@ def learning_events(folder: Path | None) -> Iterator[Callable[[int, Mapping[str,
 
         def log(commands: int, numbers: Mapping[str, float]) -> None:
             for name, number in numbers.items():
-                # Where most drones are lost their median error is infinite: nothing to draw.
+                # If most drones are lost, their median error is infinite and cannot be drawn.
                 if isfinite(number):
                     writer.add_scalar(name, number, commands)
 

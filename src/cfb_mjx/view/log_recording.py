@@ -1,4 +1,4 @@
-"""Flight logs as a film, and as a rerun recording: with thrust, predictions and residuals of a model."""
+"""Film and rerun recording of flight logs, with thrust, predictions and residuals of a model."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cfb_mjx.view.recorder import AXES, Plot, Recorder, part, recording
 from cfb_mjx.view.style import COLOURS
 
 RATE = 100.0
-"""Rows per second kept at most."""
+"""Largest number of rows per second in a recording."""
 _MOTORS = ("M1", "M2", "M3", "M4")
 
 
@@ -28,17 +28,17 @@ def write_log_recording(
     evaluation: Evaluation,
     residuals: Sequence[tuple[Residuals, np.ndarray]],
 ) -> None:
-    """Record flights beside a model's view of them.
+    """Write a recording of flights with a model's predictions and residuals.
 
-    For each flight, under its name: in 3D the measured way and drone with the thrust of each rotor, and predictions of
-    half a second from every window; commands, rotor speeds, body rates and voltage under ``signal``, what the model
-    misses under ``residual``.
+    For each flight, under its name: in 3D the measured path and the drone with the thrust of each rotor, and
+    predictions of half a second from every window; commands, rotor speeds, body rates and voltage under ``signal``;
+    residuals under ``residual``.
 
     Args:
         path: file to write, ``.rrd``.
-        model: whose predictions and residuals are shown.
-        evaluation: of the model on the flights.
-        residuals: of each flight, with the rotor speeds (rows, 4) [rad/s] that drove the model.
+        model: the model.
+        evaluation: evaluation of the model on the flights.
+        residuals: residuals of each flight, with the rotor speeds (rows, 4) [rad/s] that drove the model.
 
     Raises:
         CfbError: rerun is not installed, or the file cannot be written.
@@ -62,15 +62,15 @@ def write_log_film(path: str | Path, model: Quadrotor, log: FlightLog, driven: n
 
     Args:
         path: file to write, ``.mp4`` or ``.gif``.
-        model: whose thrust the arrows are.
+        model: model of the rotors, for the thrust arrows.
         log: the flight.
         driven: rotor speeds (rows, 4) [rad/s] that drove the model.
-        slow: how many times slower the film is than the flight.
+        slow: slow-motion factor; 2 plays at half speed.
 
     Raises:
-        CfbError: what films need is not there, or the file cannot be written.
+        CfbError: a program or library for films is missing, or the file cannot be written.
     """
-    # Where the log's zero is not the floor, the floor is below all of the flight.
+    # A log's z may be negative; raise the flight so that all of it is above the floor.
     lift = np.array([0.0, 0.0, max(0.0, 0.1 - float(log.position[:, 2].min()))])
     flight = Path3D(log.time, log.position + lift, log.quaternion, _thrust(model, driven))
     write_film(path, flight, speed=1 / slow)
@@ -81,7 +81,7 @@ def _thrust(model: Quadrotor, driven: np.ndarray) -> np.ndarray:
 
 
 def _signals(recorder: Recorder, root: str, evaluated: LogEvaluation, driven: np.ndarray) -> None:
-    """What the log holds beside the pose."""
+    """Record commands, rotor speeds, body rates and battery voltage."""
     log: FlightLog = evaluated.log
     step = max(1, round(1 / (RATE * max(log.nominal_interval, 1e-4))))
     rows = slice(None, None, step)

@@ -1,4 +1,4 @@
-"""How much randomisation is worth: the paper's figure."""
+"""Figure of hover error and command std over the magnitude of the randomisation, as in the paper."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ def magnitudes_figure(
     paper: Mapping[float, tuple[float, float]],
     path: str | Path,
 ) -> None:
-    """Hover error and command std over magnitude: seeds as points, their mean as a line, the paper as crosses.
+    """Draw hover error and command std over magnitude: seeds as points, their mean as a line, the paper as crosses.
 
     Args:
-        found: of every algorithm (a column each) and magnitude, one number per seed, None where a drone was lost:
+        found: algorithm (one column each) to magnitude to one number per seed, None where a drone was lost:
             ``nominal`` and ``away`` (drones with effects), mm, and ``nominal_std`` and ``away_std``.
-        paper: hover error (mm) and command std of its real drone, by magnitude.
+        paper: magnitude to hover error (mm) and command std of the paper's real drone.
         path: figure to write.
     """
     from matplotlib.ticker import FormatStrFormatter

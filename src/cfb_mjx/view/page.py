@@ -1,4 +1,4 @@
-"""A page that needs nothing beside it: text, tables and figures in one HTML file."""
+"""Self-contained HTML pages: text, tables and figures in one file."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _TYPES = {".png": "image/png", ".svg": "image/svg+xml"}
 
 @dataclass(frozen=True)
 class Section:
-    """A heading with paragraphs, tables and figures below it, in this order.
+    """A heading followed by paragraphs, tables and figures, in this order.
 
     Attributes:
         title: heading.
         paragraphs: plain text.
-        tables: (caption, header, rows) each, cells as text.
-        figures: (file, alternative text) each; PNG or SVG, copied into the page.
+        tables: (caption, header, rows) of each table, with cells as text.
+        figures: (file, alternative text) of each figure; PNG or SVG, embedded in the page.
     """
 
     title: str
@@ -40,13 +40,16 @@ class Section:
 
 
 def html_page(title: str, lead: str, sections: Sequence[Section], footer: Mapping[str, object]) -> str:
-    """The page as text.
+    """Build a self-contained page.
 
     Args:
         title: heading of the page.
-        lead: its first paragraph.
-        sections: what follows.
-        footer: what the results depend on (date, machine, versions), printed at the end.
+        lead: first paragraph.
+        sections: the sections after it.
+        footer: facts on which the results depend (date, machine, versions), printed at the end.
+
+    Returns:
+        The HTML as text.
     """
     body = "\n".join(_section(section) for section in sections)
     facts = " · ".join(f"{html.escape(str(key))} {html.escape(str(value))}" for key, value in footer.items())
@@ -77,6 +80,6 @@ def _table(caption: str, header: Sequence[str], rows: Sequence[Sequence[str]]) -
 
 
 def _figure(path: Path, alternative: str) -> str:
-    # As an image and not as inline SVG: ids of two figures cannot then collide.
+    # An image element, because the ids of two inline SVG figures could collide.
     data = base64.b64encode(read_bytes(path)).decode("ascii")
     return f'<img alt="{html.escape(alternative)}" src="data:{_TYPES[Path(path).suffix]};base64,{data}">'

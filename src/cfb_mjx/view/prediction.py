@@ -1,4 +1,4 @@
-"""Prediction against measurement: what a model says half a second ahead, drawn over what was measured."""
+"""Figure of open-loop predictions of a model over the measurement, with the error against the horizon."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _COMPONENTS = {
     "rate": ("x", "y", "z"),
 }
 SHOWN = 6.0
-"""Seconds of flight drawn: more, and the predictions are too narrow to see."""
+"""Seconds of flight in the figure; with more, the predictions would be too narrow to see."""
 
 
 def prediction_figure(
@@ -37,18 +37,19 @@ def prediction_figure(
     """Draw one log's measurement with open-loop predictions over it, and error against horizon.
 
     Left, for `SHOWN` seconds in the middle of the flight: position [m], velocity [m/s], roll, pitch and yaw [deg]
-    and body rate [rad/s]. Predictions of windows that do not overlap start at an open circle on the measurement; their
-    markers are the evaluation's horizons. Pose and velocity are drawn at the time they speak of, that is without
-    their delay. Right: RMS errors of that log with 95 % intervals.
+    and body rate [rad/s]. Each prediction starts at an open circle on the measurement, and its markers are the
+    evaluation's horizons; only windows that do not overlap are drawn. Pose and velocity are drawn without their delay.
+    Right: RMS errors of that log with 95 % intervals.
 
     Args:
         evaluation: result of `cfb_mjx.sysid.evaluate`.
         path: file to write, ``.svg``, ``.png`` or ``.pdf``.
-        log_name: which log; by default the first that has windows.
-        title: heading; by default the log's name.
+        log_name: name of the log; by default the first that has windows.
+        title: title of the figure; by default the log's name.
 
     Raises:
-        CfbError: no such log, a log without windows, or the file cannot be written.
+        CfbError: no such log, a log without windows, the ending of ``path`` is not supported, or the file cannot be
+            written.
     """
     path = style.check_path(path)
     chosen = _choose(evaluation, log_name)
@@ -94,7 +95,7 @@ def _choose(evaluation: Evaluation, name: str | None) -> LogEvaluation:
 
 
 def euler_deg(quaternion: np.ndarray) -> np.ndarray:
-    """Roll, pitch, yaw in degrees (z-y-x) of [w, x, y, z] quaternions (..., 4)."""
+    """Roll, pitch and yaw, deg (z-y-x), from [w, x, y, z] quaternions (..., 4)."""
     w, x, y, z = np.moveaxis(quaternion, -1, 0)
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
@@ -103,7 +104,7 @@ def euler_deg(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _measured(chosen: LogEvaluation, quantity: str) -> tuple[np.ndarray, np.ndarray]:
-    """Times the values speak of (n,) and values (n, 3); NaN in gaps, so that no line crosses them."""
+    """Times without delay (n,) and values (n, 3); NaN in gaps, so that no line crosses them."""
     log = chosen.log
     values = {
         "position": log.position,
@@ -119,7 +120,7 @@ def _measured(chosen: LogEvaluation, quantity: str) -> tuple[np.ndarray, np.ndar
 
 
 def _shown(chosen: LogEvaluation, reach: float) -> tuple[float, float, list[int]]:
-    """Start and end of what is drawn, and the windows in it, which do not overlap."""
+    """Start and end of the drawn time, and the indices of non-overlapping windows in it."""
     starts = chosen.windows.start
     begin = max(starts[0], starts[len(starts) // 2] - SHOWN / 2)
     chain, free = [], begin - 1e-9
@@ -133,7 +134,7 @@ def _shown(chosen: LogEvaluation, reach: float) -> tuple[float, float, list[int]
 
 
 def _predicted(chosen: LogEvaluation, variant: str, quantity: str, chain: list[int]) -> np.ndarray | None:
-    """Values at the window starts and horizons, (windows, 1 + H, 3); NaN where the variant cannot be had."""
+    """Values at the window starts and horizons, (windows, 1 + H, 3); NaN where the variant is not available."""
     states = chosen.predictions[variant]
     if states is None:
         return None
@@ -141,7 +142,7 @@ def _predicted(chosen: LogEvaluation, variant: str, quantity: str, chain: list[i
     field = fields[quantity]
     start, later = getattr(chosen.windows, field), np.asarray(getattr(states, field))
     if variant == "rotor_speed_in":
-        # These predictions exist for the windows with measured rotor speed only.
+        # These predictions exist only for windows with measured rotor speed.
         everywhere = np.full((len(chosen.windows), *later.shape[1:]), np.nan)
         everywhere[chosen.measured] = later
         later = everywhere
@@ -156,7 +157,7 @@ def _draw_component(axes, chosen: LogEvaluation, horizons: tuple[float, ...], qu
     inside = (time >= begin) & (time <= end)
     time, values = time[inside], values[inside, column]
     axes.plot(time, values, color=style.MEASURED, linewidth=1.1, zorder=2)
-    # hold is left to the error panels: its straight lines would hide the rest.
+    # hold is shown only in the error panels, because its straight lines would cover the rest.
     for variant in ("rotor_speed_in", "commands_in"):
         predicted = _predicted(chosen, variant, quantity, chain)
         if predicted is None:
@@ -165,12 +166,12 @@ def _draw_component(axes, chosen: LogEvaluation, horizons: tuple[float, ...], qu
         at = chosen.windows.start[chain][:, None] + np.concatenate([[0.0], horizons])
         known = np.isfinite(values)
         if quantity == "attitude":
-            # On the branch of the measurement, or a yaw past 180 degrees would look like an error of 360.
+            # Unwrap to the branch of the measurement; otherwise a yaw past 180 degrees looks like an error of 360.
             predicted = np.unwrap(predicted, period=360.0, axis=1)
             near = np.interp(at[:, 0], time[known], values[known])
             predicted = predicted + 360.0 * np.round((near - predicted[:, 0]) / 360.0)[:, None]
         colour = style.COLOURS[variant]
-        # One line with breaks draws faster than a line for each window.
+        # One line with breaks is drawn faster than one line per window.
         broken = np.full((len(chain), 1), np.nan)
         x, y = np.hstack([at, broken]), np.hstack([predicted, broken])
         axes.plot(x.ravel(), y.ravel(), color=colour, linewidth=1.3, alpha=0.9, zorder=3)
@@ -195,7 +196,7 @@ def _draw_error(axes, results: dict[str, tuple[dict, dict]], horizons: tuple[flo
         keys = [f"{quantity}_rmse_{unit}@{horizon:g}s" for horizon in horizons]
         rmse = np.array([values[key] for key in keys])
         low, high = np.array([intervals[key] for key in keys]).T
-        # Side by side, or equal errors would hide each other.
+        # Offset in x, because equal errors would cover each other.
         x = np.asarray(horizons) * (1 + 0.03 * (order - 1))
         axes.errorbar(
             x,

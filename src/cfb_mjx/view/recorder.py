@@ -1,4 +1,4 @@
-"""Recordings that rerun opens. The only module that knows rerun: what is recorded is said by those who call it."""
+"""Write recordings for rerun. This is the only module that imports rerun."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from cfb_mjx.files import read_bytes, replacing
 
 TIMELINE = "flight_time"
 _VIEWER_S = 4.0
-"""A viewer that cannot open has said so by then."""
+"""Time after which a viewer that has not ended counts as open, s."""
 ARM_M = 0.05
-"""From the middle of a drawn drone to a motor, along x and y."""
+"""Distance from the centre of a drawn drone to a motor, along x and along y, m."""
 METRES_PER_NEWTON = 1.0
-"""Length of a thrust arrow."""
+"""Scale of the thrust arrows."""
 LIGHT = "#d8dce0"
-"""What was measured: rerun's views are dark."""
+"""Colour of measurements; light, because rerun's views are dark."""
 AXES = {"x": "#E69F00", "y": "#56B4E9", "z": "#009E73"}
-"""Okabe and Ito's, one for each axis where lines differ in nothing else."""
+"""Colours of the axes (Okabe and Ito), for lines that differ only in the axis."""
 
 
 @dataclass(frozen=True)
 class Plot:
-    """A time series view: its title and the entities shown."""
+    """A time series view: its title, and the entities shown in it."""
 
     name: str
     contents: tuple[str, ...]
@@ -39,13 +39,13 @@ class Plot:
 
 @dataclass(frozen=True)
 class Tab:
-    """A 3D view beside plots.
+    """A 3D view next to plots.
 
     Attributes:
-        name: of the tab.
+        name: title of the tab.
         world: entity at the root of the 3D view.
-        plots: one above the other.
-        seen: corners (2, 3) of what the 3D view shows at first, m; None: rerun decides.
+        plots: the plots, from top to bottom.
+        seen: corners (2, 3) of the region that the 3D view shows at first, m; None: rerun decides.
     """
 
     name: str
@@ -55,21 +55,21 @@ class Tab:
 
 
 def part(name: str) -> str:
-    """A name as one part of an entity's path, whatever characters it has."""
+    """A name, with any characters, escaped as one part of an entity's path."""
     return _rerun("recordings").escape_entity_path_part(name)
 
 
 @contextlib.contextmanager
 def recording(application: str, tabs: Sequence[Tab], path: str | Path) -> Iterator[Recorder]:
-    """Record into a file.
+    """Context manager that writes a recording.
 
     Args:
-        application: name that rerun keeps settings of views under.
-        tabs: how it is shown.
-        path: file to write, ``.rrd``; an earlier one stays until the new one is whole.
+        application: name under which rerun stores the settings of its views.
+        tabs: layout of the views.
+        path: file to write, ``.rrd``. An existing file is replaced only when the new one is complete.
 
     Raises:
-        CfbError: rerun is not installed, or the file cannot be written.
+        CfbError: rerun is not installed, the path does not end in ``.rrd``, or the file cannot be written.
     """
     rr = _rerun(path)
     if Path(path).suffix != ".rrd":
@@ -83,10 +83,11 @@ def recording(application: str, tabs: Sequence[Tab], path: str | Path) -> Iterat
 
 
 def open_viewer(path: str | Path) -> None:
-    """Open rerun's viewer on a recording and leave it open.
+    """Open a recording in rerun's viewer, which stays open.
 
     Raises:
-        CfbError: there is no such file, rerun is not installed, or its viewer ends at once (no display).
+        CfbError: there is no such file, rerun is not installed, or its viewer ends at once (for example without a
+            display).
     """
     read_bytes(path, 1)
     _rerun(path)
@@ -105,33 +106,35 @@ def open_viewer(path: str | Path) -> None:
         if failed:
             said.seek(0)
             words = " ".join(said.read().decode(errors="replace").split())[-200:]
-            raise CfbError(f"{path}: rerun's viewer does not open here ({words}); copy the file to where it does.")
+            raise CfbError(
+                f"{path}: rerun's viewer does not open here ({words}); copy the file to a machine with a display."
+            )
 
 
 class Recorder:
-    """Puts flights into a recording. Times are seconds, positions m in the world, quaternions ``[w, x, y, z]``."""
+    """Writes flights into a recording. Times in s, positions in m (world), quaternions ``[w, x, y, z]``."""
 
     def __init__(self, rr: Any, stream: Any):
         self._rr, self._stream = rr, stream
 
     def world(self, entity: str) -> None:
-        """The root of a 3D view: z up."""
+        """Declare an entity as the root of a 3D view with z up."""
         self._stream.log(entity, self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def line(self, entity: str, points: np.ndarray, colour: str | None = None) -> None:
-        """A line (n, 3) that is there all the time."""
+        """Record a line (n, 3) that is always visible."""
         strips = self._rr.LineStrips3D([points], radii=0.003, colors=_rgb(colour))
         self._stream.log(entity, strips, static=True)
 
     def lines(self, entity: str, time: np.ndarray, strips: np.ndarray, colour: str) -> None:
-        """Lines (n, points, 3), each shown from its time on."""
+        """Record lines (n, points, 3), each shown from its time on."""
         rr = self._rr
         self._stream.log(entity, rr.LineStrips3D.from_fields(colors=_rgb(colour)), static=True)
         columns = rr.LineStrips3D.columns(strips=list(np.asarray(strips, np.float32)))
         self._stream.send_columns(entity, self._time(time), columns)
 
     def point(self, entity: str, time: np.ndarray, positions: np.ndarray, colour: str) -> None:
-        """A point (n, 3) that moves: a set-point."""
+        """Record a moving point (n, 3), for example a set-point."""
         rr = self._rr
         self._stream.log(entity, rr.Points3D.from_fields(colors=_rgb(colour), radii=0.015), static=True)
         self._stream.send_columns(entity, self._time(time), rr.Points3D.columns(positions=positions))
@@ -145,15 +148,15 @@ class Recorder:
         thrust: np.ndarray | None = None,
         colour: str = LIGHT,
     ) -> None:
-        """A drone that flies, with an arrow for the thrust of each rotor.
+        """Record a moving drone, with an arrow for the thrust of each rotor.
 
         Args:
-            entity: its path.
+            entity: path of its entity.
             time: (n,) s.
             position: (n, 3) m.
             quaternion: (n, 4), body to world.
             thrust: (n, 4) N, of M1 to M4; None: no arrows.
-            colour: of its arms.
+            colour: colour of its arms.
         """
         rr = self._rr
         poses = rr.Transform3D.columns(translation=position, quaternion=np.asarray(quaternion)[:, [1, 2, 3, 0]])
@@ -173,7 +176,7 @@ class Recorder:
         self._stream.send_columns(arrows, self._time(time), columns.partition([4] * len(thrust)))
 
     def series(self, entity: str, time: np.ndarray, values: np.ndarray, label: str, colour: str | None = None) -> None:
-        """A number (n,) over time."""
+        """Record a number (n,) over time."""
         rr = self._rr
         self._stream.log(entity, rr.SeriesLines(names=label, colors=_rgb(colour)), static=True)
         self._stream.send_columns(entity, self._time(time), rr.Scalars.columns(scalars=values))
@@ -205,7 +208,7 @@ def _blueprint(tabs: Sequence[Tab]):
 
 
 def _eye(rrb, seen: np.ndarray | None) -> dict:
-    """Looking along -x, as flips about x are seen face on, from so far that all is in the picture."""
+    """Camera looking along -x, so that flips about x are seen face on, at a distance that shows the whole region."""
     if seen is None or not np.isfinite(seen).all():
         return {}
     low, high = np.asarray(seen, float)

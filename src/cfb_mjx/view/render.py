@@ -1,8 +1,8 @@
-"""Draw a flight with MuJoCo, picture by picture; run by `film` in a process of its own, for OpenGL is chosen at import.
+"""Render the frames of a flight with MuJoCo. `film` runs this in a separate process, which chooses OpenGL at import.
 
     python -m cfb_mjx.view.render JOB.npz
 
-The job holds what `film` puts there; pictures go to standard output as raw RGB, one after the other.
+The job is written by `film`. The frames go to standard output as raw RGB, one after the other.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, cast
 import mujoco as _mujoco
 import numpy as np
 
-# Most of it is compiled, and nothing says what that holds.
+# MuJoCo's compiled module has no type information.
 mujoco = cast(Any, _mujoco)
 
 WAY = np.array([0.0, 0.45, 0.7, 0.9], np.float32)
@@ -24,10 +24,10 @@ MOTORS = 0.03535 * np.array([[1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
 
 
 def main(path: str) -> None:
-    """Draw the job in ``path``."""
+    """Render the job in ``path``."""
     job = np.load(path)
     model = mujoco.MjModel.from_xml_string(str(job["xml"]))
-    # The far plane is so many extents away; the floor is to end at the horizon, not at a few metres.
+    # The far plane is a multiple of the extent; this value makes the floor reach the horizon.
     model.stat.extent = 2.0
     width, height = (int(x) for x in job["size"])
     data, camera = mujoco.MjData(model), mujoco.MjvCamera()
@@ -39,7 +39,7 @@ def main(path: str) -> None:
             mujoco.mj_forward(model, data)
             camera.lookat[:] = job["look_at"][i]
             renderer.update_scene(data, camera)
-            # Without a graphics card shadows take longer than all the rest.
+            # Without a graphics card, shadows take longer than everything else.
             renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False
             renderer.scene.flags[mujoco.mjtRndFlag.mjRND_REFLECTION] = False
             renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = False

@@ -1,4 +1,4 @@
-"""Rotors: commanded against measured speed, and thrust and torque curves through their bench points."""
+"""Figure of rotor fits: simulated and measured speed, and thrust and torque curves with their bench points."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ def rotor_figure(
     """Draw the fits of `cfb fit-rotors`, each with its residuals below.
 
     Args:
-        replays: simulated and measured rotor speeds, a column each.
-        maps: ``thrust`` and ``torque``, a column each.
+        replays: simulated and measured rotor speeds, one column each.
+        maps: fits of ``thrust`` and ``torque``, one column each.
         path: file to write, ``.svg``, ``.png`` or ``.pdf``.
-        title: heading.
+        title: title of the figure.
 
     Raises:
-        CfbError: nothing to draw, an unknown ending, or the file cannot be written.
+        CfbError: there is no fit to draw, the ending of ``path`` is not supported, or the file cannot be written.
     """
     path = style.check_path(path)
     count = len(replays) + len(maps)
@@ -58,7 +58,7 @@ def _draw_replay(top, bottom, item: Replay) -> None:
     top.plot(item.time, item.measured, color=style.MEASURED, linewidth=1.1, label="measured")
     top.plot(item.time, item.simulated, color=style.COLOURS["commands_in"], linewidth=1.2, label="from commands alone")
     name = f"motor M{item.motor}" if item.motor else "motor"
-    top.set_title(f"{name}: {item.rms:.3g} rad/s rms off")
+    top.set_title(f"{name}: {item.rms:.3g} rad/s rms error")
     top.set_ylabel("rotor speed, rad/s")
     top.legend(loc="best", fontsize=8)
     bottom.plot(item.time, item.measured - item.simulated, color=style.MEASURED, linewidth=0.9)

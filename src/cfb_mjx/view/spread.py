@@ -1,4 +1,4 @@
-"""How far randomised drones spread when all receive the same commands."""
+"""Figure of the spread of randomised drones that all receive the same commands."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ def spread_figure(
     reference_label: str = "measured",
     title: str = "",
 ) -> None:
-    """Draw quantile bands over many drones.
+    """Draw quantile bands of position and tilt over many drones.
 
     Args:
         time: (T,) s.
         position: (N, T, 3) m.
         tilt: (N, T) angle between the body's and the world's z axis, deg.
         path: file to write, ``.svg``, ``.png`` or ``.pdf``.
-        reference: time (K,), position (K, 3) and tilt (K,) of one flight to compare with, same units.
-        reference_label: what that flight is called in the legend.
-        title: heading.
+        reference: time (K,), position (K, 3) and tilt (K,) of one flight to compare with, in the same units.
+        reference_label: legend label of that flight.
+        title: title of the figure.
 
     Raises:
-        CfbError: an unknown ending, or the file cannot be written.
+        CfbError: the ending of ``path`` is not supported, or the file cannot be written.
     """
     path = style.check_path(path)
     panels = [(f"position {axis}", "m", position[..., i]) for i, axis in enumerate(style.AXES)]
@@ -63,7 +63,7 @@ def spread_figure(
 
 
 def tilt_deg(quaternion: np.ndarray) -> np.ndarray:
-    """Angle between body z and world z, deg, of [w, x, y, z] quaternions (..., 4)."""
+    """Angle between body z and world z, deg, from [w, x, y, z] quaternions (..., 4)."""
     _, x, y, _ = np.moveaxis(quaternion, -1, 0)
-    # From the sine of the half angle: exact near zero, where arccos of the matrix entry is not.
+    # From the sine of the half angle, because arccos of the matrix entry is inaccurate near zero.
     return np.degrees(2 * np.arcsin(np.clip(np.hypot(x, y), 0.0, 1.0)))

@@ -1,4 +1,4 @@
-"""One look for all figures: colours that survive colour blindness and grey print, and headless saving."""
+"""Common style of all figures (colours that suit colour blindness and grey print), and saving without a display."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _RC: dict[RcKeyType, Any] = {
     "grid.linewidth": 0.6,
     "axes.axisbelow": True,
     "legend.frameon": False,
-    # Fixed ids and text as text: the same results give the same small SVG.
+    # Fixed ids, and text stored as text: equal results give equal, small SVG files.
     "svg.hashsalt": "cfb_mjx",
     "svg.fonttype": "none",
     "font.family": "sans-serif",
@@ -47,28 +47,28 @@ _RC: dict[RcKeyType, Any] = {
 
 
 def context():
-    """Settings for the drawing and saving of one figure; the caller's own stay untouched."""
+    """Context manager with the settings for drawing and saving a figure; restores the caller's settings."""
     import matplotlib
 
     return matplotlib.rc_context(_RC)
 
 
 def new_figure(width: float, height: float):
-    """An empty figure of ``width`` x ``height`` inches that needs no display and leaves no global state."""
+    """An empty figure of ``width`` x ``height`` inches, without display or global state."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    # Callers give margins themselves: matplotlib's constrained layout would draw everything twice.
+    # Callers set the margins, because matplotlib's constrained layout draws everything twice.
     figure = Figure(figsize=(width, height))
     FigureCanvasAgg(figure)
     return figure
 
 
 def check_path(path: str | os.PathLike) -> Path:
-    """The path, if its ending names a format figures are written in.
+    """The path, if its ending is a supported format of figures.
 
     Raises:
-        CfbError: another ending.
+        CfbError: the ending is not supported.
     """
     return require_ending(path, FIGURES, f"a figure must end in {', '.join(FIGURES)}")
 
@@ -105,7 +105,7 @@ def save(figure, path: Path) -> None:
 
 def _write(figure, path: Path) -> None:
     suffix = path.suffix.lower()
-    # Without a date, equal figures are equal files.
+    # Without a date, equal figures give equal files.
     metadata = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}.get(suffix)
     with replacing(path) as temporary:
         figure.savefig(temporary, format=suffix[1:], dpi=130, metadata=metadata)

@@ -39,7 +39,7 @@ class BladeFlapping(Effect):
     name: ClassVar[str] = "blade_flapping"
     meaning: ClassVar[str] = "sideways motion tilts the rotor discs and turns the body"
     experiment: ClassVar[str] = (
-        "straight passes at constant speed, 0.5 to 3 m/s, forth and back and in both body axes, repeated while climbing"
+        "straight passes at constant speed, 0.5 to 3 m/s, back and forth, along both body axes, repeated while climbing"
     )
     units: ClassVar[dict[str, str]] = {
         "coefficient": "N s",

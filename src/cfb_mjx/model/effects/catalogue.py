@@ -316,7 +316,7 @@ def _complaint(kind: type[Effect]) -> str | None:
         return f"'name' must consist of lower-case letters, digits and underscores, found {name!r}"
     shipped = {key: each.__name__ for key, each in _SHIPPED.items()} | {COMMAND_LEAD: "the search"}
     if (owner := (shipped | dict.fromkeys(SENSOR_FAULTS, "a sensor fault")).get(name)) is not None:
-        return f"the name {name!r} is taken by {owner}; choose another"
+        return f"{owner} has the name {name!r} already"
     fields = [item.name for item in dataclasses.fields(kind)]
     for attribute in ("units", "prior"):
         given = getattr(kind, attribute, None)

@@ -40,7 +40,7 @@ class Gust(Effect):
     """Velocity of the air with autocorrelation intensity^2 exp(-|t| / time_scale)."""
 
     name: ClassVar[str] = "gust"
-    meaning: ClassVar[str] = "the air wanders about its mean"
+    meaning: ClassVar[str] = "the velocity of the air varies randomly about its mean"
     experiment: ClassVar[str] = "minutes of hover, outdoors or before a fan, and the same indoors"
     units: ClassVar[dict[str, str]] = {"intensity": "m/s", "time_scale": "s", "seed": "1"}
     source: ClassVar[str] = (

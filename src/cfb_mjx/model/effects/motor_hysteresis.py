@@ -27,7 +27,7 @@ class MotorHysteresis(Effect):
 
     name: ClassVar[str] = "motor_hysteresis"
     meaning: ClassVar[str] = "the motor controllers do not follow small changes of the command"
-    experiment: ClassVar[str] = "small command steps to and fro about hover, rotor speed logged"
+    experiment: ClassVar[str] = "small command steps up and down about hover, rotor speed logged"
     units: ClassVar[dict[str, str]] = {"width": "1", "share": "1"}
     source: ClassVar[str] = (
         "G. Tao, P. Kokotovic, Adaptive Control of Systems with Actuator and Sensor Nonlinearities, 1996 (backlash)"

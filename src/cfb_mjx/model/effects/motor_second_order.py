@@ -25,7 +25,7 @@ class MotorSecondOrder(Effect):
     """lag y' = K u - y, T Omega' = y - Omega."""
 
     name: ClassVar[str] = "motor_second_order"
-    meaning: ClassVar[str] = "the motors answer with a second lag"
+    meaning: ClassVar[str] = "the motors respond with a second lag"
     experiment: ClassVar[str] = MotorTimeConstant.experiment
     coarse: ClassVar[dict[int, float]] = {0: 0.3}
     units: ClassVar[dict[str, str]] = {"lag": "s"}

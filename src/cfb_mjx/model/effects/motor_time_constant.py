@@ -17,7 +17,7 @@ class MotorTimeConstant(Effect):
     """T *= 1 + relative."""
 
     name: ClassVar[str] = "motor_time_constant"
-    meaning: ClassVar[str] = "the motors answer slower or faster than declared"
+    meaning: ClassVar[str] = "the motors respond slower or faster than declared"
     experiment: ClassVar[str] = "cfb excite single-motor: steps of one motor at a time, rotor speed logged"
     units: ClassVar[dict[str, str]] = {"relative": "1"}
     source: ClassVar[str] = "How to Model Your Crazyflie Brushless, ICRA 2026, eq. 5"

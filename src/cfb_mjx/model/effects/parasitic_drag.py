@@ -24,7 +24,7 @@ class ParasiticDrag(Effect):
     name: ClassVar[str] = "parasitic_drag"
     meaning: ClassVar[str] = "the body drags against motion, with the square of speed"
     experiment: ClassVar[str] = (
-        "straight passes at constant speed, 0.5 to 3 m/s, forth and back and in both body axes, the fastest as fast "
+        "straight passes at constant speed, 0.5 to 3 m/s, back and forth, along both body axes, the fastest as fast "
         "as there is room for"
     )
     units: ClassVar[dict[str, str]] = {"linear": "N s/m", "quadratic": "N s^2/m^2", "cross": "1"}

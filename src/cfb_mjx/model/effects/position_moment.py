@@ -33,7 +33,7 @@ class PositionMoment(Effect):
     """tau = (Omega / 1594) (-q_y, q_x, 0) with q = R^T (gradient * (p_x, p_y, 0))."""
 
     name: ClassVar[str] = "position_moment"
-    meaning: ClassVar[str] = "a torque hangs on the position, as in air that moves towards the middle of a room"
+    meaning: ClassVar[str] = "a torque depends on the position, as in air that moves towards the middle of a room"
     experiment: ClassVar[str] = "slow passes through the whole room, and the same passes in a larger one"
     units: ClassVar[dict[str, str]] = {"gradient": "N"}
     source: ClassVar[str] = (

@@ -25,7 +25,7 @@ class RotorDrag(Effect):
 
     name: ClassVar[str] = "rotor_drag"
     meaning: ClassVar[str] = "the rotors drag against sideways motion, in proportion to speed"
-    experiment: ClassVar[str] = "straight passes at constant speed, 0.5 to 3 m/s, forth and back and in both body axes"
+    experiment: ClassVar[str] = "straight passes at constant speed, 0.5 to 3 m/s, back and forth, along both body axes"
     units: ClassVar[dict[str, str]] = {"coefficient": "N s/m"}
     source: ClassVar[str] = (
         "P. Martin, E. Salaun, The true role of accelerometer feedback in quadrotor control, ICRA 2010; M. "

@@ -1,1 +1,1 @@
-"""Experiment design: manoeuvres, their simulated flight, and what a fit will know of it."""
+"""Experiment design: manoeuvres, their simulation, and the expected uncertainty of a fit to them."""

@@ -1,4 +1,4 @@
-"""What a real flight adds to the model: noise of the sensors, and what pushes the drone unknown to anyone."""
+"""Conditions of a simulated real flight: noise of the sensors, and unknown disturbances."""
 
 from __future__ import annotations
 
@@ -7,25 +7,26 @@ from dataclasses import dataclass, replace
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a real flight adds to the model. Standard deviations of white noise per row, and rms of what wanders.
+    """Sensor noise and disturbances of a flight.
 
-    What wanders is an Ornstein-Uhlenbeck process, one per axis.
+    Sensor noise is white, with the given standard deviation per row. Each disturbance is an Ornstein-Uhlenbeck process
+    per axis, with the given rms.
 
     Attributes:
-        gyro: rad/s.
-        accelerometer: m/s^2.
-        rotor: of the measured rotor speed, rad/s.
+        gyro: noise, rad/s.
+        accelerometer: noise, m/s^2.
+        rotor: noise of the measured rotor speed, rad/s.
         measured_rotors: whether rotor speed is logged.
-        row: time between rows of the log, s. At 2 ms every command of the stabiliser is in the log; at 4 ms every
-            other one is not, and because it answers the gyro's noise, a fit then takes for the drone's what is the
-            log's (``docs/identification.md``).
-        position: of the estimator, m.
-        velocity: of the estimator, m/s.
-        attitude: of the estimator, rad.
+        row: time between rows of the log, s. At 2 ms the log contains every command of the stabiliser. At 4 ms every
+            other command is missing; as the commands respond to the gyro's noise, this biases a fit
+            (``docs/identification.md``).
+        position: noise of the estimator, m.
+        velocity: noise of the estimator, m/s.
+        attitude: noise of the estimator, rad.
         disturbance: unmodelled torque over inertia, rad/s^2.
         force_disturbance: unmodelled force over mass along body z, m/s^2.
         rotor_disturbance: error of the steady rotor speed (battery, load), rad/s.
-        correlation_time: of all that wanders, s.
+        correlation_time: of all disturbances, s.
     """
 
     gyro: float = 0.02
@@ -43,6 +44,6 @@ class Conditions:
 
     @property
     def calm(self) -> Conditions:
-        """The same sensors without noise or disturbance."""
+        """The same conditions without noise and disturbances."""
         levels = [name for name in vars(self) if name not in ("measured_rotors", "row", "correlation_time")]
         return replace(self, **dict.fromkeys(levels, 0.0))

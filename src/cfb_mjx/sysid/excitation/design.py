@@ -1,9 +1,9 @@
-"""The open-loop manoeuvre that tells most about the chosen parameters within limits (D-optimal design).
+"""D-optimal design of an open-loop manoeuvre: the most informative one about chosen parameters within limits.
 
-From a known manoeuvre on, the commands of every motor are changed by a free number per `KNOT` seconds, in a coordinate
-that squeezes the real numbers into the allowed range. Adam climbs
-the log determinant of the information, differentiated through filter and simulator, minus penalties for what exceeds
-the limits; from several starts at once, because there are many local optima. What counts in the end is a hard check.
+Starting from a known manoeuvre, the commands of every motor are changed by one free variable per `KNOT` seconds, mapped
+to the allowed range by a sigmoid. Adam maximises the log determinant of the information, differentiated through filter
+and simulator, minus penalties for exceeding the limits. Several starts are optimised at once, because there are many
+local optima. Finally, the limits are enforced by a hard check.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.unknowns import Unknowns
 
 KNOT = 0.02
+"""Time between the free variables of a command, s."""
 _PENALTY = 300.0
 _RATE = 0.03
-"""Step of Adam in the squeezed coordinate, where the whole command range is about -3 to 3; it falls to zero."""
+"""Initial learning rate of Adam, in the unbounded coordinate, in which the command range is about -3 to 3."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +52,10 @@ class Design:
     """Result of `optimise`.
 
     Attributes:
-        commands: (n, 4).
-        log_det: of the information of one repetition (`cfb_mjx.sysid.excitation.information.log_determinant`).
-        history: (iterations,) best objective over the starts, penalties included.
+        commands: (n, 4) of the manoeuvre.
+        log_det: log determinant of the information of one repetition
+            (`cfb_mjx.sysid.excitation.information.log_determinant`).
+        history: (iterations,) best objective over the starts, including penalties.
     """
 
     commands: np.ndarray
@@ -62,7 +64,7 @@ class Design:
 
 
 class Problem(eqx.Module):
-    """What is maximised."""
+    """Objective of the design: drone, parameters, noise and limits."""
 
     model: Quadrotor
     unknowns: Unknowns
@@ -74,40 +76,53 @@ class Problem(eqx.Module):
 
     @classmethod
     def of(cls, model: Quadrotor, unknowns: Unknowns, noise: Noise, limits: Limits, measured_rotors: bool) -> Problem:
-        """For ``model`` with the parameters of ``unknowns``, stepped once per row of the sequence."""
-        # Euler with exact mean loads makes a program a quarter the size of RK4's; the hard check uses RK4.
+        """Problem for a drone, integrated with one step per row of the sequence.
+
+        Args:
+            model: the drone; its parameters are replaced by the nominal ones of ``unknowns``.
+            unknowns: parameters to be fitted.
+            noise: noise levels.
+            limits: of the manoeuvre.
+            measured_rotors: whether rotor speed is logged.
+        """
+        # The program for Euler with exact mean loads is a quarter the size of that for RK4; the hard check uses RK4.
         model = stepped(Quadrotor(unknowns.nominal, model.effects, model.body), integrator="euler", rotor_loads="mean")
         return cls(model, unknowns, noise, jnp.asarray(per_relative_change(unknowns)), limits, measured_rotors)
 
     def commands(self, change: Float[Array, "knots 4"], start: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
-        """``start``, in squeezed coordinates, plus a change per knot: always within the command range."""
+        """Commands within the allowed range from unbounded coordinates: ``start`` plus a change per knot."""
         low, high = self.limits.command
         knot = ((np.arange(len(start)) * STEP + 1e-9) // KNOT).astype(int)
         return low + (high - low) * jax.nn.sigmoid(start + change[knot])
 
     def squeezed(self, commands: np.ndarray) -> np.ndarray:
-        """Unbounded numbers that stand for ``commands``."""
+        """Unbounded coordinates of commands."""
         low, high = self.limits.command
         share = np.clip((commands - low) / (high - low), 0.01, 0.99)
         return np.log(share / (1 - share))
 
     def information(self, commands: Float[Array, "n 4"], path: State | None = None) -> Float[Array, "k k"]:
-        """Of one repetition; ``path`` is what `flown` gives."""
+        """Fisher information of one repetition.
+
+        Args:
+            commands: (n, 4) of the manoeuvre.
+            path: states of the flight, from `flown`; computed by default.
+        """
         path = flown(self.model, commands) if path is None else path
         return window_information(
             self.model, commands, path, self.unknowns, self.noise, self.measured_rotors, self.relative
         )
 
     def judged(self, commands: np.ndarray) -> np.ndarray:
-        """`information`, compiled once for all sequences of a length."""
+        """`information` as a NumPy array, compiled once for all sequences of one length."""
         return np.asarray(_information(self, jnp.asarray(commands)))
 
     def loss(self, change: Float[Array, "knots 4"], start: Float[Array, "n 4"]) -> Float[Array, ""]:
-        """Negative log determinant plus penalties."""
+        """Negative log determinant of the information plus penalties."""
         commands = self.commands(change, start)
         path = flown(self.model, commands)
         asked = self.limits.shares(demand(path))
-        # A little inside the margin, so that the smooth penalty ends up on the right side of it.
+        # The penalty begins slightly inside the margin, so that the optimum keeps it.
         over = jax.tree.map(lambda x: jnp.sum(jax.nn.relu(x / self.margin - 0.98) ** 2), asked)
         return _PENALTY * sum(jax.tree.leaves(over)) - log_determinant(self.information(commands, path))
 
@@ -119,13 +134,13 @@ def optimise(
     starts: int = 4,
     progress: Callable[[int, int], None] | None = None,
 ) -> Design:
-    """The best sequence found within the limits.
+    """Find the most informative command sequence within the limits.
 
     Args:
         problem: drone, parameters, noise and limits.
-        duration: s.
-        iterations: of Adam.
-        starts: roll-pitch, all axes, single-motor, then multisines with seeds 0, 1, ...
+        duration: of the manoeuvre, 0.1 to 2 s.
+        iterations: number of steps of Adam.
+        starts: number of initial sequences: roll-pitch, all axes, single-motor, then multisines with seeds 0, 1, ...
         progress: called with (done, total) iterations.
 
     Raises:
@@ -167,12 +182,12 @@ def _starts(problem: Problem, duration: float, count: int) -> list[np.ndarray]:
 def slopes(
     problem: Problem, change: Float[Array, "starts knots 4"], start: Float[Array, "starts n 4"]
 ) -> tuple[Float[Array, " starts"], Float[Array, "starts knots 4"]]:
-    """Loss of every start, and its gradient by the changes."""
+    """Loss of every start, and its gradient with respect to the changes."""
     return jax.vmap(jax.value_and_grad(problem.loss))(change, start)
 
 
 def _best(problem: Problem, candidates: list[np.ndarray]) -> tuple[np.ndarray, float]:
-    """The best candidate within the limits; one that exceeds them is first drawn towards hover until it does not."""
+    """The most informative candidate; candidates beyond the limits are first scaled towards hover."""
     hover = hovering(problem.model, problem.limits)
     kept = [scaled_down(problem, hover, commands) for commands in candidates]
     values = [float(log_determinant(problem.judged(c))) for c in kept]
@@ -181,7 +196,7 @@ def _best(problem: Problem, candidates: list[np.ndarray]) -> tuple[np.ndarray, f
 
 
 def scaled_down(problem: Problem, hover: np.ndarray, commands: np.ndarray) -> np.ndarray:
-    """``commands`` if they keep the limits, else the nearest mixture with hover that does."""
+    """The commands, scaled towards hover as far as necessary to keep the limits."""
     mixtures = hover + np.linspace(1.0, 0.0, 101)[:, None, None] * (commands - hover)
     return mixtures[int(np.argmax(worst(problem.model, mixtures, problem.limits) <= problem.margin))]
 

@@ -1,6 +1,6 @@
-"""A flight that repeats a manoeuvre, simulated: hover, open loop, catch, return; as a log and as what truly happened.
+"""Simulated flights that repeat a manoeuvre (hover, open loop, catch, return), as a log and as true states.
 
-The loop runs every 2 ms, as the firmware's attitude loop; the open-loop commands change every 4 ms.
+The control loop runs every 2 ms, like the attitude loop of the firmware. The open-loop commands change every 4 ms.
 """
 
 from __future__ import annotations
@@ -24,23 +24,27 @@ from cfb_mjx.sysid.excitation.conditions import Conditions
 from cfb_mjx.sysid.excitation.manoeuvres import STEP, stepped
 
 TICK = 0.002
+"""Period of the control loop, s."""
 SETTLE, BRAKING, CATCH, RETURN = 1.0, 1.2, 2.0, 2.5
-"""Hover before the first manoeuvre; from the handover on only stopping; until when it should have settled, holding
-where it stopped; then flying back to the start, s."""
+"""Phases of a flight, s: hover before the first manoeuvre; braking after the handover; time from the handover until the
+drone should have settled, holding the position where it stopped; return to the start."""
 _RETURN_SPEED = 0.5
 
 
 class Stabiliser(Protocol):
-    """What flies the drone outside the manoeuvre: pure functions of a memory (any pytree), called every `TICK`."""
+    """Controller that flies the drone outside the manoeuvre: pure functions of a memory (any pytree).
+
+    It is called every `TICK`.
+    """
 
     def start(self, measurement: State) -> Any:
-        """The memory at the first measurement."""
+        """Memory at the first measurement."""
 
     def resume(self, memory: Any, measurement: State) -> Any:
-        """The memory when taking over after the manoeuvre, during which it was not called."""
+        """Memory when taking over after the manoeuvre, during which the controller was not called."""
 
     def command(self, memory: Any, measurement: State, position: Array, yaw: Array) -> tuple[Any, Array]:
-        """New memory and command (4,) to hold ``position`` [m, world] and ``yaw`` [rad]."""
+        """New memory, and command (4,) to hold ``position``, m, world axes, and ``yaw``, rad."""
         ...
 
 
@@ -49,13 +53,13 @@ class Experiment:
     """A simulated flight.
 
     Attributes:
-        log: what would be recorded (pose and velocity late by the model's ``pose_delay``,
-            the gyro by ``gyro_delay``).
+        log: the log that would be recorded, with pose and velocity delayed by the model's ``pose_delay`` and the gyro
+            by ``gyro_delay``.
         time: (n,) s, every `TICK`.
         state: true states at ``time``.
-        command: (n, 4) in force from ``time`` on.
+        command: (n, 4) applied from ``time`` on.
         starts: (repetitions,) index of the first tick of each manoeuvre.
-        length: ticks of a manoeuvre.
+        length: number of ticks of a manoeuvre.
     """
 
     log: FlightLog
@@ -76,15 +80,15 @@ def fly(
     seed: int = 0,
     name: str = "excitation",
 ) -> Experiment:
-    """Simulate hover, then ``repetitions`` times: the sequence open loop, catch, return to the start.
+    """Simulate a flight: hover, then ``repetitions`` times the open-loop sequence, catch, and return to the start.
 
     Args:
-        model: the drone; stepped at `TICK` with RK4 whatever its own choices.
-        stabiliser: flies outside the manoeuvre; not called during it.
-        sequence: (m, 4) commands, each held `STEP` seconds.
-        repetitions: of the manoeuvre, in one flight.
+        model: the drone; it is integrated with RK4 in steps of `TICK`, regardless of its own options.
+        stabiliser: controller outside the manoeuvre; it is not called during the manoeuvre.
+        sequence: (m, 4) commands, each held for `STEP` seconds.
+        repetitions: number of manoeuvres in the flight.
         conditions: noise and disturbances.
-        height: at which it hovers, m.
+        height: of the hover, m.
         seed: of noise and disturbances.
         name: of the log.
     """
@@ -116,12 +120,12 @@ def follow(
     seed: int = 0,
     name: str = "path",
 ) -> Experiment:
-    """Simulate a flight along a path, from hover at its first point.
+    """Simulate a flight along a path, starting in hover at its first point.
 
     Args:
-        model: the drone; stepped at `TICK` with RK4 whatever its own choices.
-        stabiliser: flies it.
-        path: (n, 4) set-points x, y, z [m] and yaw [rad], one per `TICK`.
+        model: the drone; it is integrated with RK4 in steps of `TICK`, regardless of its own options.
+        stabiliser: controller.
+        path: (n, 4) set-points x, y, z, m, and yaw, rad, one per `TICK`.
         conditions: noise and disturbances.
         seed: of noise and disturbances.
         name: of the log.
@@ -135,7 +139,7 @@ def follow(
 
 
 def _flown(model: Quadrotor, stabiliser: Stabiliser, start: State, phase, fixed, conditions: Conditions, seed, name):
-    """Log, time, true states and commands of a flight in given phases."""
+    """Simulate a flight with given phases; return log, time, true states and commands."""
     n = len(phase)
     rng = np.random.default_rng(seed)
     widths = {"gyro": 3, "pose": 9, "torque": 3, "force": 1, "rotor": 4}
@@ -150,12 +154,12 @@ def _flown(model: Quadrotor, stabiliser: Stabiliser, start: State, phase, fixed,
 
 
 OPEN, HANDOVER, BRAKE, BACK, FOLLOW = 1, 2, 3, 4, 5
-"""Phases of a flight besides 0, holding a position. While `OPEN`, what is fixed are commands; while `FOLLOW`,
-set-points."""
+"""Phases of a flight; 0 is holding a position. The fixed inputs are commands during `OPEN` and set-points during
+`FOLLOW`."""
 
 
 class _Push(Effect):
-    """A force and a torque on the body, held over a step."""
+    """A force and a torque on the body, constant during a step."""
 
     name: ClassVar[str] = "push"
     force: Float[Array, "3"]
@@ -173,7 +177,7 @@ def _longest_delay(model: Quadrotor) -> float:
 def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs, longest_delay: float):
     p = model.parameters
     keep = jnp.exp(-TICK / levels["correlation_time"])
-    # One process per axis of torque, force and rotor; the first draw starts it in its steady state.
+    # One process per axis of torque, per force and per rotor; the first draw initialises it in its stationary state.
     wander = jnp.concatenate([jnp.full(3, levels["disturbance"]), levels["force_disturbance"][None]])
     wander = jnp.concatenate([wander, jnp.full(4, levels["rotor_disturbance"])])
 
@@ -199,7 +203,7 @@ def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs, 
             stabiliser.resume(memory, measured),
             memory,
         )
-        # While it brakes, the position to hold is where it is: only the velocity counts.
+        # While braking, the position set-point is the current position, so only the velocity is controlled.
         target = jnp.where((phase == HANDOVER) | (phase == BRAKE), measured.position, target)
         home = start.position - target
         way = jnp.minimum(1.0, _RETURN_SPEED * TICK / jnp.maximum(jnp.linalg.norm(home), 1e-9))
@@ -224,7 +228,7 @@ def _simulate(model: Quadrotor, stabiliser, start: State, levels: dict, inputs, 
     first = jax.tree.map(lambda x: x[0], inputs[2])
     memory = stabiliser.start(start)
     wandering = wander * jnp.concatenate([first["torque"], first["force"], first["rotor"]])
-    # The push remembers nothing, but a state has an entry for each effect.
+    # The push has no memory, but a state needs an entry for each effect.
     pushed = eqx.tree_at(lambda q: q.effects, model, (*model.effects, _Push(jnp.zeros(3), jnp.zeros(3))))
     begun = begin(pushed, eqx.tree_at(lambda s: s.memory, start, (), is_leaf=lambda x: isinstance(x, tuple)))
     carry = (begun, DelayLine.filled(begun, TICK, longest_delay), memory, start.position, wandering)

@@ -1,7 +1,8 @@
-"""How well a flight will tell the parameters, before it is flown.
+"""Expected uncertainty of the parameters from a flight, before it is flown.
 
 `cfb fit` maximises the likelihood of one-step innovations (`sysid.identification.innovation`). Its Fisher information
-is J^T J, with J the Jacobian of the whitened innovations at the true parameters, which in a simulated flight are known.
+is J^T J, where J is the Jacobian of the whitened innovations at the true parameters. In a simulated flight these are
+known.
 """
 
 from __future__ import annotations
@@ -28,13 +29,14 @@ from cfb_mjx.sysid.identification.uncertainty import LOOSEST, Uncertainty, asses
 from cfb_mjx.sysid.identification.unknowns import UNITS, Unknowns
 
 _ROUNDS = 3
+"""Number of fits of the noise levels in `linearise`."""
 _HOVER_ROWS = 50
-"""Hover before the manoeuvre in `window_information`: by then the filter knows the disturbance as well as it can."""
+"""Rows of hover before the manoeuvre in `window_information`, in which the filter converges."""
 
 
 @dataclass(frozen=True)
 class Expected:
-    """One parameter's expected uncertainty, SI."""
+    """Value and expected standard deviation of one parameter, SI."""
 
     value: float
     std: float
@@ -43,15 +45,15 @@ class Expected:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What `cfb fit` will be able to say.
+    """Expected result of `cfb fit`.
 
     Attributes:
-        names: of all that is asked for.
-        parameters: those that can be told.
-        unidentifiable: names of those that cannot.
-        combinations: what can be told of them together.
-        uncertainty: relative covariance, correlation.
-        noise: levels found in the simulated flight.
+        names: of all requested parameters.
+        parameters: identifiable parameters with their expected uncertainty.
+        unidentifiable: names of parameters that cannot be identified.
+        combinations: identifiable combinations of these.
+        uncertainty: relative covariance and correlation.
+        noise: noise levels fitted to the simulated flight.
     """
 
     names: tuple[str, ...]
@@ -63,25 +65,26 @@ class Prediction:
 
 
 class Linearised(eqx.Module):
-    """The fit's residuals about the true parameters."""
+    """Residuals of a fit, linearised at the true parameters."""
 
     residual: Float[np.ndarray, "blocks rows 8"]
-    """Whitened innovations at the truth, in the fit's blocks of rows."""
+    """Whitened innovations at the true parameters, in the fit's blocks of rows."""
     jacobian: Float[np.ndarray, "blocks rows 8 k"]
-    """Their derivatives by relative changes of the quantities (offsets: in their units)."""
+    """Derivatives with respect to relative changes of the quantities (offsets: in their units)."""
     noise: Noise
+    """Fitted noise levels."""
 
 
 def linearise(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = True) -> Linearised:
-    """Residuals and Jacobian of the fit at ``unknowns.nominal``, the truth, with noise levels of maximum likelihood.
+    """Residuals and Jacobian of a fit at the true parameters, with maximum-likelihood noise levels.
 
     Args:
         logs: simulated flights, with noise and disturbances.
-        unknowns: what would be fitted.
-        use_measured: drive the body with measured rotor speeds where there are some.
+        unknowns: parameters to be fitted; the nominal values are the true ones.
+        use_measured: drive the body with measured rotor speeds where available.
 
     Raises:
-        CfbError: a parameter that does not show in the innovations.
+        CfbError: a parameter does not affect the innovations (``pose_delay``).
     """
     if "pose_delay" in unknowns.names:
         raise CfbError("--parameters pose_delay: a manoeuvre cannot be designed for it; leave it out.")
@@ -96,7 +99,16 @@ def linearise(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = Tr
 
 
 def predict(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = True) -> Prediction:
-    """Uncertainty of a fit to simulated flights; arguments and errors as `linearise`."""
+    """Expected uncertainty of a fit to simulated flights.
+
+    Args:
+        logs: as for `linearise`.
+        unknowns: as for `linearise`.
+        use_measured: as for `linearise`.
+
+    Raises:
+        CfbError: as `linearise`.
+    """
     at_truth = linearise(logs, unknowns, use_measured)
     found = assess(at_truth.residual, at_truth.jacobian, unknowns.names)
     values, std = np.asarray(unknowns.values(unknowns.start)), found.std * unknowns.scale(unknowns.start)
@@ -109,7 +121,7 @@ def predict(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = True
 
 
 def typical(predictions: list[Prediction]) -> Prediction:
-    """The middle one, from the surest to the least sure: noise makes a single flight's bootstrap jump."""
+    """The median prediction by total uncertainty, because the bootstrap of a single flight varies with its noise."""
 
     def unsure(prediction: Prediction) -> tuple[int, float]:
         return len(prediction.unidentifiable), float(np.log(prediction.uncertainty.std).sum())
@@ -126,19 +138,19 @@ def window_information(
     measured_rotors: bool,
     relative: Float[Array, "k k"],
 ) -> Float[Array, "k k"]:
-    """Fisher information of one undisturbed manoeuvre after hover; differentiable in the commands.
+    """Fisher information of one undisturbed manoeuvre after hover; differentiable with respect to the commands.
 
     Args:
-        model: the true drone; its parameters are those of ``unknowns``.
+        model: the true drone; its parameters are the nominal ones of ``unknowns``.
         commands: (n, 4) of the manoeuvre.
-        path: (n,) states after each of them (`cfb_mjx.sysid.excitation.manoeuvres.flown`).
-        unknowns: what is to be told.
-        noise: levels.
+        path: (n,) states after each command (`cfb_mjx.sysid.excitation.manoeuvres.flown`).
+        unknowns: parameters to be fitted.
+        noise: noise levels.
         measured_rotors: whether rotor speed is logged.
         relative: `per_relative_change` of the unknowns.
 
     Returns:
-        (k, k), for relative changes of the quantities (offsets: cm).
+        Information (k, k) for relative changes of the quantities (offsets: in their units).
     """
     hover = jnp.broadcast_to(model.hover_command(), (_HOVER_ROWS, 4))
     start = model.hover_state()
@@ -167,16 +179,19 @@ def window_information(
 
 
 def per_relative_change(unknowns: Unknowns) -> np.ndarray:
-    """(k, k) derivative of the fit's vector by relative changes of the quantities (offsets: in their units)."""
+    """Derivatives (k, k) of the fit's vector with respect to relative changes of the quantities.
+
+    Offsets change in their units (`OFFSETS`).
+    """
     return np.linalg.inv(unknowns.slope(unknowns.start))
 
 
 def log_determinant(information: Float[AnyArray, "k k"]) -> Float[Array, ""]:
-    """D-optimality: log det of the information, with the little known before (50 %, where a fit gives up)."""
+    """D-optimality criterion: log determinant of the information plus a weak prior of 50 % (`LOOSEST`)."""
     return jnp.linalg.slogdet(information + jnp.eye(len(information)) / LOOSEST**2)[1]
 
 
 def marginal_std(information: Float[AnyArray, "k k"]) -> np.ndarray:
-    """(k,) standard deviations with everything else unknown, of relative changes (offsets: cm)."""
+    """Marginal standard deviations (k,) of relative changes (offsets: in their units), with the same weak prior."""
     known = np.asarray(information)
     return np.sqrt(np.diag(np.linalg.inv(known + np.eye(len(known)) / LOOSEST**2)))

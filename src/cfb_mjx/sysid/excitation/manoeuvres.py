@@ -1,4 +1,4 @@
-"""Manoeuvres that identify a drone: open-loop command sequences around hover, and the limits they must keep."""
+"""Manoeuvres for identification: open-loop command sequences around hover, and their limits."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.model.vector import Vec, up_axis
 
 STEP = 0.004
-"""Time each row of a sequence is held, s."""
+"""Time for which each row of a sequence is held, s."""
 _ROLL, _PITCH, _YAW = np.array(TORQUE_SIGNS)
 _THERE_AND_BACK = np.array([1.0, -1.0, -1.0, 1.0])
-"""Quarters of a doublet pair: rate and angle are both near zero after it."""
+"""Quarters of a doublet pair; after it, rate and angle are both near zero."""
 MARGIN = 0.75
-"""Share of every limit the undisturbed manoeuvre may use; disturbances, which nobody counters, take the rest."""
+"""Share of every limit that the undisturbed manoeuvre may use. The rest is for disturbances, because there is no
+feedback."""
 _BRAKING = 3.0
-"""Vertical deceleration the stabiliser is counted on for, m/s^2; the firmware's cap on thrust allows 8 when level."""
+"""Assumed vertical deceleration by the stabiliser, m/s^2; the firmware's thrust limit allows 8 in level attitude."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What a manoeuvre must keep, from its start until the stabiliser has it again.
+    """Limits of a manoeuvre, from its start until the stabiliser has taken over.
 
     Attributes:
-        rate: norm of the body rate, rad/s.
-        tilt_deg: angle between the body's z axis and the vertical, deg.
-        altitude_loss: below the height at the start, m, the way needed to stop sinking included.
-        end_rate: body rate at the handover, rad/s.
-        end_tilt_deg: tilt at the handover, deg.
-        command: lowest and highest command.
+        rate: largest norm of the body rate, rad/s.
+        tilt_deg: largest angle between the body's z axis and the vertical, deg.
+        altitude_loss: largest loss of height since the start, including the distance needed to stop sinking, m.
+        end_rate: largest norm of the body rate at the handover, rad/s.
+        end_tilt_deg: largest tilt at the handover, deg.
+        command: lowest and highest command, in [0, 1].
     """
 
     rate: float = 12.0
@@ -55,7 +56,7 @@ class Limits:
                 raise CfbError(f"the limit on {name.replace('_', ' ')} must be positive, found {value:g}.")
 
     def shares(self, asked: Demand) -> Demand:
-        """``asked`` with every quantity as a share of its limit."""
+        """Every quantity of ``asked`` as a share of its limit."""
 
         def lean(angle_deg):
             return 1 - np.cos(np.radians(angle_deg))
@@ -70,26 +71,28 @@ class Limits:
 
 
 class Demand(eqx.Module):
-    """What a sequence asks of the undisturbed drone, or the share of every limit that is (`Limits.shares`)."""
+    """Quantities that are limited, for an undisturbed flight, or their shares of the limits (`Limits.shares`)."""
 
     rate: Float[AnyArray, "*n"]
     """Norm of the body rate, rad/s."""
     lean: Float[AnyArray, "*n"]
-    """1 - cos of the tilt: the angle itself has no derivative at zero."""
+    """1 - cos of the tilt; the angle itself is not differentiable at zero."""
     altitude_loss: Float[AnyArray, "*n"]
-    """Below the start, with the way needed to stop sinking, m."""
+    """Loss of height since the start, including the distance needed to stop sinking, m."""
     end_rate: Float[AnyArray, "*k"]
+    """Norm of the body rate at the handover, rad/s."""
     end_lean: Float[AnyArray, "*k"]
+    """1 - cos of the tilt at the handover."""
 
 
 def flown(model: Quadrotor, commands: Float[Array, "n 4"]) -> State:
-    """States (n,) after each row of ``commands``, undisturbed, from hover at height zero."""
+    """Simulate an undisturbed flight from hover at height zero; states (n,) after each row of ``commands``."""
     return rollout(model, model.hover_state((0.0, 0.0, 0.0)), commands)
 
 
 def demand(path: State) -> Demand:
-    """What `flown` asks, row by row and at the end; differentiable."""
-    rate = jnp.linalg.norm(path.body_rate + 1e-9, axis=1)  # the norm has no derivative at zero
+    """Limited quantities of a flight, row by row and at the end; differentiable."""
+    rate = jnp.linalg.norm(path.body_rate + 1e-9, axis=1)  # the norm is not differentiable at zero
     lean = 1 - up_axis(Vec.unstack(path.quaternion))[2]
     sinking = jnp.maximum(-path.velocity[:, 2], 0.0)
     lost = -path.position[:, 2] + sinking**2 / (2 * _BRAKING)
@@ -97,70 +100,76 @@ def demand(path: State) -> Demand:
 
 
 def stepped(model: Quadrotor, **choices) -> Quadrotor:
-    """The model with one step per row of a sequence; RK4, which follows commands that jump; unless told otherwise."""
+    """The model with one RK4 step per row of a sequence, unless ``choices`` say otherwise."""
     return Quadrotor(model.parameters, model.effects, model.body, **({"dt": STEP, "integrator": "rk4"} | choices))
 
 
 def rows(duration: float) -> int:
-    """Rows of a sequence of ``duration`` seconds.
+    """Number of rows of a sequence of ``duration`` seconds.
 
     Raises:
-        CfbError: shorter than 0.1 s or longer than 2 s.
+        CfbError: the duration is shorter than 0.1 s or longer than 2 s.
     """
     if not 0.1 <= duration <= 2.0:
-        raise CfbError(f"an open-loop manoeuvre lasts 0.1 to 2 s, found {duration:g} s; nobody steers meanwhile.")
+        raise CfbError(f"an open-loop manoeuvre lasts 0.1 to 2 s, found {duration:g} s; it is flown without feedback.")
     return round(duration / STEP)
 
 
 def roll_pitch(duration: float = 0.5) -> np.ndarray:
-    """(n, 4) doublet pair about x, then about y, as changes of the command of unit height: for J_x and J_y."""
+    """Doublet pair about x, then about y (n, 4), as command changes of unit amplitude: for J_x and J_y."""
     n = rows(duration)
     half = n // 2
     return np.concatenate([_doublets(half, _ROLL), _doublets(n - half, _PITCH)])
 
 
 def all_axes(duration: float = 0.5) -> np.ndarray:
-    """(n, 4) doublet pairs about x and y, a quarter of the time each, then about z, as changes of unit height."""
+    """Doublet pairs about x and y, a quarter of the time each, then about z (n, 4), as changes of unit amplitude."""
     n = rows(duration)
     quarter = n // 4
     return np.concatenate([_doublets(quarter, _ROLL), _doublets(quarter, _PITCH), _doublets(n - 2 * quarter, _YAW)])
 
 
 def single_motor(duration: float = 0.5, motor: int = 0) -> np.ndarray:
-    """(n, 4) doublet pair of one motor, as changes of the command of unit height: for J_z and J_m.
+    """Doublet pair of one motor (n, 4), as command changes of unit amplitude: for J_z and J_m.
 
-    The motor's acceleration turns the body about z against its rotor (paper eq. 7); unlike a yaw command of all four,
-    the drone also rolls and pitches, by known amounts.
+    The motor's acceleration turns the body about z in the opposite direction (paper eq. 7). Unlike with a yaw command
+    of all four motors, the drone also rolls and pitches by known amounts.
     """
     return _doublets(rows(duration), np.eye(4)[motor])
 
 
 def multisine(duration: float, seed: int = 0, lines: int = 5) -> np.ndarray:
-    """(n, 4) sums of sines with random phases, no frequency in two motors, of height one at most."""
+    """Sums of sines with random phases (n, 4), at different frequencies for each motor, with a maximum of one.
+
+    Args:
+        duration: s.
+        seed: of the phases.
+        lines: number of sines per motor.
+    """
     n = rows(duration)
     rng = np.random.default_rng(seed)
     time = np.arange(n)[:, None, None] * STEP
-    # Whole periods fit into the sequence: every sine ends where it began.
+    # The sequence contains whole periods of every sine.
     frequency = (1 + np.arange(4)[None, :, None] + 4 * np.arange(lines)[None, None, :]) / (4 * n * STEP) * 4
     waves = np.sin(2 * np.pi * frequency * time + rng.uniform(0, 2 * np.pi, (1, 4, lines))).sum(-1)
     return waves / np.abs(waves).max()
 
 
 def scaled(model: Quadrotor, shape: np.ndarray, limits: Limits, margin: float = MARGIN) -> np.ndarray:
-    """Hover plus the largest multiple of ``shape`` that stays within ``margin`` of every limit.
+    """Hover plus the largest multiple of ``shape`` that keeps the limits.
 
     Args:
         model: the drone.
         shape: (n, 4) changes of the command.
-        limits: to keep.
+        limits: of the manoeuvre.
         margin: share of every limit that may be used.
 
     Returns:
-        (n, 4) commands.
+        Commands (n, 4).
 
     Raises:
-        CfbError: the drone cannot hover within the command range, or the limits leave no room for a movement that can
-            be told from noise.
+        CfbError: the drone cannot hover within the command range, or the limits leave no room for a motion that exceeds
+            the noise.
     """
     hover = hovering(model, limits)
     low, high = limits.command
@@ -168,7 +177,7 @@ def scaled(model: Quadrotor, shape: np.ndarray, limits: Limits, margin: float = 
     room = min(np.min(high - hover[change]), np.min(hover[change] - low)) / np.abs(shape).max()
     heights = np.linspace(0.0, room, 201)
     asked = worst(model, hover + heights[:, None, None] * shape, limits)
-    # Contiguous from zero: beyond the first violation lies nothing one would want.
+    # Use the largest height before the first violation; larger ones may be admissible again but are not wanted.
     first_bad = int(np.argmax(asked > margin)) if np.any(asked > margin) else len(heights)
     height = heights[max(first_bad - 1, 0)]
     if height * np.abs(shape).max() < 0.01:
@@ -180,22 +189,22 @@ def scaled(model: Quadrotor, shape: np.ndarray, limits: Limits, margin: float = 
 
 
 def hovering(model: Quadrotor, limits: Limits) -> np.ndarray:
-    """(4,) commands of hover.
+    """Commands (4,) of hover.
 
     Raises:
-        CfbError: they lie outside the limits.
+        CfbError: the commands lie outside the limits.
     """
     hover = np.asarray(model.hover_command(), dtype=float)
     if not np.all((hover > limits.command[0] + 0.02) & (hover < limits.command[1] - 0.02)):
         raise CfbError(
             f"this model hovers at commands {np.array2string(hover, precision=2)}, outside the range "
-            f"{limits.command[0]:g} to {limits.command[1]:g} a manoeuvre may use; check its mass and thrust."
+            f"{limits.command[0]:g} to {limits.command[1]:g} of a manoeuvre; check its mass and thrust."
         )
     return hover
 
 
 def worst(model: Quadrotor, commands: np.ndarray, limits: Limits) -> np.ndarray:
-    """(k,) largest share of a limit that each of (k, n, 4) sequences asks for; at most 1 is allowed."""
+    """Largest share of a limit (k,) that each sequence of commands (k, n, 4) uses; at most 1 is allowed."""
     return np.max(jax.tree.leaves(limits.shares(_peaks(stepped(model), jnp.asarray(commands)))), axis=0)
 
 

@@ -1,4 +1,4 @@
-"""Paths a position controller can follow, each of a kind that shows some effects and not others."""
+"""Paths for a position controller; each kind of path excites some effects and not others."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float
 
 SECONDS = 15.0
-"""Of every path."""
+"""Duration of every path, s."""
 HEIGHT = 1.2
-"""Of those that stay level, m; all keep within 1 m of the origin sideways and below 2.2 m."""
+"""Height of level paths, m. All paths stay within 1 m of the origin horizontally and do not exceed 2.2 m."""
 Path = Float[np.ndarray, "n 4"]
+"""Set-points x, y, z, m, and yaw, rad."""
 
 
 def _steps(time: np.ndarray, values: list[float], duration: float) -> np.ndarray:
@@ -19,7 +20,7 @@ def _steps(time: np.ndarray, values: list[float], duration: float) -> np.ndarray
 
 
 def _there_and_back(time: np.ndarray, reach: float, speeds: tuple[float, ...]) -> np.ndarray:
-    """From -reach to reach and back at each of the speeds in turn, then staying."""
+    """Motion from -reach to reach and back at each of the speeds in turn, then standing still."""
     corners, ends = [0.0], [-reach]
     for speed in speeds:
         for end in (reach, -reach):
@@ -40,7 +41,7 @@ def _level(
 
 PATHS: dict[str, tuple[str, Callable[[np.ndarray], Path]]] = {
     "passes along x": (
-        "straight passes along x at 0.5, 1 and 2.5 m/s, nose ahead",
+        "straight passes along x at 0.5, 1 and 2.5 m/s, nose forwards",
         lambda t: _level(t, x=_there_and_back(t, 0.9, (0.5, 1.0, 2.5))),
     ),
     "passes along y": (
@@ -60,24 +61,24 @@ PATHS: dict[str, tuple[str, Callable[[np.ndarray], Path]]] = {
         lambda t: _level(t, yaw=0.5 * np.pi * _steps(t, [0.0, 1.0, 2.0, -1.0, 0.0], 3.0)),
     ),
     "yaw turns": (
-        "hover with yaw steps of 120 degrees forth and back",
+        "hover with yaw steps of 120 degrees back and forth",
         lambda t: _level(t, yaw=_steps(t, [0.0, 2.1, 0.0, -2.1] * 4, 1.0)),
     ),
     "stops": (
-        "jumps of a metre, ahead and aside in turn, each followed by a hover",
+        "steps of one metre, forwards and sideways in turn, each followed by a hover",
         lambda t: _level(t, x=_steps(t, [0.0, 1.0, 1.0, 0.0, 0.0], 3.0), y=_steps(t, [0.0, 0.0, 1.0, 1.0, 0.0], 3.0)),
     ),
 }
-"""What to tell a pilot, and set-points (n, 4) [x, y, z in m, yaw in rad] at given times, s."""
+"""Paths by name: a description for the pilot, and a function from times (n,), s, to set-points (n, 4)."""
 
 
 def path(name: str, tick: float) -> Path:
-    """Set-points of a path, one per ``tick`` seconds."""
+    """Set-points (n, 4) of a path, one per ``tick`` seconds."""
     return PATHS[name][1](np.arange(round(SECONDS / tick)) * tick)
 
 
 def setpoints_csv(name: str, tick: float = 0.02) -> str:
-    """A path as a table to fly: time, position and heading, a row every ``tick`` seconds."""
+    """A path as a CSV table of time, s, position, m, and yaw, rad, with a row every ``tick`` seconds."""
     rows = enumerate(path(name, tick))
     lines = ["t,x,y,z,yaw", *(f"{tick * i:.2f}," + ",".join(f"{v:.4f}" for v in row) for i, row in rows)]
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""How rough a simulated manoeuvre was, and whether the stabiliser caught the drone."""
+"""Safety of a simulated manoeuvre: its extremes, and whether the stabiliser caught the drone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cfb_mjx.sysid.excitation.experiment import CATCH, TICK, Experiment
 from cfb_mjx.sysid.excitation.manoeuvres import Limits
 
 SETTLED_TILT_DEG, SETTLED_SPEED = 10.0, 0.3
-"""Caught means: below this tilt and speed (m/s) for good, at the latest `CATCH` seconds after the handover."""
+"""A drone is caught if it stays below this tilt and speed, m/s, from at most `CATCH` seconds after the handover."""
 
 
 @dataclass(frozen=True)
@@ -18,13 +18,13 @@ class Attained:
     """Extremes of one repetition, from its start until `CATCH` seconds after the handover.
 
     Attributes:
-        tilt_deg: deg.
-        rate: norm of the body rate, rad/s.
-        altitude_loss: below the height at the start, m.
-        drift: largest horizontal distance from the start, m: the room it needs.
-        lowest: height above the floor, m.
-        settled: s from the handover until tilt and speed were small for good; NaN if never.
-        caught: settled in time and never below the floor.
+        tilt_deg: largest tilt, deg.
+        rate: largest norm of the body rate, rad/s.
+        altitude_loss: largest loss of height since the start, m.
+        drift: largest horizontal distance from the start, m, which is the space needed.
+        lowest: smallest height above the floor, m.
+        settled: time from the handover until tilt and speed stay small, s; NaN if never.
+        caught: whether it settled in time and never fell below the floor.
     """
 
     tilt_deg: float
@@ -36,14 +36,14 @@ class Attained:
     caught: bool
 
     def within(self, limits: Limits) -> bool:
-        """Whether tilt, body rate and altitude loss kept the limits."""
+        """Whether tilt, body rate and loss of height kept the limits."""
         return (
             self.tilt_deg <= limits.tilt_deg and self.rate <= limits.rate and self.altitude_loss <= limits.altitude_loss
         )
 
 
 def attained(experiment: Experiment) -> list[Attained]:
-    """One `Attained` per repetition."""
+    """Extremes of every repetition of an experiment."""
     return [_one(experiment, start) for start in experiment.starts]
 
 
@@ -70,7 +70,7 @@ def _one(experiment: Experiment, start: int) -> Attained:
 
 
 def worst_of(repetitions: list[Attained], limits: Limits) -> dict[str, float | int | None]:
-    """Extremes over repetitions, as JSON terms, and how many kept the limits and were caught."""
+    """Extremes over repetitions, and how many kept the limits and were caught, as a JSON-compatible dictionary."""
     return {
         "max_tilt_deg": max(a.tilt_deg for a in repetitions),
         "max_rate_radps": max(a.rate for a in repetitions),

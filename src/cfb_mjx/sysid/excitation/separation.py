@@ -1,8 +1,8 @@
-"""Which flight tells effects apart that the flights so far hardly tell apart.
+"""Choose a flight that distinguishes effects which earlier flights hardly distinguish.
 
-Every path is flown in simulation by a drone that has one of the effects; each of the others is then given the chance to
-explain that flight in its place. What it cannot explain, in nats of log-likelihood, is what the path tells about the
-pair; a path is worth what it tells about the pair it tells least about.
+Every path is flown in simulation by a drone that has one of the effects. Then each other effect is fitted to that
+flight in its place. The log-likelihood that it fails to explain, in nats, is the information of the path about this
+pair of effects. A path is ranked by the pair about which it has the least information.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 
 TYPICAL = 0.2
-"""Strength assumed of an effect the model does not have, as a share of its prior range's upper end."""
+"""Assumed strength of an effect that the model does not have, as a share of the upper end of its prior range."""
 ENOUGH = 10.0
-"""Nats that settle a question: odds of twenty thousand to one."""
+"""Nats required to decide between two effects: odds of twenty thousand to one."""
 REACH = 5.0
-"""A flight that ends up farther than this from its path, m, has not followed it."""
+"""A flight that deviates by more than this from its path, m, counts as not having followed it."""
 
 
 @dataclass(frozen=True)
 class Told:
-    """What a path tells.
+    """Information of a path about pairs of effects.
 
     Attributes:
-        path: its name.
-        nats: (true effect, effect in its place) -> log-likelihood the other one cannot explain, of one flight.
-        flown: the flight with the first effect there.
-        followed: whether every drone followed the path.
+        path: name of the path.
+        nats: log-likelihood per flight that the second effect cannot explain, by (true effect, second effect).
+        flown: flight with the first of the effects.
+        followed: whether every simulated drone followed the path.
     """
 
     path: str
@@ -53,29 +53,33 @@ class Told:
 
     @property
     def worst(self) -> float:
-        """Nats about the pair it tells least about; nothing if a drone did not follow it."""
+        """Smallest number of nats over all pairs; zero if a drone did not follow the path."""
         return min(self.nats.values()) if self.followed else 0.0
 
     @property
     def flights(self) -> int | None:
-        """Flights that settle every pair; None if no number of them would."""
+        """Number of flights that decide every pair; None if 100 or more would be needed."""
         return max(1, int(np.ceil(ENOUGH / self.worst))) if self.worst > ENOUGH / 100 else None
 
     def to_json(self) -> dict[str, Any]:
-        """All but the flight."""
+        """All results except the flight as a JSON-compatible dictionary."""
         nats = {f"{true} against {other}": value for (true, other), value in self.nats.items()}
         return {"nats": nats, "flights": self.flights, "followed": self.followed}
 
 
 def assumed(name: str, present: Sequence[Effect]) -> Effect:
-    """The effect as the model has it, else at a typical strength (`TYPICAL`, signs alternating).
+    """The effect as in the model, or at a typical strength (`TYPICAL`, with alternating signs) if the model lacks it.
+
+    Args:
+        name: of the effect.
+        present: effects of the model.
 
     Raises:
-        CfbError: not an effect of the catalogue.
+        CfbError: the effect is not in the catalogue.
     """
     if name in SENSOR_FAULTS:
         raise CfbError(
-            f"{name} is a fault of the recording: cfb close-loop tells it from other sensors, not by flying."
+            f"{name} is a fault of the recording and not an effect on the flight; cfb close-loop looks for it."
         )
     if name not in CATALOGUE:
         raise CfbError(f"unknown effect {name}; the catalogue has {', '.join(sorted(CATALOGUE))}.")
@@ -100,21 +104,21 @@ def separate(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Told]:
-    """What every path tells about some effects, the most telling first.
+    """Rank paths by how well they distinguish some effects, the most informative first.
 
     Args:
-        model: the drone so far; effects it has are taken at its strengths. Run with x64 enabled.
-        names: two effects or more.
-        conditions: noise and disturbances to expect.
-        paths: of `PATHS`.
+        model: the drone; effects that it has are used with its strengths. Run with x64 enabled.
+        names: at least two effects.
+        conditions: expected noise and disturbances.
+        paths: names of `PATHS`.
         seed: of noise and disturbances.
-        progress: called with (done, total).
+        progress: called with (done, total) simulations.
 
     Raises:
-        CfbError: fewer than two effects, one twice, or one that is not in the catalogue.
+        CfbError: there are fewer than two effects, one is repeated, or one is not in the catalogue.
     """
     if len(set(names)) < 2 or len(set(names)) < len(names):
-        raise CfbError(f"name two different effects or more to tell apart, found {', '.join(names) or 'none'}.")
+        raise CfbError(f"name at least two different effects to distinguish, found {', '.join(names) or 'none'}.")
     there = {name: assumed(name, model.effects) for name in names}
     others = tuple(effect for effect in model.effects if type(effect).name not in names)
     stabiliser = PositionHold(FirmwarePid.hovering(model.parameters))
@@ -142,7 +146,7 @@ def _followed(flown: Experiment, wanted: np.ndarray) -> bool:
 def _unexplained(
     log: FlightLog, model: Quadrotor, others: tuple[Effect, ...], true: str, effect: Effect, names: Sequence[str]
 ) -> dict[str, float]:
-    """Nats that each other effect cannot explain of a flight with ``effect``."""
+    """Nats of a flight with ``effect`` that each other effect cannot explain."""
     delay, gyro_delay = float(model.parameters.pose_delay), float(model.parameters.gyro_delay)
     search = Search.start([log], model.parameters, delay, check_sensors([log], delay, gyro_delay), others)
     nothing = search.learned(search.nothing())
@@ -155,7 +159,7 @@ def _unexplained(
         if name == true:
             continue
         best = nothing
-        # An effect without a probe, its sign making no sense, explains nothing of this flight.
+        # An effect whose fitted sign is meaningless has no probe and explains nothing of this flight.
         if name in probes:
             evidence, variant = probes[name]
             best = search.settled(search.with_candidate(nothing, variant, evidence))

@@ -1,4 +1,4 @@
-"""A manoeuvre tried in simulation before it is flown: what a fit will know, and whether the drone is caught."""
+"""Trial of a manoeuvre in simulation before it is flown: expected uncertainty of a fit, and safety."""
 
 from __future__ import annotations
 
@@ -23,9 +23,12 @@ from cfb_mjx.sysid.identification.fitting import default_parameters
 from cfb_mjx.sysid.identification.unknowns import choose
 
 PAPER = {"roll-pitch": roll_pitch, "single-motor": single_motor}
+"""Manoeuvres of the paper."""
 ITERATIONS = 1000
+"""Number of steps in the design of an optimised manoeuvre."""
 FLIGHTS = 3
-"""Each with its own noise and disturbances; the middle one's uncertainty counts, the first is kept."""
+"""Number of simulated flights with different noise and disturbances; the median uncertainty is reported, and the first
+flight is kept."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +37,12 @@ class Trial:
 
     Attributes:
         commands: (m, 4) of one repetition.
-        calm: the flight without noise and disturbances.
-        flown: a flight with them.
-        prediction: what a fit will know of such a flight.
-        log_det: information of one repetition about what is fitted.
-        undisturbed: what `calm` attains.
-        worst: of the flights with disturbances, and how many repetitions kept the limits and were caught.
+        calm: flight without noise and disturbances.
+        flown: flight with noise and disturbances.
+        prediction: expected result of a fit to such a flight.
+        log_det: log determinant of the information of one repetition.
+        undisturbed: extremes of ``calm``.
+        worst: extremes of the flights with disturbances, and how many repetitions kept the limits and were caught.
     """
 
     commands: Float[np.ndarray, "m 4"]
@@ -51,25 +54,25 @@ class Trial:
     worst: dict[str, Any]
 
     def expected(self) -> dict[str, dict[str, Any]]:
-        """Value, standard deviation and unit of every parameter that a fit will know."""
+        """Value, expected standard deviation and unit of every identifiable parameter."""
         return {name: asdict(one) for name, one in self.prediction.parameters.items()}
 
     def commands_csv(self) -> str:
-        """The commands as a table to fly: time, and the command of each motor from then on."""
+        """The commands as a CSV table of time, s, and the command of each motor from that time on."""
         lines = (f"{STEP * i:.3f}," + ",".join(f"{u:.6f}" for u in row) for i, row in enumerate(self.commands))
         return "\n".join(["t,u1,u2,u3,u4", *lines]) + "\n"
 
 
 @dataclass(frozen=True)
 class Excitation:
-    """A manoeuvre, beside those of the paper where it is not one of them.
+    """Result of `excite`: the chosen manoeuvre and, if it is optimised, those of the paper for comparison.
 
     Attributes:
-        manoeuvre: its name.
-        trials: by name, it among them.
-        repetitions: in one flight.
+        manoeuvre: name of the chosen manoeuvre.
+        trials: trials of all manoeuvres, by name.
+        repetitions: number of manoeuvres in one flight.
         duration: of the open-loop part, s.
-        limits: that it keeps.
+        limits: of the manoeuvres.
         conditions: noise and disturbances.
     """
 
@@ -82,11 +85,11 @@ class Excitation:
 
     @property
     def chosen(self) -> Trial:
-        """The trial of the manoeuvre itself."""
+        """Trial of the chosen manoeuvre."""
         return self.trials[self.manoeuvre]
 
     def to_json(self) -> dict[str, Any]:
-        """All numbers."""
+        """All results as a JSON-compatible dictionary."""
         chosen = self.chosen
         return {
             "manoeuvre": self.manoeuvre,
@@ -121,27 +124,28 @@ def excite(
 ) -> Excitation:
     """Choose or design a manoeuvre, and fly it in simulation.
 
-    Before an optimised one come the paper's, which it is compared with and whose noise it assumes.
+    If the manoeuvre is optimised, those of the paper are flown first, for comparison. The design uses the noise levels
+    that were fitted to the first of them.
 
     Args:
-        manoeuvre: its name.
-        described: the best guess of the drone. Run with x64 enabled.
-        parameters: what will be fitted, as for `choose`; by default what a fit would choose.
-        repetitions: of the manoeuvre in one flight.
-        duration: of the open-loop part, s.
-        limits: not to exceed.
-        conditions: noise and disturbances to expect.
+        manoeuvre: name of the manoeuvre.
+        described: best available model of the drone. Run with x64 enabled.
+        parameters: parameters to be fitted, as for `choose`; by default those that a fit would choose.
+        repetitions: number of manoeuvres in one flight.
+        duration: of the open-loop part, 0.1 to 2 s.
+        limits: of the manoeuvre.
+        conditions: expected noise and disturbances.
         progress: called with (done, total) simulations and predictions.
-        designing: called with (done, total) iterations of an optimised manoeuvre's design.
+        designing: called with (done, total) iterations of the design of an optimised manoeuvre.
 
     Raises:
-        CfbError: unknown parameters, or limits or a duration that leave no room.
+        CfbError: a parameter is unknown, the duration is out of range, or the limits leave no room for a manoeuvre.
     """
     nominal = described.parameters()
     model = Quadrotor.from_file(described)
     stabiliser = PositionHold(FirmwarePid.hovering(nominal))
     if parameters is not None:
-        choose(parameters, nominal)  # refuses unknown names before the work
+        choose(parameters, nominal)  # refuse unknown names before any simulation
     names = [manoeuvre] if manoeuvre in PAPER else [*PAPER, manoeuvre]
     problem: Problem | None = None
     trials: dict[str, Trial] = {}
@@ -149,7 +153,7 @@ def excite(
         if name in PAPER:
             commands = scaled(model, PAPER[name](duration), limits)
         else:
-            # The paper's manoeuvres came first and made it.
+            # `problem` was created with the paper's manoeuvres, which come first.
             commands = optimise(not_none(problem), duration, ITERATIONS, progress=designing).commands
         calm = fly(model, stabiliser, commands, repetitions, conditions.calm, name=name)
         flown = [fly(model, stabiliser, commands, repetitions, conditions, seed=i, name=name) for i in range(FLIGHTS)]

@@ -19,7 +19,7 @@ from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.robust import limited
 
 CORRELATION_TIME = 0.5
-"""Correlation time of the disturbances of specific force and steady rotor speed, s: battery and inflow, below 0.3 Hz."""
+"""Correlation time of the disturbances of specific force and steady rotor speed (battery, inflow), s: about 0.3 Hz."""
 
 
 class Unlogged(NamedTuple):

@@ -1,4 +1,4 @@
-"""A log prepared for fitting: contiguous segments on rows, padded to one shape, and the noise its sensors show."""
+"""Logs prepared for fitting: gap-free segments of rows, padded to one shape, and the noise of the sensors."""
 
 from __future__ import annotations
 
@@ -14,54 +14,61 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.state import AnyArray
 
 ROWS_PER_SEGMENT = 641
-"""Long flights are cut into overlapping segments of this many rows, which run side by side. One shape for all flights:
-programs are compiled once and then come from the cache."""
+"""Long flights are cut into overlapping segments of this many rows, which are processed in parallel. With one shape for
+all flights, programs are compiled once and then come from the cache."""
 _COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+"""Numbers of segments to which the data are padded."""
 
 
 class Segments(eqx.Module):
-    """S contiguous pieces of flight, N rows each; the last row of a short piece is repeated with zero time between."""
+    """S gap-free pieces of flight of N rows; short pieces are padded with their last row and zero intervals."""
 
     interval: Float[AnyArray, "s n"]
     """Time from the previous row, s; 0 at the first row and in the padding."""
     valid: Float[AnyArray, "s n"]
-    """1 for rows that are measured, 0 for the padding."""
+    """1 for measured rows, 0 for the padding."""
     command: Float[AnyArray, "s n 4"]
+    """0 to 1."""
     doubt: Float[AnyArray, "s n 4"]
-    """Of a command's step to the next row, the part that the steps about it do not foretell: what may have been sent
-    between the rows is uncertain by a share of it."""
+    """Part of a command's step to the next row that the neighbouring steps do not predict. The commands sent between
+    the rows are uncertain by a share of it."""
     excess: Float[AnyArray, "s n 4"]
-    """Mean of what is commanded until the next row, less ``command``: 0 as logged, see `innovation.as_held`."""
+    """Mean command until the next row minus ``command``; 0 for a log as read (`innovation.as_held`)."""
     rotor_speed: Float[AnyArray, "s n 4"]
-    """Measured, rad/s; what it holds where ``measured`` is 0 means nothing."""
+    """Measured, rad/s; meaningless where ``measured`` is 0."""
     measured: Float[AnyArray, " s"]
-    """1 where every rotor speed of the piece was measured."""
+    """1 if every rotor speed of the piece was measured."""
     warm_up: Float[AnyArray, "s n"]
-    """1 for rows used to find the rotor speed and the filter's state only."""
+    """1 for rows that only serve to initialise the rotor speed and the filters."""
     body_rate: Float[AnyArray, "s n 3"]
+    """rad/s."""
     specific_force: Float[AnyArray, "s n 3"]
+    """m/s^2."""
     over: Devices | None = eqx.field(static=True, default=None)
-    """What they are divided over."""
+    """Devices over which the segments are divided."""
 
 
 @dataclass(frozen=True)
 class FlightData:
-    """Segments of several logs together."""
+    """Segments of several logs, and the noise of their sensors.
+
+    Attributes:
+        segments: None if no stretch of any log is long enough.
+        log_of_segment: (pieces,) index of the log of each segment; further segments are padding.
+        rate_noise: (3,) gyro noise, rad/s.
+        specific_force_noise: (3,) accelerometer noise, m/s^2.
+        rotor_speed_noise: rad/s; NaN if rotor speed was not measured.
+    """
 
     segments: Segments | None
-    """None where no stretch of any log is long enough."""
     log_of_segment: np.ndarray
-    """(pieces,) index of the log each segment comes from; segments beyond are empty."""
     rate_noise: np.ndarray
-    """(3,) gyro noise, rad/s."""
     specific_force_noise: np.ndarray
-    """(3,) accelerometer noise, m/s^2."""
     rotor_speed_noise: float
-    """rad/s; NaN where none was measured."""
 
     @property
     def rows(self) -> int:
-        """Measured rows."""
+        """Number of measured rows."""
         return 0 if self.segments is None else int(np.sum(np.asarray(self.segments.valid)))
 
 
@@ -70,8 +77,8 @@ def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
 
     Args:
         logs: flights.
-        warm_up: time at the start of each segment in which the motor model forgets its guessed start, s (eight motor
-            time constants).
+        warm_up: time at the start of each segment, s, in which the motor model's initial error decays (eight motor time
+            constants).
     """
     pieces: list[tuple[FlightLog, int, int, int]] = []
     owners: list[int] = []
@@ -98,10 +105,10 @@ def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
 
 
 def _padded(stacked: Segments) -> Segments:
-    """Append segments that count for nothing up to the next count of `_COUNTS` (beyond, a multiple of the last)."""
+    """Pad with invalid segments to the next number in `_COUNTS`, or to a multiple of the largest."""
     count = len(stacked.valid)
     wanted = next((n for n in _COUNTS if n >= count), -(-count // _COUNTS[-1]) * _COUNTS[-1])
-    # Copies of a real segment: zeros would divide by zero.
+    # The padding copies a real segment, because zeros would cause divisions by zero.
     more = jax.tree.map(lambda x: np.concatenate([x, np.repeat(x[:1], wanted - count, axis=0)]), stacked)
     return replace(more, valid=more.valid * (np.arange(wanted) < count)[:, None])
 
@@ -113,7 +120,7 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> Se
     measured = log.rotor_speed is not None
     for motor in range(4 if measured else 0):
         good = np.isfinite(speed[:, motor])
-        # A bad reading or two is bridged; a motor that is silent for longer makes the piece unmeasured.
+        # Interpolate up to two invalid readings in a row; with a longer hole the piece counts as not measured.
         longest = max((len(list(run)) for run in _runs(~good)), default=0)
         if longest > 2 or not good.any():
             measured = False
@@ -139,10 +146,11 @@ def _segment(log: FlightLog, first: int, last: int, lead: int, width: int) -> Se
 
 
 def _unforetold(time: np.ndarray, command: np.ndarray) -> np.ndarray:
-    """(n - 1, 4) steps of the command without what the mean slope of the steps before and after would make.
+    """Parts (n - 1, 4) of the command's steps that the mean slope of the neighbouring steps does not predict.
 
-    A step far larger than the others (a new set-point) came at one moment that no row tells, always the same one where
-    rows and set-points are in step: it counts for still more, or a handful of them would decide the motors' lag.
+    A step far larger than the others (a new set-point) occurred at an unknown moment between the rows, always the same
+    moment if rows and set-points are synchronous. Its uncertainty is increased further; otherwise a few such steps
+    would dominate the estimate of the motors' lag.
     """
     interval, step = np.diff(time)[:, None], np.diff(command, axis=0)
     slope = step / interval
@@ -158,9 +166,12 @@ def _runs(mask: np.ndarray):
 
 
 def white_noise(values: np.ndarray, time: np.ndarray | None = None) -> np.ndarray:
-    """(k,) white noise on a smooth (n, k) signal from its third differences, robustly.
+    """Robust estimate (k,) of the white noise on smooth signals from their third differences.
 
-    With the rows' ``time`` (s) they are divided differences: at uneven rows plain ones take steady motion for noise.
+    Args:
+        values: (n, k) signals.
+        time: (n,) of the rows, s. If given, divided differences are used: with uneven rows, plain differences of a
+            steady motion look like noise.
     """
     if time is None:
         third = np.diff(values, n=3, axis=0) / np.sqrt(20.0)

@@ -58,7 +58,7 @@ class Noise(eqx.Module):
 
     @staticmethod
     def from_vector(vector: Float[Array, "17"]) -> Noise:
-        """Inverse of `to_vector`. The levels have lower bounds, because the likelihood is flat where a level vanishes."""
+        """Inverse of `to_vector`; lower bounds on the levels avoid the flat likelihood where a level vanishes."""
         x = jnp.exp(jnp.concatenate([vector[:9], vector[10:]])) + _FLOORS
         middle = jnp.sqrt(_SHORTEST * _LONGEST)
         return Noise(

@@ -1,4 +1,4 @@
-"""What a fit returns, and how it becomes a model file."""
+"""Result of a fit, and its conversion to a model file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ from cfb_mjx.sysid.identification.unknowns import OFFSETS, UNITS, Unknowns
 
 @dataclass(frozen=True)
 class Estimate:
-    """One fitted quantity, SI."""
+    """One fitted quantity.
+
+    Attributes:
+        value: SI.
+        std: standard deviation of the value, SI.
+        unit: of both.
+        preset: value before the fit, SI.
+    """
 
     value: float
     std: float
@@ -27,50 +34,61 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of a fit."""
+    """Result of a fit.
+
+    Attributes:
+        estimator: ``innovation`` or ``shooting``.
+        estimates: identified parameters.
+        unidentifiable: parameters that the data do not determine: name to explanation.
+        combinations: products of powers that are known better than their factors, such as ``inertia_xx / mass``; SI.
+        parameters: parameters of the drone with all fitted values, including those not identified alone; together they
+            describe the flights.
+        uncertainty: covariance and unidentified directions.
+        names: of the fitted parameters.
+        values: all fitted values, SI, identified or not.
+        vector: (k,) all unknowns in the optimiser's units (`cfb_mjx.sysid.identification.unknowns`).
+        rows: number of measured rows (innovation) or windows (shooting) that were fitted.
+        hold: how long a logged command acted, s (innovation); None: until the next row.
+        contradicted: parameters that were not requested but are fitted too, because the flights contradict their fixed
+            values.
+        noise: noise levels (innovation).
+        whiteness: lag-one correlation of the innovations per channel; near 0 if the noise model is right (innovation).
+        feedback: test of whether the commands responded to the gyro (innovation).
+    """
 
     estimator: str
-    """``innovation`` or ``shooting``."""
     estimates: dict[str, Estimate]
-    """Identified parameters."""
     unidentifiable: dict[str, str]
-    """What the data cannot tell: name to explanation."""
     combinations: dict[str, Estimate]
-    """Products that are known better than what is in them, as ``inertia_xx / mass``; SI."""
     parameters: Parameters
-    """With every fitted value, also of what cannot be told alone: together they describe the flights."""
     uncertainty: Uncertainty
     names: tuple[str, ...]
     values: dict[str, float]
-    """Every fitted value, SI, whether it can be told or not."""
     vector: np.ndarray
-    """(k,) of all that may move, the optimiser's numbers, see `cfb_mjx.sysid.identification.unknowns`."""
     rows: int
-    """Measured rows (innovation) or windows (shooting) that were fitted."""
     hold: float | None = None
-    """How long a logged command acted, s (innovation); None: until the next row."""
     contradicted: tuple[str, ...] = ()
-    """What was to be held but is fitted, because the flights contradict the value it had."""
     noise: Noise | None = None
-    """Noise levels (innovation)."""
     whiteness: dict[str, float] | None = None
-    """Lag-one correlation of the innovations per channel: near 0 when the noise model fits (innovation)."""
     feedback: Feedback | None = None
-    """Whether the commands answered the gyro (innovation)."""
 
     def model_file(self, base: ModelFile, source: str) -> ModelFile:
-        """``base`` with the fitted constants, their uncertainty and ``source``.
+        """Write the fitted constants and their uncertainty into a copy of a model file.
+
+        Args:
+            base: the model file to copy.
+            source: origin of the fitted constants, for the file.
 
         Raises:
-            CfbError: a fitted value that cannot be, named: no file may hold it.
+            CfbError: a fitted value is impossible; the message names it.
 
         Warns:
-            CfbWarning: an unusual one.
+            CfbWarning: a fitted value is unusual.
         """
         return _describe(base, self, source)
 
     def to_json(self) -> dict:
-        """What was found and how well it describes the flights, in JSON terms."""
+        """All results as a JSON-compatible dictionary."""
         return {
             "parameters": numbers_of(self.estimates),
             "unidentifiable": list(self.unidentifiable),
@@ -88,7 +106,7 @@ class Fit:
 
 
 def numbers_of(estimates: Mapping[str, Estimate]) -> dict[str, dict]:
-    """Estimates in JSON terms."""
+    """Estimates as JSON-compatible dictionaries."""
     return {name: asdict(estimate) for name, estimate in estimates.items()}
 
 
@@ -102,9 +120,9 @@ def summarise(
     impossible: dict[str, str] | None = None,
     **more,
 ) -> Fit:
-    """A `Fit` that gives numbers only to what the data can tell; of the unknowns, only ``names`` are shown.
+    """Assemble a `Fit` at the optimum ``vector`` (k,), with estimates only of parameters that the data determine.
 
-    Those in ``impossible`` get its reasons instead of a number.
+    Only ``names`` are reported, by default all unknowns. Those in ``impossible`` get its reason instead of an estimate.
     """
     impossible = impossible or {}
     names = unknowns.names if names is None else names
@@ -133,7 +151,7 @@ def summarise(
 
 
 def _combinations(uncertainty: Uncertainty, values: dict[str, float], names: tuple[str, ...]) -> dict[str, Estimate]:
-    """Products of powers that are known better than the quantities in them."""
+    """Products of powers that are known better than their factors."""
     order, covariance, found = uncertainty.order, uncertainty.covariance, {}
 
     def put(powers: dict[str, float], std: float):
@@ -155,7 +173,7 @@ def _combinations(uncertainty: Uncertainty, values: dict[str, float], names: tup
 
 
 def _reasons(uncertainty: Uncertainty) -> dict[str, str]:
-    """Why each parameter without a number has none."""
+    """Reasons why the unidentified parameters have no estimate."""
     reasons = {}
     for name in uncertainty.names:
         known = [text for text in uncertainty.combinations if name in text.split() or f"{name}," in text.split()]
@@ -183,7 +201,7 @@ def _describe(base: ModelFile, result: Fit, source: str) -> ModelFile:
         try:
             SPECIFICATIONS[key].check(value, f"the fit's parameters.{key}", warn=True)
         except CfbError as error:
-            raise CfbError(f"{error} Leave it out of --parameters, or fit flights that tell it.") from None
+            raise CfbError(f"{error} Leave it out of --parameters, or fit flights that determine it.") from None
         entries[key] = Entry(np.asarray(value, dtype=float), source + note, std)
 
     def deviation(name):

@@ -1,4 +1,4 @@
-"""Shooting windows of several logs in one batch of a few fixed shapes, with the noise of their sensors."""
+"""Windows of several logs for multiple shooting, in batches of a few fixed shapes, with the noise of the sensors."""
 
 from __future__ import annotations
 
@@ -18,47 +18,49 @@ from cfb_mjx.sysid.identification.flight_data import white_noise
 from cfb_mjx.sysid.windows import Windows, find_windows
 
 HORIZONS = tuple(float(h) for h in np.round(np.arange(0.02, 0.2001, 0.02), 3))
-"""Where a window is compared with the measurement, s."""
+"""Times after a window's start at which the prediction is compared with the measurement, s."""
 LEAD = 0.6
-"""Commands before a window from which its rotor speeds are estimated, s: twelve motor time constants."""
+"""Duration of the commands before a window that determine its rotor speeds, s: twelve motor time constants."""
 COMMAND_DOUBT = 50.0
-"""How far off rotor speeds from commands are believed to be, rad/s: battery and load are not known."""
+"""Standard deviation of rotor speeds estimated from commands, rad/s, because battery and load are unknown."""
 
 
 class Batch(eqx.Module):
-    """W windows, S integration steps, H instants of comparison, P rows before the window."""
+    """A batch of w windows with s integration steps, h instants of comparison and p rows before the window."""
 
     lead_step: Float[Array, "w p"]
     lead_command: Float[Array, "w p 4"]
     state: State
-    """Measured at the start; rotor speeds as measured, or zero."""
+    """Measured state at the start of each window; rotor speeds are zero if not measured."""
     step: Float[Array, "w s"]
     inputs: Float[Array, "w s 4"]
     at: jax.Array
     truth: State
     noise: Float[Array, "w 12"]
-    """Of a row: position, velocity, attitude (rotation vector), body rate."""
+    """Measurement noise per row: position, velocity, attitude (rotation vector), body rate."""
     rotor_noise: Float[Array, " w"]
+    """Standard deviation of the rotor speeds, rad/s."""
     live: Float[Array, " w"]
-    """0 for windows that only fill the batch."""
+    """0 for windows that only pad the batch."""
     delay: Float[Array, ""]
     """Age of the pose in a row that was assumed when the windows were cut, s."""
     measured: bool = eqx.field(static=True)
+    """Whether the inputs are measured rotor speeds instead of commands."""
     over: Devices | None = eqx.field(static=True, default=None)
-    """What the windows are divided over."""
+    """Devices over which the windows are divided."""
 
 
 def batches(
     logs: list[FlightLog], delay: float | None, fallback: float, use_measured: bool, over: Devices | None = None
 ) -> list[Batch]:
-    """Windows of the logs, those with and those without measured rotor speeds.
+    """Cut logs into windows, batched separately by input (commands or measured rotor speeds) and by delay.
 
     Args:
-        logs: flights, the gyro in time (`with_gyro_in_time`).
-        delay: age of the pose in every log, s; None takes each log's own.
-        fallback: for logs that do not know theirs, s.
-        use_measured: feed measured rotor speeds where there are some.
-        over: devices to divide the windows over.
+        logs: flights with the gyro's delay removed (`with_gyro_in_time`).
+        delay: age of the pose in all logs, s; None: each log's own.
+        fallback: age of the pose for logs that do not state it, s.
+        use_measured: use measured rotor speeds as input where available.
+        over: devices over which to divide the windows.
     """
     pieces: dict[tuple[bool, float], list[dict]] = {}
     for log in logs:
@@ -78,7 +80,7 @@ def batches(
 def _divided(batch: Batch, over: Devices) -> Batch:
     if not over.several:
         return batch
-    # Added windows count for nothing, and the delay is one for all.
+    # Windows added as padding have no weight; the delay is common to all windows.
     more = -len(batch.live) % over.count
     live = np.concatenate([np.asarray(batch.live), np.zeros(more)])
     alike = replace(batch, delay=np.broadcast_to(batch.delay, batch.live.shape))
@@ -91,7 +93,7 @@ def _arrays(log: FlightLog, windows: Windows, chosen: np.ndarray, measured: bool
     speed = windows.rotor_speed[chosen]
     names = ("position", "velocity", "quaternion", "body_rate")
     return {
-        # Shorter leads start with steps of no length.
+        # Shorter leads are padded in front with steps of zero length.
         "lead_step": np.stack([np.pad(step, (width - len(step), 0)) for step, _ in lead]),
         "lead_command": np.stack([np.pad(u, ((width - len(u), 0), (0, 0)), mode="edge") for _, u in lead]),
         "state": [getattr(windows, name)[chosen] for name in names]
@@ -146,7 +148,7 @@ def _stack(parts: list[dict], measured: bool, delay: float) -> Batch:
 
 
 def _ladder(count: int) -> int:
-    """Batch sizes 32, 64, 96, 128, then multiples of 64: few programs, little waste."""
+    """Round a number of windows up to 32, 64, 96, 128 or a multiple of 64: few compiled programs, little padding."""
     return 32 * -(-count // 32) if count <= 128 else 64 * -(-count // 64)
 
 
@@ -157,7 +159,7 @@ def _pad_steps(values: np.ndarray, width: int, front: bool, edge: bool) -> np.nd
 
 
 def _noise(log: FlightLog) -> np.ndarray:
-    """(12,) noise of a row, from third differences."""
+    """Measurement noise per row (12,), from third differences."""
 
     def level(values):
         return np.maximum(white_noise(values), 1e-6)

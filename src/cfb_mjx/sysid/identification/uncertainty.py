@@ -1,4 +1,4 @@
-"""How sure a fit is: covariance from the whitened Jacobian, block bootstrap, and what the data cannot tell at all."""
+"""Uncertainty of a fit: covariance from the whitened Jacobian, block bootstrap, and unidentified directions."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from cfb_mjx.sysid.identification.unknowns import OFFSETS
 
 LOOSEST = 0.5
-"""A direction in which the estimate is free by more than this is not identified: 50 % of a value, half the unit of
+"""A direction with a larger standard deviation than this is not identified: 50 % of a value, or half the unit of
 `cfb_mjx.sysid.identification.unknowns.OFFSETS` (5 mm, 100 rad/s, 2 ms)."""
 SHARE = 0.3
-"""A parameter belongs to an unidentified direction when its component there is at least this."""
+"""A parameter belongs to an unidentified direction if its component there is larger than this."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Of the named quantities: relative, or in the units of `cfb_mjx.sysid.identification.unknowns.OFFSETS`.
+    """Uncertainty of k quantities, relative or in the units of `cfb_mjx.sysid.identification.unknowns.OFFSETS`.
 
     Attributes:
-        covariance: (k, k), of the identified part.
+        covariance: (k, k) of the identified part.
         correlation: (k, k).
-        unidentified: directions (unit vectors) the data leave free.
-        names: of the parameters those directions move.
-        combinations: what *is* identified among them, as text; empty where nothing is.
-        order: (k,) of the names, as the rows of the covariance.
+        unidentified: unit vectors (k,) of the directions that the data do not determine.
+        names: of the parameters that those directions move.
+        combinations: identified combinations of these parameters, as text; empty if there are none.
+        order: (k,) names of all quantities, in the order of the covariance.
         products: the combinations as powers by name, each with its relative standard deviation.
     """
 
@@ -39,12 +39,12 @@ class Uncertainty:
 
     @property
     def std(self) -> np.ndarray:
-        """(k,) standard deviations."""
+        """Standard deviations (k,)."""
         return np.sqrt(np.diag(self.covariance))
 
 
 CLEAR = 4.0
-"""What is held is contradicted where a fit would move it by so many of its standard deviations."""
+"""A fixed value is contradicted if a fit would move it by at least this many of its standard deviations."""
 
 
 def assess(
@@ -55,18 +55,18 @@ def assess(
     blur: np.ndarray | float = 0.0,
     bootstraps: int = 400,
 ) -> Uncertainty:
-    """Uncertainty at the optimum.
+    """Compute the uncertainty at the optimum.
+
+    The covariance is that of the normal equations, by SVD, widened to that of a block bootstrap if the latter is
+    larger: the bootstrap accounts for correlation within blocks and for an imperfect noise model.
 
     Args:
         residual: (blocks, ...) whitened; the first axis is what the bootstrap resamples.
-        jacobian: (blocks, ..., k) its derivatives by relative changes of the named quantities.
-        names: of the k parameters.
-        priors: standard deviations of what is known without the data, about the optimum.
-        blur: (k,) standard deviations that no amount of data makes smaller.
-        bootstraps: resamples of the blocks.
-
-    The covariance is that of the normal equations, by SVD, widened to the block bootstrap's where that is larger: the
-    bootstrap sees correlation within a block and a noise model that is not quite right.
+        jacobian: (blocks, ..., k) its derivatives with respect to relative changes of the quantities.
+        names: of the k quantities.
+        priors: standard deviations of normal priors about the optimum, by name.
+        blur: (k,) standard deviations that are added and do not decrease with more data.
+        bootstraps: number of resamples of the blocks.
     """
     k = len(names)
     residual, jacobian = residual.reshape(len(residual), -1), jacobian.reshape(len(residual), -1, k)
@@ -84,7 +84,7 @@ def assess(
     free = [row for row, is_loose in zip(rows, loose, strict=True) if is_loose]
     moved = [name for i, name in enumerate(names) if any(abs(v[i]) > SHARE for v in free)]
     correlation = covariance / np.outer(deviation, deviation)
-    # With what is free as well, known to a factor of e^10 at least.
+    # Include the free directions, with a standard deviation of at most 10 (a factor of e^10).
     size = np.minimum(1 / np.maximum(singular[loose], 1e-9), 10.0)
     everything = covariance + (rows[loose].T * size**2) @ rows[loose]
     products = _products(everything, len(free), [i for i, name in enumerate(names) if name in moved], names)
@@ -94,17 +94,17 @@ def assess(
 def most_contradicted(
     residual: np.ndarray, jacobian: np.ndarray, names: tuple[str, ...], free: tuple[str, ...], held: list[str]
 ) -> str | None:
-    """The held quantity that the data would move by most of its standard deviations, if by `CLEAR` or more.
+    """Name of the fixed quantity whose value the data contradict most, if by `CLEAR` standard deviations or more.
 
-    A score test (Rao 1948): of each held quantity alone, with all that is free following. The score's variance is the
-    larger of the model's and that of the blocks.
+    A score test (Rao 1948) of each fixed quantity alone, with all free quantities adjusting to it. The variance of the
+    score is the larger of the model's and that of the scatter between blocks.
 
     Args:
-        residual: (blocks, ...) whitened, at the optimum of what is free.
+        residual: (blocks, ...) whitened, at the optimum of the free quantities.
         jacobian: (blocks, ..., k) its derivatives.
         names: of the k quantities.
-        free: names that were fitted.
-        held: names to test.
+        free: names of the quantities that were fitted.
+        held: names of the fixed quantities to test.
     """
     k = len(names)
     residual, jacobian = residual.reshape(len(residual), -1), jacobian.reshape(len(residual), -1, k)
@@ -117,7 +117,7 @@ def most_contradicted(
         i = names.index(name)
         left = information[i, i] - information[i, columns] @ following[:, i]
         if left < max(1 / LOOSEST**2, 1e-7 * information[i, i]):
-            continue  # nothing that the data know apart from what is free
+            continue  # not distinguishable from the free quantities
         scores = gradient[:, i] - gradient[:, columns] @ following[:, i]
         z = abs(scores.sum()) / np.sqrt(max(left, len(scores) * np.var(scores)))
         if z > strongest:
@@ -126,7 +126,7 @@ def most_contradicted(
 
 
 def _inflation(jacobian, residual, known, keep, covariance, bootstraps) -> np.ndarray:
-    """(k, k) factor by which the block bootstrap's standard deviations exceed the model's."""
+    """Factors (k, k) that widen the model's covariance to that of the block bootstrap; at least 1."""
     blocks, k = jacobian.shape[0], jacobian.shape[2]
     if blocks < 8 or keep.shape[1] == 0:
         return np.ones((k, k))
@@ -136,7 +136,7 @@ def _inflation(jacobian, residual, known, keep, covariance, bootstraps) -> np.nd
     draws = rng.integers(0, blocks, (bootstraps, blocks))
     moves = []
     for draw in draws:
-        # One Gauss-Newton step from the optimum: a refit of the resampled data to first order.
+        # One Gauss-Newton step from the optimum approximates a refit of the resampled data.
         a, g = information[draw].sum(0) + known, gradient[draw].sum(0)
         moves.append(-keep @ np.linalg.lstsq(keep.T @ a @ keep, keep.T @ g, rcond=None)[0])
     spread = np.std(moves, axis=0)
@@ -147,10 +147,10 @@ def _inflation(jacobian, residual, known, keep, covariance, bootstraps) -> np.nd
 def _products(
     covariance: np.ndarray, unknown: int, members: list[int], names: tuple[str, ...]
 ) -> list[tuple[dict[str, float], float]]:
-    """Products of powers that the data tell of quantities which they do not tell one by one, with relative std.
+    """Identified products of powers of quantities that are not identified alone, with relative standard deviations.
 
-    As many quantities as there are unknown directions are taken as given, the least known first; each of the others is
-    known together with them.
+    As many quantities as there are unidentified directions are taken as given, the least known first. Each of the
+    others is then identified in combination with them.
     """
     left, given = covariance.copy(), []
     for _ in range(min(unknown, len(members))):
@@ -175,7 +175,7 @@ def _products(
 
 
 def power_product(powers: dict[str, float]) -> str:
-    """As text: ``thrust_scale * motor_gain^2``."""
+    """Format a product of powers as text, for instance ``thrust_scale * motor_gain^2``."""
     parts = []
     for name, power in powers.items():
         sign = ("* " if power > 0 else "/ ") if parts else ("" if power > 0 else "1 / ")

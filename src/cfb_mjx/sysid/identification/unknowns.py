@@ -1,8 +1,8 @@
-"""Which parameters a fit may change, and the unconstrained numbers it works with.
+"""Parameters that a fit may change, and their mapping to unconstrained unknowns of the optimiser.
 
-Every vector the optimiser sees is physical: positive quantities are logarithms, and the inertia is built from the
-second moments of its mass distribution, whichever of its axes are free: every possible rigid body can be reached and
-no impossible one.
+Every vector of unknowns is physically possible. Positive quantities are fitted as logarithms. The inertia is
+parametrised by the second moments of the mass distribution, so every possible rigid body can be reached and no
+impossible one, whichever axes are free.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ UNITS = {
     "pose_delay": "s",
     "command_hold": "s",
 }
-"""Names a fit knows, with their units. Motor quantities are common to the four motors; ``thrust_linear`` is the
-coefficient of s in the thrust cubic: with ``thrust_scale`` it sets level and slope of the thrust near hover.
-``command_hold`` is no constant of the drone but of its log, see `Unknowns.hold`."""
+"""Parameters that can be fitted, with their units. Motor quantities are common to the four motors. ``thrust_linear`` is
+the coefficient of s in the thrust cubic; with ``thrust_scale`` it determines level and slope of the thrust near hover.
+``command_hold`` is a property of the log, not of the drone (`Unknowns.hold`)."""
 GROUPS = {
     "inertia": ("inertia_xx", "inertia_yy", "inertia_zz"),
     "motor": ("motor_time_constant", "motor_gain"),
@@ -54,29 +54,31 @@ OFFSETS = {
     "pose_delay": 0.004,
     "command_hold": 0.002,
 }
-"""Quantities that may be zero: changed by so much, not by a factor, for one unit of the optimiser's number."""
+"""Quantities that may be zero, with the additive change per unit of the optimiser's unknown; the others change by a
+factor."""
 _AXES = ("inertia_xx", "inertia_yy", "inertia_zz")
 HOLD = 0.002
-"""How long a logged command acts where nothing else is known, s: the firmware's rate loop runs at 500 Hz."""
+"""Initial value of the time for which a logged command acts, s: the firmware's rate loop runs at 500 Hz."""
 _FACTORS = ("mass", "rotor_inertia", "motor_time_constant", "motor_gain", "thrust_scale", "torque_scale")
 
 
 class Unknowns(eqx.Module):
-    """The chosen names and the parameters they start from."""
+    """The chosen parameters, and the mapping from a vector of unknowns to their values."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     nominal: Parameters
-    # An explicit type: a weakly typed number would compile every program of a fit twice.
+    """Parameters at the zero vector."""
+    # Explicit dtype: with a weakly typed number every program of a fit would be compiled twice.
     timed: Float[Array, ""] = eqx.field(converter=partial(jnp.asarray, dtype=float), default=0.0)
-    """1 where every command acts until the next row, whatever ``command_hold`` says."""
+    """1 if every command acts until the next row, regardless of ``command_hold``."""
 
     @property
     def start(self) -> Float[Array, " k"]:
-        """The vector of the nominal parameters: zeros."""
+        """The vector of the nominal parameters, which is zero."""
         return jnp.zeros(len(self.names))
 
     def apply(self, vector: Float[Array, " k"]) -> Parameters:
-        """Parameters at ``vector``; differentiable."""
+        """Parameters of the drone at ``vector``; differentiable."""
         p, change = self.nominal, dict(zip(self.names, vector, strict=True))
         factors = tuple(getattr(p, name) * jnp.exp(change.get(name, 0.0)) for name in _FACTORS)
         inertia = _inertia(p.inertia, tuple(change.get(axis) for axis in _AXES))
@@ -103,10 +105,7 @@ class Unknowns(eqx.Module):
         )
 
     def hold(self, vector: Float[Array, " k"]) -> Float[Array, ""] | None:
-        """How long a logged command acts before the next one that was sent, s; infinite where until the next row.
-
-        None where that is not fitted.
-        """
+        """Time for which a logged command acts, s; infinite if until the next row; None if it is not fitted."""
         if "command_hold" not in self.names:
             return None
         return jnp.where(self.timed > 0, jnp.inf, self._hold(vector))
@@ -115,7 +114,7 @@ class Unknowns(eqx.Module):
         return HOLD + OFFSETS["command_hold"] * vector[self.names.index("command_hold")]
 
     def values(self, vector: Float[Array, " k"]) -> Float[Array, " k"]:
-        """The chosen quantities at ``vector``, SI (means over the motors); differentiable."""
+        """Values (k,) of the chosen quantities at ``vector``, SI (means over the motors); differentiable."""
         p = self.apply(vector)
         known = {
             **{name: jnp.mean(getattr(p, name)) for name in (*_FACTORS, "motor_speed_offset", "pose_delay")},
@@ -128,22 +127,26 @@ class Unknowns(eqx.Module):
         return jnp.stack([known[name] for name in self.names])
 
     def scale(self, vector: Float[Array, " k"]) -> np.ndarray:
-        """(k,) what one unit of a relative change is in SI: the value itself, or the unit of `OFFSETS`."""
+        """Size (k,) of one unit of relative change, SI: the value itself, or the unit in `OFFSETS`."""
         values = np.asarray(self.values(vector))
         return np.array([OFFSETS.get(name, value) for name, value in zip(self.names, values, strict=True)])
 
     def slope(self, vector: Float[Array, " k"]) -> np.ndarray:
-        """(k, k) derivative of the relative changes of the quantities by the vector."""
+        """Derivatives (k, k) of the quantities' relative changes with respect to the vector."""
         return np.asarray(jax.jacfwd(self.values)(vector)) / self.scale(vector)[:, None]
 
 
 def _inertia(nominal: Float[Array, "3"], change: tuple[Array | None, ...]) -> Float[Array, "3"]:
-    """Principal inertia whose free axes (those with a change) moved, and whose other axes stayed, always possible.
+    """Principal inertia with the free axes changed and the other axes fixed; always physically possible.
 
-    With m the second moments of the mass about the three coordinate planes, J_xx = m_y + m_z and so on; a body is
-    possible when no m is negative.
+    With the second moments m of the mass about the three coordinate planes, J_xx = m_y + m_z etc. A body is possible if
+    no m is negative.
+
+    Args:
+        nominal: (3,) kg m^2.
+        change: unknown of each axis; None for a fixed axis.
     """
-    # A flat plate has a moment of zero, which no factor could change.
+    # The lower bound is for a flat plate, whose zero moment could not be changed by a factor.
     moments = jnp.maximum(0.5 * jnp.sum(nominal) - nominal, 1e-6 * jnp.sum(nominal))
     free = [i for i in range(3) if change[i] is not None]
     if not free:
@@ -151,8 +154,8 @@ def _inertia(nominal: Float[Array, "3"], change: tuple[Array | None, ...]) -> Fl
     if len(free) == 3:
         moments = moments * jnp.exp(jnp.stack([not_none(x) for x in change]))
     elif len(free) == 2:
-        # The fixed axis k holds m_i + m_j: the ratio of these two is one unknown, m_k the other. The unknowns are
-        # turned so that each moves its own axis first.
+        # The fixed axis k determines m_i + m_j. The ratio of these two is one unknown, m_k the other. The unknowns are
+        # rotated so that each mainly changes its own axis.
         i, j = free
         k = 3 - i - j
         own, other = not_none(change[i]), not_none(change[j])
@@ -161,7 +164,7 @@ def _inertia(nominal: Float[Array, "3"], change: tuple[Array | None, ...]) -> Fl
         moments = moments.at[i].set(nominal[k] * share).at[j].set(nominal[k] * (1 - share))
         moments = moments.at[k].multiply(jnp.exp(rest))
     else:
-        # J_j and J_k stay: m_k = J_j - m_i and m_j = J_k - m_i, so J_i = J_j + J_k - 2 m_i with m_i in (0, min).
+        # J_j and J_k are fixed: m_k = J_j - m_i and m_j = J_k - m_i, so J_i = J_j + J_k - 2 m_i with m_i in (0, min).
         i = free[0]
         j, k = (n for n in range(3) if n != i)
         most = jnp.minimum(nominal[j], nominal[k])
@@ -171,13 +174,13 @@ def _inertia(nominal: Float[Array, "3"], change: tuple[Array | None, ...]) -> Fl
 
 
 BORDER = 0.01
-"""A second moment of the mass below this share of their sum is at the border of what a rigid body can be."""
+"""An inertia is at the border of the possible if a second moment of the mass is below this share of their sum."""
 
 
 def at_the_border(parameters: Parameters) -> dict[str, str]:
-    """What no number can be given of an inertia that only the possibility of the body stopped, with the reason.
+    """Parameters without a meaningful estimate, with the reason, if the inertia is at the border of the possible.
 
-    Empty for a body well inside. Yaw tells J_zz, J_m and the torque scale as ratios, so these go together.
+    Otherwise the result is empty. Yaw determines J_zz, J_m and the torque scale only as ratios, so these are included.
     """
     inertia = np.asarray(parameters.inertia)
     worst = int(np.argmax(inertia))
@@ -185,17 +188,21 @@ def at_the_border(parameters: Parameters) -> dict[str, str]:
         return {}
     others = [axis for i, axis in enumerate(_AXES) if i != worst]
     reason = (
-        f"these flights ask for {_AXES[worst]} > {others[0]} + {others[1]}, which no rigid body has: something "
-        "else that turns the drone is not in the model"
+        f"these flights require {_AXES[worst]} > {others[0]} + {others[1]}, which no rigid body has: another torque on "
+        "the drone is missing in the model"
     )
     return dict.fromkeys((*_AXES, "rotor_inertia", "torque_scale"), reason)
 
 
 def choose(request: str | tuple[str, ...], nominal: Parameters) -> Unknowns:
-    """Unknowns from names and group names (``inertia``, ``motor``, ``cog``, ``J_m``), comma separated or as a tuple.
+    """Create the unknowns of a fit from names of parameters.
+
+    Args:
+        request: names of parameters (`UNITS`) and of groups (`GROUPS`), comma-separated or as a tuple.
+        nominal: parameters to start from.
 
     Raises:
-        CfbError: an unknown name, or nothing asked for.
+        CfbError: a name is unknown, or there is none.
     """
     parts = [part.strip() for part in (request.split(",") if isinstance(request, str) else request)]
     names: list[str] = []

@@ -19,8 +19,9 @@ PLANT = (
     *("blade_flapping", "inflow_thrust", "rate_damping", "rotor_drag", "thrust_scale", "inertia", "cog_offset"),
     *("torque_scale", "thrust_tilt", "position_moment", "command_delay", "motor_asymmetry", "battery_sag"),
 )
-"""Effects that an undamaged drone usually has beside the paper's model. They have to be fitted together, because none
-of them alone improves predictions. Loads, wind and other effects of only some drones are fitted on request."""
+"""Effects that an undamaged drone usually has in addition to the paper's model. They have to be fitted together,
+because none of them alone improves predictions. Loads, wind and other effects of only some drones are fitted on
+request."""
 INERTIA = 0.25
 """Largest plausible relative change of a moment of inertia, for instance by decks and another battery."""
 HELD = 1e-12

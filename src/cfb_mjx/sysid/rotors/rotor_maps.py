@@ -22,7 +22,7 @@ FEWEST_POINTS = 6
 TARE = 3.0
 """An offset of all points is kept if it exceeds this many of its standard deviations."""
 _TARE_LEVELS = 5
-"""Number of different rotor speeds required to fit an offset beside the three coefficients, with one to spare."""
+"""Number of different rotor speeds required to fit an offset alongside the three coefficients, with one to spare."""
 _ITERATIONS = 50
 """Maximum number of iterations of the fit."""
 

@@ -133,7 +133,7 @@ class Candidate:
     Attributes:
         name: of the effect.
         gain: in cross-validation, when it was last considered, nats.
-        p_value: in cross-validation, likewise.
+        p_value: in cross-validation, when it was last considered.
         why: reason why it is not reported.
     """
 

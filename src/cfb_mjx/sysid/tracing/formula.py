@@ -47,7 +47,7 @@ def with_library(search: Search, hypothesis: Hypothesis) -> tuple[Search, Hypoth
 
 
 def select(search: Search, hypothesis: Hypothesis, progress: Callable[[str], None] = lambda _: None) -> Selection:
-    """Select terms beside the effects that are present, separately for each axis.
+    """Select terms alongside the effects that are present, separately for each axis.
 
     Args:
         search: search with the library (`with_library`).
@@ -104,7 +104,7 @@ class _Axis:
         return added, gains
 
     def pruned(self, picked: list[Column]) -> list[Column]:
-        """Remove terms that gain next to nothing beside the others."""
+        """Remove terms that gain next to nothing in addition to the others."""
         for column in list(picked):
             others = [c for c in picked if c != column]
             squared = any(_square(c) and _coordinate(c) == _coordinate(column) for c in others)
@@ -213,7 +213,7 @@ def terms_of(hypothesis: Hypothesis, deviation: np.ndarray, gains: dict[Column, 
 
 @dataclass(frozen=True)
 class Proposal:
-    """A formula beside the effects that were found.
+    """A formula alongside the effects that were found.
 
     Attributes:
         terms: of the formula, the largest gain first.
@@ -231,7 +231,7 @@ class Proposal:
 def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Column]) -> bool:
     """Whether the terms can reproduce most of an effect; the effect, which has a physical meaning, is then kept.
 
-    An effect that the terms cannot reproduce, but that is needless beside them, only stood in for them.
+    An effect that the terms cannot reproduce, but that is needless alongside them, only stood in for them.
 
     Args:
         search: with the library.
@@ -253,7 +253,7 @@ def mimicked(search: Search, hypothesis: Hypothesis, name: str, terms: list[Colu
 def explain(
     found: Trace, progress: Callable[[str], None] = lambda _: None, held_out: Search | None = None
 ) -> tuple[Search, Proposal | None]:
-    """Look for a formula beside the effects found, keep it if it is material, and remove effects it makes needless.
+    """Look for a formula alongside the effects found, keep it if it is material, and remove effects it makes needless.
 
     Args:
         found: result of the search.

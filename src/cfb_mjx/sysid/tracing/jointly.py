@@ -1,7 +1,7 @@
 """Selection of many missing effects at once, by stepwise regression on the linearised residual.
 
 The inner products of `Search.whole` contain what every effect of the catalogue would explain, and what it shares with
-every other effect. So a set of effects can be selected without a fit: add the effect with the largest gain beside those
+every other effect. So a set of effects can be selected without a fit: add the effect with the largest gain given those
 already chosen, remove chosen ones that are no longer significant, and stop when no further effect is. Then fit all
 effects of the set, remove those that the fit shows to be needless, linearise again and repeat.
 """
@@ -27,7 +27,7 @@ class Chosen:
 
     Attributes:
         variant: its columns.
-        found: evidence for it beside the effects chosen before.
+        found: evidence for it given the effects chosen before.
     """
 
     variant: list[Column]
@@ -42,7 +42,7 @@ class Chosen:
 def beside_each_other(
     search: Search, hypothesis: Hypothesis, linear: Linear, refused: Collection[str] = ()
 ) -> list[Chosen]:
-    """Select the absent effects that are significant beside the present effects and beside each other.
+    """Select the absent effects that are significant given the present effects and given each other.
 
     Args:
         search: over the flights.
@@ -200,7 +200,7 @@ def _total(fit: Fit) -> float:
 
 
 def needless(search: Search, hypothesis: Hypothesis) -> dict[str, Evidence]:
-    """Present effects that are not significant beside the rest, by the linearisation here; the smallest gain first."""
+    """Present effects that are not significant given the rest, by the linearisation here; the smallest gain first."""
     own = search.own_columns(hypothesis)
     linear, gone = search.linearise(hypothesis, own), {}
     while True:

@@ -67,7 +67,7 @@ class Rules:
 
     # Many effects missing at once.
     many: int = 3
-    """If at least this many effects are clearly significant beside each other, they are added together."""
+    """If at least this many effects are clearly jointly significant, they are added together."""
     far_off: float = 1 / 3
     """A model is far off if its error after half a second exceeds this share of the error of `hold`."""
     looks: int = 5
@@ -100,7 +100,7 @@ class Rules:
     term_rare: float = 2.0
     """A term that few blocks excite must have a t above this."""
     term_needless: float = 2.0
-    """A term that gains fewer nats than this beside the others is removed."""
+    """A term that gains fewer nats than this in addition to the others is removed."""
     per_axis: int = 3
     """Maximum number of terms or families of terms along one axis."""
     of_family: float = 0.9
@@ -142,7 +142,7 @@ class Rules:
     gain: float = 0.05
     """A candidate must lower the loss by this share, and its first Gauss-Newton step must predict half of it."""
     worth: float = 0.005
-    """An effect must lower the loss by this share beside all others."""
+    """An effect must lower the loss by this share in addition to all others."""
     confused: float = 0.9
     """Two effects are confusable if parameters of theirs have at least this correlation."""
     spreads: float = 2.0
@@ -190,7 +190,7 @@ class Rules:
         return clear and enough(fit.by_flight, richer.by_flight, nothing.by_flight, *shares)
 
     def missed(self, poorer: Fit, richer: Fit, clear: bool) -> bool:
-        """Whether one of many effects lowers an error materially beside all others.
+        """Whether one of many effects lowers an error materially in addition to all others.
 
         It must do so over all flights or, if ``clear``, by twice the share in one flight. The declared model's error is
         not a useful reference here, because with many effects missing it is very large.

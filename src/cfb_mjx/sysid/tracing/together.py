@@ -5,11 +5,11 @@ it. If ten effects are missing, the answer is "no" for each of the ten. Therefor
 
 1. Commands to rotor speeds: the motors are fitted on their own, from measured rotor speeds
    (`cfb_mjx.sysid.tracing.motors`).
-2. The effects that an undamaged drone usually has beside the paper's model (`PLANT`) are fitted together, to
+2. The effects that an undamaged drone usually has in addition to the paper's model (`PLANT`) are fitted together, to
    predictions.
-3. Effects that only some drones have (a load, wind) are tried beside the rest, in the order of their evidence in the
+3. Effects that only some drones have (a load, wind) are tried alongside the rest, in the order of their evidence in the
    innovations, and kept if predictions improve.
-4. Effects that contribute too little beside the others are removed, the least important first.
+4. Effects that contribute too little in addition to the others are removed, the least important first.
 
 Effects that the model already declares belong to the type of drone. They stay as they are, except those that differ
 from drone to drone (`OWN`). If the model states how far drones of the type differ (``spread``), they may move within

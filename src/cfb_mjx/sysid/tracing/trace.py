@@ -176,7 +176,7 @@ def trace(
             fit, seen = taken_in(search, nothing, fit, name, richer, statistic[name] >= rules.clear, progress)
             if seen is not None:
                 fit, vain = completed(search, fit), 0
-                # Effects that were immaterial beside a larger error may be material now.
+                # Effects that were immaterial compared with a larger error may be material now.
                 refused = set()
                 left_out, judged = seen, fit.hypothesis
                 break
@@ -200,7 +200,7 @@ def trace(
 
 
 def lacks_many(search: Search, fit: Fit, progress: Callable[[str], None]) -> Fit | None:
-    """Fit many missing effects together, if many more are clearly significant beside those found.
+    """Fit many missing effects together, if many more are clearly significant given those found.
 
     The fit starts from the declared model again, because the effects added first have absorbed part of what others
     explain. The result is None if few more are significant, or if the joint fit does not predict better.
@@ -221,7 +221,7 @@ def rank(search: Search, fit: Fit, refused: set[str]) -> list[tuple[Evidence, li
 
 
 def needed(search: Search, less: LeftOut, fit: Fit, nothing: Fit) -> bool:
-    """Whether an effect is needed: it is significant beside the others and lowers an error materially."""
+    """Whether an effect is needed: it is significant given the others and lowers an error materially."""
     if less.own is None or not search.stands(less.own):
         return False
     return search.rules.lowers(less.fit, fit, nothing, less.own.t >= search.rules.clear)
@@ -385,7 +385,7 @@ def line_of(variant: list[Column], found: Evidence) -> dict:
 def contenders(
     search: Search, fit: Fit, ranking: list[tuple[Evidence, list[Column]]], progress: Callable[[str], None]
 ) -> tuple[list[tuple[str, Fit]], set[str]]:
-    """Fit the best candidates beside the present effects, and order them.
+    """Fit the best candidates alongside the present effects, and order them.
 
     The ranking uses linearisations at neutral values, which say little about effects whose shape is still to be
     fitted. Therefore several of the best candidates are fitted. Among those with nearly the same gain, the ones that
