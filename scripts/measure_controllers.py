@@ -10,6 +10,7 @@ measured on the real drone. `raptor` is RAPTOR's published policy (`pip install 
 import argparse
 import json
 from dataclasses import replace
+from itertools import pairwise
 
 from campaign import ROOT, facts_line
 
@@ -25,6 +26,7 @@ RAPTOR = [
     "",
 ]
 IDSIA = "cfb-idsia"
+STRENGTHS = (1.2, 1.4, 1.6)
 CONTROLLERS = ["target", "target-analytic", "target-adaptive", "pid", "mellinger", "raptor"]
 RESULTS = ROOT / "benchmarks" / "controllers.json"
 PAPER_OF = {"target": PAPER_HOVER[1.0], **PAPER_FIRMWARE}
@@ -79,6 +81,7 @@ def main() -> None:
             "random_command_std": float(np.median(np.asarray(all_of_them.command_std)[well])),
             "random_failed": float(1 - well.mean()),
             "random_recovered": float(np.mean(thrown.recovered)),
+            "recovered_by_strength": _by_strength(thrown),
             "recovered": float(np.mean(thrown_nominal.recovered)),
             "sensors": judge.with_sensors(controller, lumped),
             IDSIA: summary(hover(controller, wild, Quadrotor.from_file(IDSIA), many)[0], np.median),
@@ -94,6 +97,17 @@ def main() -> None:
     results = {name: results[name] for name in CONTROLLERS if name in results}
     write_text(ROOT / "docs" / "controllers.md", page(results, arguments.plants, described))
     print("docs/controllers.md")
+
+
+def _by_strength(thrown) -> dict[str, list]:
+    """Drones with a balanced thrust-to-weight below each limit and above the one before, and the recovered share."""
+    import numpy as np
+
+    band = np.digitize(np.asarray(thrown.thrust_to_weight), STRENGTHS)
+    well = np.asarray(thrown.recovered)
+    between = (f"{a:g} to {b:g}" for a, b in pairwise(STRENGTHS))
+    names = [f"below {STRENGTHS[0]:g}", *between, f"above {STRENGTHS[-1]:g}"]
+    return {name: [int((band == i).sum()), float(well[band == i].mean())] for i, name in enumerate(names)}
 
 
 def _cell(there: dict) -> str:
@@ -147,7 +161,9 @@ def _hover_squared(parameters):
 
 def page(results: dict, plants: int, described) -> str:
     """The Markdown page."""
-    names = list(results)
+    from cfb_mjx.model import balanced_thrust_to_weight
+
+    names, nominal = list(results), float(balanced_thrust_to_weight(described.parameters()))
     lines = [
         "# Controllers, measured",
         "",
@@ -197,6 +213,21 @@ def page(results: dict, plants: int, described) -> str:
         cells = [name, *(f"{v:.0f}" for v in r["random_hover_mm"].values()), f"{r['random_command_std']:.4f}"]
         cells += [f"{r['random_failed']:.2%}", f"{r['random_recovered']:.2%}", f"{r['recovered']:.2%}"]
         lines.append("| " + " | ".join(cells) + " |")
+    bands = list(results[names[0]]["recovered_by_strength"])
+    lines += [
+        "",
+        "Most of the drones that do not recover are weak. The next table divides the drones by the largest thrust that "
+        "they have with balanced roll, pitch and yaw torques, over their weight (`balanced_thrust_to_weight`; nominal: "
+        f"{nominal:.2f}). Each cell is the share that recovers; the number of drones is in the heading.",
+        "",
+        "| controller | "
+        + " | ".join(f"{band} ({results[names[0]]['recovered_by_strength'][band][0]} drones)" for band in bands)
+        + " |",
+        "|---|" + "---|" * len(bands),
+    ]
+    for name in names:
+        shares = results[name]["recovered_by_strength"]
+        lines.append(f"| {name} | " + " | ".join(f"{shares[band][1]:.1%}" for band in bands) + " |")
     factors = list(results[names[0]]["factors"])
     lines += [
         "",

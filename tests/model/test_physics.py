@@ -9,8 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.optimize import linprog
 
-from cfb_mjx.model import Quadrotor, State, hover_command, hover_rotor_speed, rollout, thrust, torque
+from cfb_mjx.model import (
+    Quadrotor,
+    State,
+    balanced_thrust_to_weight,
+    hover_command,
+    hover_rotor_speed,
+    rollout,
+    thrust,
+    torque,
+)
 from cfb_mjx.model import step as advance_one
 from cfb_mjx.parameters import load_model_file
 
@@ -53,6 +63,33 @@ def test_hover_command_of_a_drone_too_heavy_to_hover_is_outside_the_range(mass, 
 
 # Eqs. 6-7: roll, pitch, yaw sign of M1 front-right, M2 back-right, M3 back-left, M4 front-left.
 SIGNS = {0: (-1, -1, -1), 1: (-1, 1, 1), 2: (1, 1, -1), 3: (1, -1, 1)}
+
+
+def test_balanced_thrust_to_weight_is_that_of_linear_programming(guards):
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        drone = eqx.tree_at(
+            lambda p: (p.mass, p.center_of_gravity, p.thrust_scale, p.torque_scale),
+            guards,
+            (
+                guards.mass * rng.uniform(0.9, 1.1),
+                jnp.asarray([*rng.uniform(-0.01, 0.01, 2), 0.0]),
+                jnp.asarray(rng.uniform(0.8, 1.2, 4)),
+                jnp.asarray(rng.uniform(0.8, 1.2, 4)),
+            ),
+        )
+        most, drag = (np.asarray(f(drone, drone.motor_gain)) for f in (thrust, torque))
+        x, y, _ = np.asarray(drone.center_of_gravity)
+        half = float(drone.rotor_spacing) / 2
+        # Roll by thrust at +y, pitch by thrust at -x, about the centre of gravity.
+        arms = [
+            (roll * half - y, pitch * half + x, yaw * q / f)
+            for (roll, pitch, yaw), q, f in zip(SIGNS.values(), drag, most, strict=True)
+        ]
+        found = linprog(-np.ones(4), A_eq=np.transpose(arms), b_eq=np.zeros(3), bounds=[(0, f) for f in most])
+        assert float(balanced_thrust_to_weight(drone)) == pytest.approx(
+            -found.fun / float(drone.mass * drone.gravity), rel=1e-6
+        )
 
 
 @pytest.mark.parametrize("motor", [0, 1, 2, 3])

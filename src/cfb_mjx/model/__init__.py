@@ -8,7 +8,14 @@ from cfb_mjx.model.effects import CATALOGUE, Condition, Effect, ParasiticDrag, W
 from cfb_mjx.model.quadrotor import Quadrotor, begin, specific_force, step
 from cfb_mjx.model.randomised import require_possible, sample_drone
 from cfb_mjx.model.rollout import in_chunks, rollout, rollout_final
-from cfb_mjx.model.rotors import hover_command, hover_rotor_speed, rotor_speed_history, thrust, torque
+from cfb_mjx.model.rotors import (
+    balanced_thrust_to_weight,
+    hover_command,
+    hover_rotor_speed,
+    rotor_speed_history,
+    thrust,
+    torque,
+)
 from cfb_mjx.model.state import State
 
 if TYPE_CHECKING:
@@ -26,6 +33,7 @@ __all__ = [
     "RigidBody",
     "State",
     "Wrench",
+    "balanced_thrust_to_weight",
     "begin",
     "hover_command",
     "hover_rotor_speed",

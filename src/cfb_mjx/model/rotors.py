@@ -217,6 +217,25 @@ def hover_command(parameters: Parameters) -> Float[Array, "4"]:
     return steady_command(parameters, hover_rotor_speed(parameters))
 
 
+def balanced_thrust_to_weight(parameters: Parameters) -> Float[Array, ""]:
+    """Largest total thrust with balanced roll, pitch and yaw torques, over the weight.
+
+    Below 1 the drone cannot hold its height without turning. Three balanced torques of four rotors leave one free
+    number, the level of the thrusts, until the first rotor reaches full command. The ratio of torque to thrust of each
+    rotor is taken at full command.
+    """
+    full = parameters.motor_gain + parameters.motor_speed_offset
+    most = thrust(parameters, full)
+    half, cog = parameters.rotor_spacing / 2, jnp.asarray(parameters.center_of_gravity)
+    x, y, spin = (jnp.array(signs, most.dtype) for signs in (POSITION_SIGNS_X, POSITION_SIGNS_Y, YAW_SIGNS))
+    arms = jnp.stack([half * y - cog[1], half * x - cog[0], spin * torque(parameters, full) / most])
+    # The generalised cross product: what all three rows are orthogonal to.
+    shares = jnp.stack([(-1) ** i * jnp.linalg.det(jnp.delete(arms, i, axis=1)) for i in range(4)])
+    shares = shares / jnp.sum(shares)
+    level = jnp.min(jnp.where(shares > 0, most / jnp.maximum(shares, 1e-12), 0.0))
+    return level / (parameters.mass * parameters.gravity)
+
+
 def steady_command(parameters: Parameters, speed: Float[AnyArray, "4"]) -> Float[Array, "4"]:
     """Commands for which the rotors settle at ``speed`` [rad/s]."""
     return (jnp.asarray(speed) - parameters.motor_speed_offset) / parameters.motor_gain

@@ -17,6 +17,7 @@ from cfb_mjx.envs.episode import Task, reset, settled_command, step, with_room
 from cfb_mjx.envs.observation import Layout
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.rotors import balanced_thrust_to_weight
 from cfb_mjx.model.state import State
 
 HOVER_S, SETTLING_S = 6.0, 1.0
@@ -208,6 +209,8 @@ class Recovery(NamedTuple):
     lost_height_m: Float[Array, "*drones"]
     final_distance_m: Float[Array, "*drones"]
     failed: Bool[Array, "*drones"]
+    thrust_to_weight: Float[Array, "*drones"]
+    """Of the drone, with balanced torques: `balanced_thrust_to_weight`."""
 
 
 RECOVERY_S, CAUGHT_M = 6.0, 0.75
@@ -262,16 +265,18 @@ def _recovery(controller, task, nominal, keys, tilt_deg, speed):
             hovering.rotor_speed,
             hovering.memory,
         )
-        return fly(controller, task, nominal, of_flight, RECOVERY_S, state)
+        # The drone that `fly` draws from this key.
+        drone = reset(task, nominal, of_flight, state).model.parameters
+        return fly(controller, task, nominal, of_flight, RECOVERY_S, state), balanced_thrust_to_weight(drone)
 
-    flown = jax.vmap(thrown)(keys)
+    flown, strength = jax.vmap(thrown)(keys)
     distance = jnp.linalg.norm(flown.position[:, -1], axis=-1)
     slow = jnp.linalg.norm(flown.velocity[:, -1], axis=-1) < 0.5
     _, x, y, _ = jnp.moveaxis(flown.quaternion[:, -1], -1, 0)
     level = 1 - 2 * (x * x + y * y) > np.cos(np.radians(30.0))
     well = ~flown.failed[:, -1] & slow & level & (distance < CAUGHT_M)
     lost = -jnp.minimum(0.0, flown.position[..., 2].min(axis=1))
-    return Recovery(well, lost, distance, flown.failed[:, -1]), flown
+    return Recovery(well, lost, distance, flown.failed[:, -1], strength), flown
 
 
 _AnyTask = TypeVar("_AnyTask", bound=Task)
