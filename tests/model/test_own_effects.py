@@ -15,7 +15,7 @@ import pytest
 from jaxtyping import Array, Float
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.model import CATALOGUE, Condition, Effect, Quadrotor, Wrench, begin, register, rollout, step
+from cfb_mjx.model import CATALOGUE, Condition, Effect, Quadrotor, RigidBody, Wrench, begin, register, rollout, step
 from cfb_mjx.model.effects import KNOWN, RotorDrag, effect_from_mapping, effect_to_mapping
 from cfb_mjx.model.effects.fields import number, vector
 from cfb_mjx.model.vector import Vec
@@ -329,6 +329,29 @@ def test_an_effect_of_anybody_takes_the_fast_path_if_its_program_fits(kind, guar
             np.testing.assert_allclose(got[i], wanted, rtol=1e-9, atol=1e-9)
     without = rollout(Quadrotor(guards), *manoeuvre)
     assert np.abs(flown.position[0] - without.position).max() > 1e-7, "the test would not see it"
+
+
+class Sliding:
+    """Somebody's body: the rigid one, on a floor without friction that pulls it along x."""
+
+    name = "sliding"
+
+    def prepare(self, parameters, dt):
+        return RigidBody().prepare(parameters, dt)
+
+    def accelerations(self, prepared, state, wrench, gyroscopic=True):
+        (x, y, z), angular = RigidBody().accelerations(prepared, state, wrench, gyroscopic)
+        return Vec(x + 0.1, y, z), angular
+
+
+def test_a_body_of_anybody_takes_the_fast_path_if_its_program_fits(guards, manoeuvre):
+    model = Quadrotor(guards, body=Sliding())
+    traced = jax.jit(rollout).trace(model, *manoeuvre)
+    assert any(equation.primitive.name == "fly" for equation in traced.jaxpr.jaxpr.eqns)
+    flown = traced.lower().compile(compiler_options=helpers.QUICK_COMPILE)(model, *manoeuvre)
+    one = _stepped(model, *manoeuvre)
+    np.testing.assert_allclose(flown.position, one.position, rtol=1e-9, atol=1e-9)
+    assert np.abs(flown.position - rollout(Quadrotor(guards), *manoeuvre).position).max() > 1e-4
 
 
 def test_the_choice_is_made_once_for_models_alike(guards):
