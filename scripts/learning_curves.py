@@ -248,7 +248,7 @@ def page(found: dict[str, list[dict]]) -> str:
         "where the training did not measure it.",
         "- std: command std of the last policy on the nominal drone, with the pose 24 ms late and the gyro read on the "
         "drone, and with both 16 ms late (8 ms in the model). Above 0.04 the drone oscillates.",
-        f"- recovered: share of {THROWN} drones with the paper's full randomisation that catch themselves after a throw "
+        f"- recovered: share of {THROWN} drones with the paper's full randomisation that come back after a throw "
         "([the test](controllers.md)). Empty where it was not measured.",
         "",
         "![learning curves](learning-curves.png)",
