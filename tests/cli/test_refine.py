@@ -13,7 +13,7 @@ from cfb_mjx.model.effects import Inertia, RotorDrag
 from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.sysid.refinement import model_files, plausible_numbers
 from cfb_mjx.sysid.sensor_faults import HEALTHY
-from cfb_mjx.sysid.tracing.given import Given
+from cfb_mjx.sysid.tracing.named_effects import NamedFit
 
 LOGS = Path(__file__).resolve().parents[2] / "data" / "flight_logs"
 LOG = LOGS / "drag.mcap"
@@ -42,8 +42,8 @@ def test_a_number_that_ends_at_its_bound_says_so(monkeypatch):
     """By innovations, too: there a strength may not change its sign."""
 
     def found(drag):
-        given = Given((RotorDrag(coefficient=drag),), {"rotor_drag": {"coefficient": 1e-3}}, HEALTHY)
-        monkeypatch.setattr("cfb_mjx.sysid.refinement.model_files.fit_given", lambda *_: given)
+        given = NamedFit((RotorDrag(coefficient=drag),), {"rotor_drag": {"coefficient": 1e-3}}, HEALTHY)
+        monkeypatch.setattr("cfb_mjx.sysid.refinement.model_files.fit_named_effects", lambda *_: given)
         _, report = model_files.by_innovations(load_model_file("cfb-guards"), [read_log(LOG)], ["rotor_drag"])
         return report["numbers"]["rotor_drag.coefficient"]["at_bound"]
 
@@ -72,8 +72,8 @@ def test_effects_that_are_not_fitted_anew_keep_what_is_known_of_them(monkeypatch
     known = {"relative": [0.1, 0.1, 0.1]}
     inertia = {"name": "inertia", "parameters": {"relative": [0.2, -0.1, 0.4]}, "uncertainty": known}
     effects = (Inertia(relative=[0.2, -0.1, 0.4]), RotorDrag(coefficient=0.01))
-    given = Given(effects, {"rotor_drag": {"coefficient": 1e-3}}, HEALTHY)
-    monkeypatch.setattr("cfb_mjx.sysid.refinement.model_files.fit_given", lambda *_: given)
+    given = NamedFit(effects, {"rotor_drag": {"coefficient": 1e-3}}, HEALTHY)
+    monkeypatch.setattr("cfb_mjx.sysid.refinement.model_files.fit_named_effects", lambda *_: given)
     base = replace(load_model_file("cfb-guards"), effects=(inertia,))
     with pytest.warns(CfbWarning, match="impossible for a rigid body"):
         refined, report = model_files.by_innovations(base, [read_log(LOG)], ["rotor_drag"])

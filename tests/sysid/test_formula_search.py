@@ -55,7 +55,7 @@ def test_wind_gives_way_to_a_place_only_if_nothing_misses_it(monkeypatch, withou
 
 @pytest.fixture
 def rare(monkeypatch):
-    """What `_with_rare` makes of one sure and one rare term: the statistic of the rare one, and the errors with it."""
+    """A function of the statistic of a rare term and of the errors with it: whether `_with_weakly_excited` keeps it."""
     sure, seldom = (c for c in term_columns(3) if c.field == "place" and c.index in ((0, 1), (0, 2)))
     effects = neutral_effects(_Search.names)
     base = Hypothesis(effects, (), origin=effects)
@@ -69,7 +69,7 @@ def rare(monkeypatch):
         monkeypatch.setattr(formula, "prediction_errors", errors)
         monkeypatch.setattr(formula, "confirm", lambda *_: SimpleNamespace(t=statistic))
         held_out = SimpleNamespace(nothing=lambda: base, rules=RULES)
-        found = formula._with_rare(_Search(), base, [sure], Selection([sure], [[seldom]]), held_out)
+        found = formula._with_weakly_excited(_Search(), base, [sure], Selection([sure], [[seldom]]), held_out)
         return found == [sure, seldom]
 
     return run

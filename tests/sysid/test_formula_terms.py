@@ -32,7 +32,7 @@ def _selected(signals: dict[str, np.ndarray], residual: np.ndarray):
     )
     chosen = select(search, None)
     return [list(PLACES)[c.index[1]] for c in chosen.sure], [
-        [list(PLACES)[c.index[1]] for c in group] for group in chosen.rare
+        [list(PLACES)[c.index[1]] for c in group] for group in chosen.weakly_excited
     ]
 
 

@@ -53,12 +53,14 @@ def tried(monkeypatch):
         monkeypatch.setattr(trace, "summary", lambda s, f, name, less: Found(name, 0.01, 9.0, 0.1, {}, {}, [], base))
         search = SimpleNamespace(with_candidate=richer, rules=rules)
         judging = SimpleNamespace(
-            rare_sure=rules.rare_sure, lowered=rules.lowered, stretched=lambda _, name: name in impossible
+            weakly_excited_sure=rules.weakly_excited_sure,
+            lowered=rules.lowered,
+            stretched=lambda _, name: name in impossible,
         )
         judge = SimpleNamespace(nothing=lambda: base.without("rotor_drag"), rules=judging)
         first = Found("rotor_drag", 1e-9, 99.0, 0.4, {}, {}, [], base)
         found = Trace(base, None, [first], [], search, np.ones(8), np.ones(8), fit_of(base))
-        result = trace.with_rare(found, judge)
+        result = trace.with_weakly_excited(found, judge)
         assert set(result.hypothesis.present) == {item.name for item in result.found}
         return [item.name for item in result.found], asked, result
 
@@ -92,4 +94,4 @@ def test_no_more_than_two_are_tried_and_one_that_needs_an_impossible_strength_is
     names, asked, _ = tried(evidence, impossible=("gyroscopic",))
     assert asked == ["gyroscopic", "torque_scale"]
     assert "gyroscopic" not in names
-    assert tried(evidence, rules=replace(RULES, rare_tried=1))[1] == ["gyroscopic"]
+    assert tried(evidence, rules=replace(RULES, weakly_excited_tried=1))[1] == ["gyroscopic"]

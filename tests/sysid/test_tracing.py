@@ -25,10 +25,10 @@ from cfb_mjx.sysid.tracing.closing import close_loop
 from cfb_mjx.sysid.tracing.evidence import dealt, evidence
 from cfb_mjx.sysid.tracing.fits import as_it_is
 from cfb_mjx.sysid.tracing.formula import with_library
-from cfb_mjx.sysid.tracing.given import fit_given
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, moved, neutral_effects, shapes, strengths, term_columns
 from cfb_mjx.sysid.tracing.jointly import beside_each_other, everything, needless, one_by_one, told_apart
-from cfb_mjx.sysid.tracing.residuals import find_lines, residual_rows
+from cfb_mjx.sysid.tracing.named_effects import fit_named_effects
+from cfb_mjx.sysid.tracing.residuals import find_spectral_lines, residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors, lags
 from cfb_mjx.sysid.tracing.together import asked
@@ -226,7 +226,7 @@ def test_a_line_in_every_flight_is_found_and_noise_has_none(campaigns, base):
     for name in ("periodic", "clean"):
         campaign = campaigns[name]
         search = Search.start(campaign.fit, base.parameters(), 0.008, check_sensors(campaign.fit, 0.008, 0.0))
-        lines = find_lines(residual_rows(search, search.nothing()))
+        lines = find_spectral_lines(residual_rows(search, search.nothing()))
         if name == "clean":
             assert not lines
         else:
@@ -355,7 +355,7 @@ def test_a_fold_leaves_out_another_part_of_every_flight():
 
 def test_named_effects_are_fitted_to_innovations(campaigns, base):
     campaign = campaigns["drag"]
-    found = fit_given(campaign.fit, base.parameters(), ("rotor_drag", "thrust_scale"))
+    found = fit_named_effects(campaign.fit, base.parameters(), ("rotor_drag", "thrust_scale"))
     drag, thrust = found.effects
     total = 4 * np.mean(campaign.truth["effects"]["rotor_drag"]["rotor_drag"])
     assert 0.6 * total < float(drag.coefficient) < 1.05 * total
@@ -363,7 +363,7 @@ def test_named_effects_are_fitted_to_innovations(campaigns, base):
     assert 0 < found.uncertainty["rotor_drag"]["coefficient"] < 0.1 * total
     assert found.faults.healthy
     with pytest.raises(CfbError, match="warp"):
-        fit_given(campaign.fit, base.parameters(), ("warp",))
+        fit_named_effects(campaign.fit, base.parameters(), ("warp",))
 
 
 @pytest.mark.parametrize("guess", [0.1, 0.15, 0.2])

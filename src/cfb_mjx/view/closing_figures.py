@@ -286,7 +286,7 @@ def draw(diagnosis: Diagnosis, folder: Path) -> Figures:
     """
     held_out = diagnosis.held_out
     figures: Figures = {"errors": [(folder / "errors.svg", "held-out error against horizon, before and after")]}
-    errors_figure(diagnosis.before, diagnosis.after, held_out.floor, held_out.random, figures["errors"][0][0])
+    errors_figure(diagnosis.before, diagnosis.after, held_out.noise_floor, held_out.random, figures["errors"][0][0])
     for item in diagnosis.reported:
         panels, labels = _effect(diagnosis, item)
         if panels:

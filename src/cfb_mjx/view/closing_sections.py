@@ -194,7 +194,7 @@ def _errors(figures: Figures) -> Section:
 def _numbers(diagnosis: Diagnosis) -> Section:
     windows = sum(len(log.windows) for log in diagnosis.before.logs)
     caption = f"RMS errors over {windows} windows of {len(diagnosis.before.logs)} held-out flights, with 95 % intervals"
-    rows = _rows(diagnosis.before, diagnosis.after, diagnosis.held_out.floor, diagnosis.held_out.random)
+    rows = _rows(diagnosis.before, diagnosis.after, diagnosis.held_out.noise_floor, diagnosis.held_out.random)
     head = ["error of", "ahead", "before", "after", "change", "hold", "noise floor", "noise and disturbances"]
     tables = [(caption, head, rows)]
     before, after = diagnosis.before.metrics("rotor_speed_in"), diagnosis.after.metrics("rotor_speed_in")
@@ -362,8 +362,8 @@ def _budget(diagnosis: Diagnosis) -> str:
     for quantity, unit in QUANTITIES.items():
         key = f"{quantity}_rmse_{unit}@{horizon:g}s"
         for found, floor in (
-            (sensors, diagnosis.held_out.floor[key]),
-            (wandering, max(diagnosis.held_out.floor[key], diagnosis.held_out.random[key])),
+            (sensors, diagnosis.held_out.noise_floor[key]),
+            (wandering, max(diagnosis.held_out.noise_floor[key], diagnosis.held_out.random[key])),
         ):
             found.append(f"{quantity} {100 * min(1.0, floor**2 / errors[key] ** 2):.0f} %")
     return (

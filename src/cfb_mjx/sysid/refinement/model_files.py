@@ -17,8 +17,8 @@ from cfb_mjx.sysid.flight import usual_delay
 from cfb_mjx.sysid.refinement.fitting import refine
 from cfb_mjx.sysid.refinement.numbers import free_numbers, plausible_numbers
 from cfb_mjx.sysid.sensor_faults import SensorFaults
-from cfb_mjx.sysid.tracing.given import fit_given
 from cfb_mjx.sysid.tracing.hypothesis import bounds
+from cfb_mjx.sysid.tracing.named_effects import fit_named_effects
 
 
 def by_innovations(
@@ -34,19 +34,19 @@ def by_innovations(
         base: the model to start from.
         logs: flights; run with x64 enabled.
         names: effects to fit.
-        as_logged: as for `fit_given`.
+        as_logged: as for `fit_named_effects`.
         progress: called with a message at each step.
 
     Returns:
         The fitted model, and a report with value, standard deviation and bound of each parameter under ``numbers``.
 
     Raises:
-        CfbError: as `fit_given`.
+        CfbError: as `fit_named_effects`.
     """
     parameters = base.parameters()
     delay = usual_delay(logs, parameters)
     declared = Quadrotor.from_file(base).effects
-    found = fit_given(logs, parameters, names, declared, delay, progress, as_logged)
+    found = fit_named_effects(logs, parameters, names, declared, delay, progress, as_logged)
     rows, mappings = {}, _mappings(found.effects, _kept(base, names) | found.uncertainty)
     for mapping in mappings:
         std = mapping.get("uncertainty")

@@ -20,12 +20,12 @@ from cfb_mjx.sysid.tracing.diagnosis import Diagnosis, Reported, Unexplained
 from cfb_mjx.sysid.tracing.fits import Verdict, confirm, prediction_errors
 from cfb_mjx.sysid.tracing.formula import Proposal, explain, only_there
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
-from cfb_mjx.sysid.tracing.residuals import Line, find_lines, residual_rows
+from cfb_mjx.sysid.tracing.residuals import SpectralLine, find_spectral_lines, residual_rows
 from cfb_mjx.sysid.tracing.rules import RULES, Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.together import Part, asked, fit_together, hypothesis_of, paired
-from cfb_mjx.sysid.tracing.trace import Found, Trace, deviations, numbers_of, trace, with_rare
+from cfb_mjx.sysid.tracing.trace import Found, Trace, deviations, numbers_of, trace, with_weakly_excited
 
 
 def close_loop(
@@ -64,7 +64,7 @@ def close_loop(
     # Biases of the held-out sensors come from their own kinematics; no model is fitted.
     check = replace(check_sensors(held_out, delay, float(parameters.gyro_delay)), faults=found.sensors.faults)
     judge = found.search.beside(held_out, check)
-    found = with_rare(found, judge, progress)
+    found = with_weakly_excited(found, judge, progress)
     search, proposal = explain(found, progress, judge)
     progress("judging on held-out flights")
     before = evaluate(found.search.nothing().model(parameters), held_out)
@@ -195,13 +195,13 @@ def _unexplained(
     return Unexplained(proposal, lines, there) if proposal or lines or there else None
 
 
-def _lines(search: Search, judge: Search, hypothesis: Hypothesis) -> list[Line]:
+def _lines(search: Search, judge: Search, hypothesis: Hypothesis) -> list[SpectralLine]:
     """Spectral lines common to most fit flights, and to most held-out flights if there are enough of these."""
     rules = search.rules
-    lines = find_lines(residual_rows(search, hypothesis), rules.line_alpha)
+    lines = find_spectral_lines(residual_rows(search, hypothesis), rules.line_alpha)
     if len(judge.logs) < rules.line_flights:
         return lines
-    again = find_lines(residual_rows(judge, hypothesis), rules.line_alpha)
+    again = find_spectral_lines(residual_rows(judge, hypothesis), rules.line_alpha)
     return [
         a for a in lines if any(a.axis == b.axis and abs(a.frequency - b.frequency) < rules.same_line for b in again)
     ]

@@ -29,7 +29,7 @@ from cfb_mjx.sysid.tracing.fits import Verdict
 from cfb_mjx.sysid.tracing.formula import Proposal, Term
 from cfb_mjx.sysid.tracing.hypothesis import FORMULA, Hypothesis
 from cfb_mjx.sysid.tracing.innovations import FIRST, levels_from
-from cfb_mjx.sysid.tracing.residuals import Line, Residuals, aligned, residual_rows
+from cfb_mjx.sysid.tracing.residuals import Residuals, SpectralLine, aligned, residual_rows
 from cfb_mjx.sysid.tracing.rules import Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
@@ -99,12 +99,12 @@ class Unexplained:
 
     Attributes:
         proposal: a formula that describes it and is confirmed by the held-out flights.
-        lines: spectral lines of the residual.
+        spectral_lines: spectral lines of the residual.
         held_out_only: terms that only the held-out flights show, fitted to these; not part of the corrected model.
     """
 
     proposal: Proposal | None
-    lines: list[Line]
+    spectral_lines: list[SpectralLine]
     held_out_only: list[Term] = field(default_factory=list)
 
     @property
@@ -118,7 +118,7 @@ class Unexplained:
         """Description of the axes, signals and frequencies involved."""
         words = _followed(self.proposal.terms if self.proposal else [])
         there = [f"in the held-out flights only, {each}" for each in _followed(self.held_out_only)]
-        return "; ".join(words + there + [str(line) for line in self.lines])
+        return "; ".join(words + there + [str(line) for line in self.spectral_lines])
 
 
 def _followed(terms: list[Term]) -> list[str]:
@@ -153,7 +153,7 @@ class HeldOut:
         pooled: residuals of all flights, concatenated.
         predictions: prediction errors of all flights, concatenated.
         structure: which of these residuals and errors depend on which signal.
-        floor: noise floor due to the sensors.
+        noise_floor: noise floor due to the sensors.
         random: noise floor due to the sensors and to random forces and torques of the size these flights show.
     """
 
@@ -162,7 +162,7 @@ class HeldOut:
     pooled: tuple[Pooled, Pooled]
     predictions: tuple[Pooled, Pooled]
     structure: tuple[Structure, Structure]
-    floor: dict[str, float]
+    noise_floor: dict[str, float]
     random: dict[str, float]
 
     def pair(self, axis: str) -> tuple[Pooled, Pooled]:

@@ -30,12 +30,12 @@ class Selection:
 
     Attributes:
         sure: significant terms.
-        rare: groups of terms that gain as much, but in so few blocks that they are not significant.
+        weakly_excited: groups of terms that gain as much, but in so few blocks that they are not significant.
         gains: gain of every term when it was chosen, nats.
     """
 
     sure: list[Column] = field(default_factory=list)
-    rare: list[list[Column]] = field(default_factory=list)
+    weakly_excited: list[list[Column]] = field(default_factory=list)
     gains: dict[Column, float] = field(default_factory=dict)
 
 
@@ -63,9 +63,9 @@ def select(search: Search, hypothesis: Hypothesis, progress: Callable[[str], Non
         axis = _Axis(linear, linear.index(own), [[c] for c in library if not _square(c)] + _families(library), rules)
         sure, gains = axis.forward([], lambda e: e.p_value * tried < rules.term_alpha)
         sure = axis.pruned([c for group in sure for c in group])
-        rare, more = axis.forward(sure, lambda e: e.t > rules.term_rare)
+        weakly_excited, more = axis.forward(sure, lambda e: e.t > rules.term_weakly_excited)
         chosen.sure.extend(sure)
-        chosen.rare.extend(rare)
+        chosen.weakly_excited.extend(weakly_excited)
         chosen.gains.update(gains | more)
     return chosen
 
@@ -268,7 +268,7 @@ def explain(
     chosen = select(widened, base, progress)
     terms = _material(widened, base, chosen.sure, found, held_out)
     if held_out is not None:
-        terms = _with_rare(widened, base, terms, chosen, held_out)
+        terms = _with_weakly_excited(widened, base, terms, chosen, held_out)
     if not terms:
         return search, None
     richer, deviation = fit_formula(widened, base, terms)
@@ -330,7 +330,7 @@ def _material(
     return terms if search.rules.lowered(*(prediction_errors(held_out, each) for each in three)) else []
 
 
-def _with_rare(
+def _with_weakly_excited(
     search: Search, base: Hypothesis, terms: list[Column], chosen: Selection, held_out: Search
 ) -> list[Column]:
     """Add terms that few blocks of the fit flights excite, if the held-out flights confirm them.
@@ -341,7 +341,7 @@ def _with_rare(
     poorer = fit_formula(search, base, terms)[0] if terms else base
     known = [c for c in chosen.sure if c not in terms]
     more = []
-    for group in chosen.rare + [known] * bool(known):
+    for group in chosen.weakly_excited + [known] * bool(known):
         richer, _ = fit_formula(search, base, terms + group)
         if confirm(judge, poorer, richer).t >= search.rules.formula_sure:
             more += group

@@ -264,7 +264,7 @@ RATE = 40.0
 
 
 @dataclass(frozen=True)
-class Line:
+class SpectralLine:
     """A spectral line of one residual axis.
 
     Attributes:
@@ -288,7 +288,7 @@ class Line:
         )
 
 
-def find_lines(rows: list[Residuals], alpha: float = RULES.line_alpha) -> list[Line]:
+def find_spectral_lines(rows: list[Residuals], alpha: float = RULES.line_alpha) -> list[SpectralLine]:
     """Find spectral lines that at least two thirds of the flights share, the most significant first.
 
     A manoeuvre has its own frequencies, which also appear in the residual of an imperfect model. Therefore a line must
@@ -314,7 +314,7 @@ def find_lines(rows: list[Residuals], alpha: float = RULES.line_alpha) -> list[L
         p_value = float(min(1.0, chance * len(frequencies) * len(names)))
         if p_value < alpha:
             amplitude = float(np.sqrt(np.median([s[best] for s in sizes]) / 2))
-            found.append(Line(name, float(frequencies[best]), amplitude, rows[0].axes()[name][1], p_value))
+            found.append(SpectralLine(name, float(frequencies[best]), amplitude, rows[0].axes()[name][1], p_value))
     return sorted(found, key=lambda line: line.p_value)
 
 

@@ -78,13 +78,13 @@ class Rules:
     """Maximum number of effects selected per linearisation."""
 
     # Effects that few blocks excite.
-    rare_gain: float = 8.0
+    weakly_excited_gain: float = 8.0
     """Such an effect is tried if it gains more nats than this."""
-    rare_t: float = 2.0
+    weakly_excited_t: float = 2.0
     """Such an effect is tried if its t is above this."""
-    rare_tried: int = 2
+    weakly_excited_tried: int = 2
     """Maximum number of trials, the largest gain first."""
-    rare_sure: float = 4.0
+    weakly_excited_sure: float = 4.0
     """Required t on the held-out flights: significant after a search through the whole catalogue."""
 
     # A formula, if the catalogue does not explain the residual.
@@ -97,7 +97,7 @@ class Rules:
     """A term's p-value, multiplied by the number of terms (Bonferroni), must be below this."""
     term_gain: float = 8.0
     """A term must gain more nats than this."""
-    term_rare: float = 2.0
+    term_weakly_excited: float = 2.0
     """A term that few blocks excite must have a t above this."""
     term_needless: float = 2.0
     """A term that gains fewer nats than this in addition to the others is removed."""

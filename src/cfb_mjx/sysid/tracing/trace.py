@@ -446,7 +446,7 @@ def _without_lead(search: Search, hypothesis: Hypothesis) -> float:
     return found if np.isfinite(found) else np.inf
 
 
-def with_rare(found: Trace, held_out: Search, progress: Callable[[str], None] = lambda _: None) -> Trace:
+def with_weakly_excited(found: Trace, held_out: Search, progress: Callable[[str], None] = lambda _: None) -> Trace:
     """Add rarely excited effects that the held-out flights confirm.
 
     Args:
@@ -460,9 +460,9 @@ def with_rare(found: Trace, held_out: Search, progress: Callable[[str], None] = 
         ranking = [
             (evidence, variant)
             for evidence, variant in rank(search, fit, tried)
-            if evidence.gain > rules.rare_gain and evidence.t > rules.rare_t
+            if evidence.gain > rules.weakly_excited_gain and evidence.t > rules.weakly_excited_t
         ]
-        if not ranking or len(tried) == rules.rare_tried:
+        if not ranking or len(tried) == rules.weakly_excited_tried:
             break
         evidence, variant = ranking[0]
         name = variant[0].effect
@@ -486,7 +486,7 @@ def _share(held_out: Search, fit: Fit, richer: Fit, name: str) -> float | None:
     """Largest relative decrease of a held-out error by an effect; None if the held-out flights do not confirm it."""
     if not np.isfinite(richer.errors).all() or held_out.rules.stretched(richer.hypothesis, name):
         return None
-    if confirm(held_out, fit.hypothesis, richer.hypothesis).t < held_out.rules.rare_sure:
+    if confirm(held_out, fit.hypothesis, richer.hypothesis).t < held_out.rules.weakly_excited_sure:
         return None
     pair = fit.hypothesis, richer.hypothesis
     old, new, first = (prediction_errors(held_out, each) for each in (*pair, held_out.nothing()))

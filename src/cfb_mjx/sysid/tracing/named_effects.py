@@ -22,8 +22,8 @@ ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class Given:
-    """Outcome of `fit_given`.
+class NamedFit:
+    """Outcome of `fit_named_effects`.
 
     Attributes:
         effects: declared effects that were not fitted, then the fitted ones.
@@ -36,7 +36,7 @@ class Given:
     faults: SensorFaults
 
 
-def fit_given(
+def fit_named_effects(
     logs: Sequence[FlightLog],
     parameters: Parameters,
     names: Sequence[str],
@@ -44,7 +44,7 @@ def fit_given(
     delay: float = 0.008,
     progress: Callable[[str], None] = lambda _: None,
     as_logged: bool = False,
-) -> Given:
+) -> NamedFit:
     """Fit named effects together, by the likelihood of whitened innovations, which feedback does not bias.
 
     Args:
@@ -86,4 +86,4 @@ def fit_given(
         else:
             own.setdefault(column.field, []).append(std)
     kept = tuple(e for e in declared if type(e).name not in names)
-    return Given((*kept, *(hypothesis.effect(name) for name in names)), uncertainty, sensors.faults)
+    return NamedFit((*kept, *(hypothesis.effect(name) for name in names)), uncertainty, sensors.faults)
