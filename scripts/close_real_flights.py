@@ -234,7 +234,7 @@ def without_each(plant: ModelFile, fit: list[FlightLog], judged: list[FlightLog]
     for name in (*BODY, *MOTORS):
         less = replace(plant, effects=tuple(e for e in plant.effects if e["name"] != name))
         print(f"without {name}", flush=True)
-        refitted, _ = by_predictions(less, fit, [n for n in BODY if n != name], weights=weights)
+        refitted = by_predictions(less, fit, [n for n in BODY if n != name], weights=weights).model_file(less)
         found[name] = errors(refitted, judged)
     return found
 
@@ -268,7 +268,8 @@ def unseen(plant: ModelFile, logs: dict[str, list[FlightLog]], observer: Observe
         others = [log for log in logs["fit"] if not log.name.startswith(kind)]
         own = [log for log in logs["validation"] if log.name.startswith(kind)]
         print(f"predictor without {kind}", flush=True)
-        model, _ = by_predictions(plant, others, [*FORECAST], True, weighing(PREDICTOR_SQUARE, others))
+        found = by_predictions(plant, others, [*FORECAST], True, weighing(PREDICTOR_SQUARE, others))
+        model = found.model_file(plant)
         built = {"predictor": Contestant.of(model), "predictor, observer": Contestant.of(model, observer)}
         found[kind] = summed(benchmark(own, built, 1, lambda *_: None)["rows"])
     return found

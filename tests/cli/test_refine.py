@@ -1,5 +1,6 @@
 """``cfb refine`` from the logs to a model the other commands take."""
 
+import inspect
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -44,8 +45,8 @@ def test_a_number_that_ends_at_its_bound_says_so(monkeypatch):
     def found(drag):
         given = NamedFit((RotorDrag(coefficient=drag),), {"rotor_drag": {"coefficient": 1e-3}}, HEALTHY)
         monkeypatch.setattr("cfb_mjx.sysid.refinement.model_files.fit_named_effects", lambda *_: given)
-        _, report = model_files.by_innovations(load_model_file("cfb-guards"), [read_log(LOG)], ["rotor_drag"])
-        return report["numbers"]["rotor_drag.coefficient"]["at_bound"]
+        fitted = model_files.by_innovations(load_model_file("cfb-guards"), [read_log(LOG)], ["rotor_drag"])
+        return fitted.to_json()["numbers"]["rotor_drag.coefficient"]["at_bound"]
 
     assert found(0.0)
     assert not found(0.01)
@@ -56,7 +57,7 @@ def test_all_that_a_drone_usually_lacks(monkeypatch, tmp_path):
 
     def fit(base, logs, names, **_):
         asked.extend(names)
-        return base, {"numbers": {}, "loss": {"before": 2.0, "after": 1.0}}
+        return model_files.EffectFit(tuple(names), {}, frozenset(), (), "plant", loss=(2.0, 1.0))
 
     monkeypatch.setattr(model_files, "by_predictions", fit)
     monkeypatch.setattr("cfb_mjx.runtime.configure_jax", lambda x64: None)
@@ -76,9 +77,23 @@ def test_effects_that_are_not_fitted_anew_keep_what_is_known_of_them(monkeypatch
     monkeypatch.setattr("cfb_mjx.sysid.refinement.model_files.fit_named_effects", lambda *_: given)
     base = replace(load_model_file("cfb-guards"), effects=(inertia,))
     with pytest.warns(CfbWarning, match="impossible for a rigid body"):
-        refined, report = model_files.by_innovations(base, [read_log(LOG)], ["rotor_drag"])
-    assert refined.effects[0]["uncertainty"] == known
-    assert list(report["numbers"]) == ["rotor_drag.coefficient"]
+        fitted = model_files.by_innovations(base, [read_log(LOG)], ["rotor_drag"])
+    assert fitted.model_file(base).effects[0]["uncertainty"] == known
+    assert list(fitted.estimates) == ["rotor_drag.coefficient"]
+    assert fitted.estimates["rotor_drag.coefficient"].unit == RotorDrag.units["coefficient"]
+
+
+def test_every_fit_returns_estimates_a_model_file_and_numbers():
+    from cfb_mjx.sysid import Fitted
+    from cfb_mjx.sysid.identification import Fit
+    from cfb_mjx.sysid.rotors.fitting import RotorFit
+
+    asked = {name for name in dir(Fitted) if not name.startswith("_")}
+    assert asked == {"estimates", "model_file", "to_json"}
+    for kind in (Fit, RotorFit, model_files.EffectFit):
+        has = {*dir(kind), *kind.__dataclass_fields__}
+        assert asked <= has, kind
+        assert list(inspect.signature(kind.model_file).parameters) == ["self", "base", "source"], kind
 
 
 def test_plants_say_nothing_and_unknown_kinds_are_refused(tmp_path):
@@ -119,7 +134,7 @@ def test_sensor_faults_of_the_model_stay_out_of_a_fit_as_logged_but_a_stretch_of
 
     def fit(base, logs, names, as_logged, progress):
         seen.update(effects={e["name"]: e["parameters"] for e in base.effects}, as_logged=as_logged)
-        return base, {"numbers": {}}
+        return model_files.EffectFit(tuple(names), {}, frozenset(), base.effects, "plant")
 
     monkeypatch.setattr(model_files, "by_innovations", fit)
     stretch = {"scale": 1.1}

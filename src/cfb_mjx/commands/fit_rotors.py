@@ -226,7 +226,7 @@ class FitRotors(Command):
             reasons = "; ".join(found.motors.common.unidentifiable.values()) if found.motors else ""
             raise CfbError(f"{names}: no constant of the model can be identified from these files ({reasons}).")
         return replace(
-            found.model_file(f"cfb fit-rotors on {len(self.files)} file(s), {date.today().isoformat()}"),
+            found.model_file(found.base, f"cfb fit-rotors on {len(self.files)} file(s), {date.today().isoformat()}"),
             name=self.output.stem,
             description=f"{found.base.name} with rotors fitted to {names}",
             provenance=provenance(["fit-rotors", *self.words()], found.base.name, "files_sha256", self.files),

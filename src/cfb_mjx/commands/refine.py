@@ -118,13 +118,14 @@ class Refine(Command):
             base = model_files.as_logged(base)
         names = self._names(base)
         if self.estimator == "innovations":
-            model, numbers = model_files.by_innovations(base, logs, names, as_logged=self.as_logged, progress=say)
+            found = model_files.by_innovations(base, logs, names, as_logged=self.as_logged, progress=say)
         else:
             extra = {"predictor": self.predictor, "weights": weights}
-            model, numbers = model_files.by_predictions(base, logs, names, progress=say, **extra)
+            found = model_files.by_predictions(base, logs, names, progress=say, **extra)
         held_out, words = [path.name for path in self.held_out], ["refine", *self.words()]
         origin = provenance(words, base.name, "fit_logs_sha256", self.logs, held_out=held_out)
-        model = replace(model, name=self.output.stem, provenance=origin)
+        model = replace(found.model_file(base), name=self.output.stem, provenance=origin)
+        numbers = found.to_json()
         if judged:
             before, after = (model_files.judge(one, judged) for one in (base, model))
             numbers |= {"held_out": {"before": before, "after": after}}

@@ -2,34 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters import SPECIFICATIONS, Entry, ModelFile, Parameters
+from cfb_mjx.sysid.fitted import Estimate, numbers_of
 from cfb_mjx.sysid.identification.feedback import Feedback
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.uncertainty import Uncertainty, power_product
 from cfb_mjx.sysid.identification.unknowns import OFFSETS, UNITS, Unknowns
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """One fitted quantity.
-
-    Attributes:
-        value: SI.
-        std: standard deviation of the value, SI.
-        unit: of both.
-        preset: value before the fit, SI.
-    """
-
-    value: float
-    std: float
-    unit: str
-    preset: float
 
 
 @dataclass(frozen=True)
@@ -103,11 +86,6 @@ class Fit:
             "noise": None if self.noise is None else vars(self.noise),
             "rows": self.rows,
         }
-
-
-def numbers_of(estimates: Mapping[str, Estimate]) -> dict[str, dict]:
-    """Estimates as JSON-compatible dictionaries."""
-    return {name: asdict(estimate) for name, estimate in estimates.items()}
 
 
 def summarise(

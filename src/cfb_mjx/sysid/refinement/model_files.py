@@ -1,18 +1,20 @@
-"""Refine the effects of a model file; the result is again a model file, with a report."""
+"""Fit effects of a model file to flights."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.model.effects import SENSOR_FAULTS, Effect, effect_to_mapping
+from cfb_mjx.model.effects import KNOWN, SENSOR_FAULTS, Effect, effect_to_mapping
 from cfb_mjx.parameters import ModelFile
 from cfb_mjx.sysid.evaluation import evaluate
+from cfb_mjx.sysid.fitted import Estimate
 from cfb_mjx.sysid.flight import usual_delay
 from cfb_mjx.sysid.refinement.fitting import refine
 from cfb_mjx.sysid.refinement.numbers import free_numbers, plausible_numbers
@@ -21,13 +23,58 @@ from cfb_mjx.sysid.tracing.hypothesis import bounds
 from cfb_mjx.sysid.tracing.named_effects import fit_named_effects
 
 
+@dataclass(frozen=True)
+class EffectFit:
+    """Some effects of a model file, fitted to flights.
+
+    Attributes:
+        names: effects that were fitted.
+        estimates: their parameters, named as ``rotor_drag.coefficient`` or ``inertia.relative[0]``.
+        at_bound: names of the estimates at a bound.
+        effects: all effects, as a model file lists them.
+        kind: ``plant`` or ``predictor``.
+        loss: mean loss before and after; None for a fit to innovations.
+        trims: trim torque of each flight, N m; None for a fit to innovations.
+    """
+
+    names: tuple[str, ...]
+    estimates: dict[str, Estimate]
+    at_bound: frozenset[str]
+    effects: tuple[dict[str, Any], ...]
+    kind: str
+    loss: tuple[float, float] | None = None
+    trims: dict[str, np.ndarray] | None = None
+
+    def model_file(self, base: ModelFile, source: str = "") -> ModelFile:
+        """``base`` with these effects; ``source`` becomes the description, by default which effects were refined."""
+        described = source or f"{base.name} with {', '.join(self.names)} refined"
+        return replace(base, effects=self.effects, kind=self.kind, description=described)
+
+    def to_json(self) -> dict[str, Any]:
+        """The parameters under ``numbers``, and for a fit to predictions ``loss`` and ``trim_torque_nm``."""
+        rows = {
+            name: {
+                "value": one.value,
+                "std": one.std if math.isfinite(one.std) else None,
+                "at_bound": name in self.at_bound,
+            }
+            for name, one in self.estimates.items()
+        }
+        found: dict[str, Any] = {"numbers": rows}
+        if self.loss is not None:
+            found["loss"] = {"before": self.loss[0], "after": self.loss[1]}
+        if self.trims is not None:
+            found["trim_torque_nm"] = {name: trim.tolist() for name, trim in self.trims.items()}
+        return found
+
+
 def by_innovations(
     base: ModelFile,
     logs: Sequence[FlightLog],
     names: Sequence[str],
     as_logged: bool = False,
     progress: Callable[[str], None] = lambda _: None,
-) -> tuple[ModelFile, dict[str, Any]]:
+) -> EffectFit:
     """Fit some effects of a model file to one-step innovations.
 
     Args:
@@ -37,9 +84,6 @@ def by_innovations(
         as_logged: as for `fit_named_effects`.
         progress: called with a message at each step.
 
-    Returns:
-        The fitted model, and a report with value, standard deviation and bound of each parameter under ``numbers``.
-
     Raises:
         CfbError: as `fit_named_effects`.
     """
@@ -47,17 +91,20 @@ def by_innovations(
     delay = usual_delay(logs, parameters)
     declared = Quadrotor.from_file(base).effects
     found = fit_named_effects(logs, parameters, names, declared, delay, progress, as_logged)
-    rows, mappings = {}, _mappings(found.effects, _kept(base, names) | found.uncertainty)
+    estimates, at_bound = {}, set()
+    before, mappings = _values(declared), _mappings(found.effects, _kept(base, names) | found.uncertainty)
     for mapping in mappings:
         std = mapping.get("uncertainty")
         if not std or mapping["name"] not in names:
             continue
         for field, value in mapping["parameters"].items():
             low, high = bounds(mapping["name"], field)
+            unit = KNOWN[mapping["name"]].units[field]
             for name, (v, s) in _pairs(f"{mapping['name']}.{field}", value, std.get(field)).items():
-                rows[name] = {"value": v, "std": s, "at_bound": not low < v < high}
+                estimates[name] = Estimate(v, math.nan if s is None else s, unit, before.get(name, math.nan))
+                at_bound |= set() if low < v < high else {name}
     effects = (*mappings, *found.faults.to_mappings())
-    return replace(base, effects=effects, description=_description(base, names)), {"numbers": rows}
+    return EffectFit(tuple(names), estimates, frozenset(at_bound), effects, base.kind)
 
 
 def by_predictions(
@@ -67,7 +114,7 @@ def by_predictions(
     predictor: bool = False,
     weights: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda _: None,
-) -> tuple[ModelFile, dict[str, Any]]:
+) -> EffectFit:
     """Fit some effects of a model file to multi-step predictions.
 
     Args:
@@ -78,10 +125,6 @@ def by_predictions(
         weights: as for `refine`.
         progress: called with a message at each step.
 
-    Returns:
-        The fitted model, and a report with the parameters (``numbers``), the mean loss before and after (``loss``) and
-        the trim torque of each flight, N m (``trim_torque_nm``).
-
     Raises:
         CfbError: as `refine`.
     """
@@ -90,19 +133,20 @@ def by_predictions(
     faults = SensorFaults.from_mappings(base.effects, f"model {base.name}")
     # A predictor is used on new flights, whose trim is unknown.
     found = refine(start, logs, numbers, faults, weights=weights, trimmed=not predictor, progress=progress)
-    rows = {}
+    estimates, before = {}, _values(start.effects)
     for number, value, std in zip(found.numbers, found.values, found.deviations, strict=True):
-        known = float(std) if np.isfinite(std) else None
-        rows[number.name] = {"value": float(value), "std": known, "at_bound": found.at_bound(number)}
+        unit = KNOWN[number.effect].units[number.field]
+        estimates[number.name] = Estimate(float(value), float(std), unit, before.get(number.name, math.nan))
     uncertainty = {number.effect: found.uncertainty(number.effect) for number in numbers}
-    kind = "predictor" if predictor else base.kind
-    effects = (*_mappings(found.model.effects, _kept(base, names) | uncertainty), *faults.to_mappings())
-    report = {
-        "numbers": rows,
-        "loss": {"before": found.cost[0], "after": found.cost[1]},
-        "trim_torque_nm": {name: trim.tolist() for name, trim in found.trims.items()},
-    }
-    return replace(base, effects=effects, kind=kind, description=_description(base, names)), report
+    return EffectFit(
+        tuple(names),
+        estimates,
+        frozenset(number.name for number in found.numbers if found.at_bound(number)),
+        (*_mappings(found.model.effects, _kept(base, names) | uncertainty), *faults.to_mappings()),
+        "predictor" if predictor else base.kind,
+        found.cost,
+        found.trims,
+    )
 
 
 def as_logged(model: ModelFile) -> ModelFile:
@@ -129,8 +173,13 @@ def _kept(base: ModelFile, names: Sequence[str]) -> dict[str, dict]:
     return {e["name"]: e["uncertainty"] for e in base.effects if "uncertainty" in e and e["name"] not in names}
 
 
-def _description(base: ModelFile, names: Sequence[str]) -> str:
-    return f"{base.name} with {', '.join(names)} refined"
+def _values(effects: Sequence[Effect]) -> dict[str, float]:
+    """Parameters of effects by the names of estimates."""
+    found = {}
+    for mapping in map(effect_to_mapping, effects):
+        for field, value in mapping["parameters"].items():
+            found |= {name: v for name, (v, _) in _pairs(f"{mapping['name']}.{field}", value, None).items()}
+    return found
 
 
 def _pairs(name: str, value, std) -> dict[str, tuple[float, float | None]]:

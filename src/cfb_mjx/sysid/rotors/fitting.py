@@ -16,7 +16,7 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.flown import flown_part
 from cfb_mjx.logs.rotor_files import RotorFiles
 from cfb_mjx.parameters import Entry, ModelFile
-from cfb_mjx.sysid.identification.result import Estimate, numbers_of
+from cfb_mjx.sysid.fitted import Estimate, numbers_of
 from cfb_mjx.sysid.rotors.motors import ENTRIES, MotorFit
 from cfb_mjx.sysid.rotors.rotor_maps import MapFit
 from cfb_mjx.sysid.rotors.steady import SteadyFit, fit_steady
@@ -86,10 +86,10 @@ class RotorFit:
                 found[f"{name}_scale_M{motor}"] = Estimate(value, std, "1", scales[motor - 1])
         return found
 
-    def model_file(self, source: str) -> ModelFile:
-        """The base model with the fitted values, their uncertainty, and ``source`` as their origin."""
+    def model_file(self, base: ModelFile, source: str) -> ModelFile:
+        """``base`` with the fitted constants, their uncertainty and ``source``."""
         new = {key: Entry(np.asarray(value, float), source, std) for key, (value, std) in self.entries.items()}
-        return replace(self.base, entries={**self.base.entries, **new})
+        return replace(base, entries={**base.entries, **new})
 
     def to_json(self) -> dict:
         """All results as a JSON-compatible dictionary."""

@@ -18,7 +18,7 @@ from jax.scipy.special import gammaincc
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.bench_tables import MotorRecord
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.identification.result import Estimate, numbers_of
+from cfb_mjx.sysid.fitted import Estimate, numbers_of
 from cfb_mjx.sysid.rotors.common_lag import common_lag
 from cfb_mjx.sysid.rotors.motor_filter import DEAD_TIME_UNIT, Motor
 from cfb_mjx.sysid.rotors.motor_likelihood import Optimum, first_guess, maximise
