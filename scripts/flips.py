@@ -48,6 +48,7 @@ FLIPS = {
     "double-flip": Wanted(
         2, "margin", "Two turns, completed by as many randomised drones as possible.", {"rate_radps": 17.1}
     ),
+    "double-flip-within": Wanted(2, "within", "Two turns within 1.8 m for as many randomised drones as possible."),
     "double-flip-ppo": Wanted(
         2,
         "within",
