@@ -30,7 +30,7 @@ class MotorRecord:
         command: (n, k) in [0, 1]; a row holds until the next.
         rotor_speed: (n, k) rad/s, NaN where a reading is missing.
         motors: (k,) motor numbers 1..4; 0 if the recording does not say which.
-        battery_voltage: (n,) V, supply voltage of a bench; None if it was not measured, and for a flight.
+        battery_voltage: (n,) V, voltage of the supply or the battery; None if it was not measured.
     """
 
     name: str
