@@ -11,7 +11,7 @@ from cfb_mjx.loop.summary import MEASURES, POLICIES, Row, Spread, summarise, val
 from cfb_mjx.view.page import Section
 from cfb_mjx.view.style import check_path, context, new_figure, save
 
-TITLE = "The loop closed: from a flight to a better flight"
+TITLE = "From a flight to a better flight, by correcting the model"
 LABELS = {
     "without_effect": "nominal policy, drone without the effect",
     "nominal": "nominal policy",

@@ -13,7 +13,8 @@ velocity column. Before you believe in moving air, compare the column with the d
 accelerometer, which measures the drag of such air. The middle is the origin of the positions; another middle adds a
 constant torque, which `cog_offset` describes.
 
-`cfb close-loop` does not search for it, because cables and walls also act by position. Name it in ``cfb refine``.
+`cfb close-loop` does not propose it alone, because cables and walls also act by position; it fits it where it fits all
+effects of a plant together. ``cfb refine`` fits it by name.
 """
 
 from __future__ import annotations
