@@ -1,5 +1,7 @@
 """The firmware's Mellinger controller: against the article written out in NumPy, its signs, and flights."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -129,3 +131,46 @@ def test_upside_down_it_stops_pushing_and_forgets():
     np.testing.assert_allclose(command, 7000 / 65535)
     np.testing.assert_array_equal(memory.position, 0)
     np.testing.assert_array_equal(memory.attitude, 0)
+
+
+def test_wanted_velocity_and_acceleration_by_hand():
+    """At the target, level and at rest: F = m (a + g e_z) + k_d v; e_R = -2 F_x / |F| about +y."""
+    at = measured()
+    wanted = {"velocity": jnp.array([0.1, 0.0, 0.05]), "acceleration": jnp.array([1.0, 0.0, -0.5])}
+    _, command = step(Mellinger(), init(at), at, jnp.zeros(3), **wanted)
+    x, z = 0.0393 * 1.0 + 0.2 * 0.1, 0.0393 * (9.81 - 0.5) + 0.4 * 0.05
+    counts = 132000 * z + PITCH * 70000 * 2 * x / np.hypot(x, z)
+    np.testing.assert_allclose(command, counts / 65535, rtol=1e-9)
+
+
+def test_integrals_of_earlier_steps_count_up_to_their_limits():
+    """At the target, level: 0.05 N/(m s) of the position's integral, 500 counts/s of the heading's."""
+    at = measured()
+    memory, command = step(
+        Mellinger(),
+        MellingerState(jnp.array([0.0, 0.0, 0.3]), jnp.array([0.0, 0.0, 2.0]), at.body_rate),
+        at,
+        jnp.zeros(3),
+    )
+    counts = 132000 * (0.0393 * 9.81 + 0.05 * 0.3) + YAW * 500 * 2.0
+    np.testing.assert_allclose(command, counts / 65535, rtol=1e-9)
+    np.testing.assert_allclose(memory.attitude, [0.0, 0.0, 2.0])
+    full = MellingerState(jnp.array([3.0, -3.0, 3.0]), jnp.array([3.0, -3.0, 2000.0]), at.body_rate)
+    memory, _ = step(Mellinger(), full, at, jnp.zeros(3))
+    np.testing.assert_allclose(memory.position, [2.0, -2.0, 0.4])
+    np.testing.assert_allclose(memory.attitude, [1.0, -1.0, 1500.0])
+
+
+def test_the_first_step_knows_no_change_of_the_body_rate():
+    """Damping alone, without the derivative: 20000 counts s/rad about x."""
+    at = measured(rate=(0.2, 0.0, 0.0))
+    _, command = step(Mellinger(), init(at), at, jnp.zeros(3))
+    np.testing.assert_allclose(command, (132000 * 0.0393 * 9.81 - ROLL * 20000 * 0.2) / 65535, rtol=1e-9)
+
+
+@pytest.mark.parametrize("gravity", [9.81, 5.0])
+def test_scaled_to_the_drone_it_commands_hover_at_its_target(gravity):
+    drone = replace(DRONE, parameters=replace(DRONE.parameters, gravity=jnp.asarray(gravity)))
+    at = measured()
+    _, command = step(Mellinger.hovering(drone.parameters), init(at), at, jnp.zeros(3))
+    np.testing.assert_allclose(command, drone.hover_command(), rtol=1e-6)

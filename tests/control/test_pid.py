@@ -1,5 +1,6 @@
 """The firmware's PID: signs against the library's own geometry, and flights of the library's drone with late poses."""
 
+import math
 import warnings
 
 import equinox as eqx
@@ -7,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from firmware_pid import Drone, flight
+from firmware_pid import Drone, Firmware, flight
+from scipy.spatial.transform import Rotation
 
 from cfb_mjx.control import FirmwarePid, Setpoint, init, resume, step
 from cfb_mjx.control.pid import COUNTS, DT, mix
@@ -227,3 +229,50 @@ def test_steps_are_those_of_the_firmwares_loops_written_anew_on_a_drone_written_
     assert np.linalg.norm(positions[-1] - goal) < 0.05
     np.testing.assert_allclose(states.position, positions, atol=1e-4)
     np.testing.assert_allclose(given[:500], commands[:500], atol=1e-3)
+
+
+def test_limits_are_those_of_the_firmwares_loops_written_anew():
+    """The same measurements, large and small in turns of 0.8 s, to both: every limit acts, and is seen afterwards."""
+    rng = np.random.default_rng(2)
+    # Errors of position [m], velocity [m/s], roll and pitch [deg], yaw [deg], rate [rad/s].
+    calm = (0.01, 0.01, 0.2, 0.3, 0.005)
+    turns = [calm, calm, (0.1, 0.05, 2, 5, 0.1), (5, 2, 10, 20, 0.2), (0.3, 0.1, 3, 8, 0.2), (0.2, 0.1, 50, 170, 0.5)]
+    turns += [(0.2, 0.1, 2, 5, 0.1), (0.2, 0.1, 5, 10, 12), (0.1, 0.05, 1, 3, 0.1), (0.2, 0.5, 3, 190, 0.3)]
+    turns += [(0.1, 0.05, 2, 5, 0.1)]
+    count, goal, yaw_deg = 400, np.array([0.3, -0.2, 0.5]), 178.0
+    rows = []
+    for k, sizes in enumerate(turns * 2):
+        position, velocity, rate = (sizes[i] * rng.uniform(-1, 1, 3) for i in (0, 1, 4))
+        if sizes is calm:
+            # Little but sinking or rising fast: the limits of the collective thrust.
+            velocity[2] = (-2.0, 2.0)[k % 2]
+        roll, pitch = sizes[2] * rng.uniform(-1, 1, 2)
+        wander = np.linspace(0, 1, count)[:, None] * rng.uniform(-0.3, 0.3, 12) + 1
+        rows.append(np.array([*position, *velocity, roll, pitch, 0.0, *rate]) * wander)
+        # Through the wanted heading, and through half a turn.
+        rows[-1][:, 8] = yaw_deg + sizes[3] * np.linspace(-1, 1, count)
+    rows = np.concatenate(rows)
+    rows[:, :3] += goal
+
+    base = 30000.0
+    plain, expected = Firmware(base), []
+    for *x, roll, pitch, yaw, p, q, r in rows:
+        rates = np.degrees([p, -q, r])
+        # Measured yaw lies within half a turn; the firmware's pitch is nose up.
+        expected.append(plain(goal, yaw_deg, x[:3], x[3:], roll, -pitch, math.remainder(yaw, 360.0), rates))
+    quaternion = Rotation.from_euler("ZYX", rows[:, [8, 7, 6]], degrees=True).as_quat()[:, [3, 0, 1, 2]]
+    measured = State(*map(jnp.asarray, (rows[:, :3], rows[:, 3:6], quaternion, rows[:, 9:], np.zeros((len(rows), 4)))))
+    pid, first = FirmwarePid(thrust_base=jnp.asarray(base)), jax.tree.map(lambda x: x[0], measured)
+    setpoint = Setpoint.hover(jnp.asarray(goal), np.radians(yaw_deg))
+    flown = jax.jit(lambda pid: jax.lax.scan(lambda m, at: step(pid, m, at, setpoint), init(pid, first), measured)[1])
+    np.testing.assert_allclose(flown(pid), expected, atol=1e-9)
+
+
+def test_taking_over_keeps_the_integral_of_every_loop():
+    pid, level = FirmwarePid.hovering(PARAMETERS), turned()
+    loops = ("position", "velocity", "attitude", "rate")
+    held = [jnp.array([1.0, 2.0, 3.0]) * (i + 1) for i in range(4)]
+    memory = eqx.tree_at(lambda s: [getattr(s, loop).integral for loop in loops], init(pid, level), held)
+    again = resume(pid, memory, turned(rate=(2.0, 0.0, 0.0)))
+    for loop, integral in zip(loops, held, strict=True):
+        np.testing.assert_array_equal(getattr(again, loop).integral, integral)

@@ -439,3 +439,34 @@ def test_a_full_disk_leaves_the_export_before_as_it_was(tmp_path, monkeypatch):
     with pytest.raises(CfbError, match="No space"):
         export_policy(find_deployment("target-adaptive"), tmp_path / "c")
     assert {path.name: path.read_bytes() for path in exported.folder.iterdir()} == before
+
+
+def test_the_app_forgives_one_late_step(built, tmp_path):
+    """Twelve ticks instead of eight: the flight goes on; seventeen: it begins anew."""
+    exported, compiled = built(find_deployment("target"))
+    app = firmware(exported, tmp_path)
+    app.controllerOutOfTreeInit()
+    control, seen = Control(), ((0, 0, 1), (0, 0, 0), (1, 0, 0, 0), (0, 0, 0), (0.5, 0, 1))
+    compiled.reset()
+    expected = [compiled.step(*seen) for _ in range(3)]
+    assert np.abs(expected[2] - expected[0]).max() > 1e-4
+    for at, command in ((0, expected[0]), (8, expected[1]), (20, expected[2]), (37, expected[0])):
+        np.testing.assert_allclose(tick(app, at, control), command, atol=1e-6)
+
+
+def test_a_flip_asked_for_during_a_flip_is_not_begun(built):
+    deployment = find_deployment("double-flip")
+    compiled, knobs = built(deployment)[1], deployment.manoeuvre.knobs
+    begin(deployment, compiled)
+    phases = []
+    for i in range(600):
+        roll = min(0.2 * max(0, i - 60), 4 * math.pi)
+        compiled.step(
+            (0, 0, 0), (0, 0, 2.5 if i > 50 else 0.0), (math.cos(roll / 2), math.sin(roll / 2), 0, 0), (0, 0, 0)
+        )
+        phases.append(compiled.phase)
+        if i in (20, 55, 130):
+            compiled.set_flip(float(knobs.speed_mps), float(knobs.rate_radps))
+    hold, climb, turn, catch = range(4)
+    assert [phases[20], phases[55], phases[130]] == [climb, turn, catch]
+    assert [p for i, p in enumerate(phases) if i == 0 or phases[i - 1] != p] == [climb, turn, catch, hold]

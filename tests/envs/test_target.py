@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cfb_mjx.envs import PAPER_REWARD, Layout, Noise, Starts, TargetReward, TargetTask, observe, reset, step
 from cfb_mjx.envs.episode import QUIET
-from cfb_mjx.envs.observation import Estimate, frame
+from cfb_mjx.envs.observation import Estimate, frame, observation, remember, start
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, State, rollout
 from cfb_mjx.parameters import load_randomisation
@@ -236,3 +236,47 @@ def test_the_control_step_must_fit_the_simulation():
     task = TargetTask(layout=Layout(control_dt_s=0.01))
     with pytest.raises(CfbError, match=r"control_dt_s = 0.01 is not a multiple"):
         task.hold(DRONE)
+
+
+@pytest.mark.parametrize(("body_position", "body_velocity"), [(True, False), (False, True)])
+def test_position_and_velocity_have_axes_of_their_own_choice(body_position, body_velocity):
+    turn = Rotation.from_rotvec([0.4, -0.7, 1.1])
+    position, velocity = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.2, -0.4])
+    layout = Layout(
+        position_scale_m=1.0,
+        position_bend_m=0.0,
+        velocity_scale_mps=1.0,
+        velocity_bend_mps=0.0,
+        body_position=body_position,
+        body_velocity=body_velocity,
+    )
+    quaternion = jnp.asarray(turn.as_quat()[[3, 0, 1, 2]])
+    shown = frame(layout, Estimate(jnp.asarray(position), jnp.asarray(velocity), quaternion, jnp.zeros(3)))
+    np.testing.assert_allclose(shown[:3], turn.inv().apply(position) if body_position else position, atol=1e-9)
+    np.testing.assert_allclose(shown[3:6], turn.inv().apply(velocity) if body_velocity else velocity, atol=1e-9)
+
+
+def test_commands_before_the_first_are_shown_as_those_after_it():
+    """From -1 to 1, as 2 u - 1; the newest first."""
+    layout, zero = Layout(past_commands=3), jnp.zeros(3)
+    at = Estimate(zero, zero, jnp.array([1.0, 0.0, 0.0, 0.0]), zero)
+    memory = start(layout, at, jnp.array([0.5, 0.6, 0.75, 1.0]))
+    np.testing.assert_allclose(memory.commands, [[0.0, 0.2, 0.5, 1.0]] * 3, atol=1e-12)
+    memory = remember(layout, memory, at, jnp.array([0.0, 0.25, 0.5, 0.75]))
+    np.testing.assert_allclose(memory.commands, [[-1.0, -0.5, 0.0, 0.5], *[[0.0, 0.2, 0.5, 1.0]] * 2], atol=1e-12)
+
+
+def test_the_integral_and_the_set_points_are_shown_in_their_units():
+    """An error of 0.2 m for 400 steps of 8 ms is 0.64 m s, beyond the limit of 0.6; one of 5 m counts as 0.3 m."""
+    layout = Layout(past_estimates=0, past_commands=0, integral=True, setpoint_scales=(2.0, 20.0))
+    at = dict.fromkeys(("velocity", "body_rate"), jnp.zeros(3))
+    at = Estimate(jnp.array([0.2, -0.1, 5.0]), quaternion=jnp.array([1.0, 0.0, 0.0, 0.0]), **at)
+
+    def after(steps):
+        memory = jax.lax.fori_loop(
+            0, steps, lambda _, m: remember(layout, m, at, jnp.full(4, 0.5)), start(layout, at, 0.5)
+        )
+        return observation(layout, memory, at, jnp.array([3.0, 10.0]))[-5:]
+
+    np.testing.assert_allclose(after(10), [0.016 / 0.6, -0.008 / 0.6, 0.024 / 0.6, 1.5, 0.5], rtol=1e-9)
+    np.testing.assert_allclose(after(400), [1.0, -0.32 / 0.6, 1.0, 1.5, 0.5], rtol=1e-9)

@@ -1,13 +1,16 @@
 """Bench tables under the names of the programs that write them: four rotors on a scale, dead sensors, voltage."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.logs.bench_columns import in_si
 from cfb_mjx.logs.bench_layouts import read_bench_table, recognises
 from cfb_mjx.logs.bench_points import SteadyPoints, joined
 from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
-from cfb_mjx.logs.tabular import read_table
+from cfb_mjx.logs.tabular import Table, read_table
 from cfb_mjx.sysid.rotors.steady import fit_steady
 
 KF, RPM = 3.72e-8, 30 / np.pi
@@ -243,7 +246,7 @@ def test_a_clock_that_stands_at_first(tmp_path):
     parts, notes = read(tmp_path, {"Time (s)": time} | RC)
     (record,) = [p for p in parts if isinstance(p, MotorRecord)]
     assert len(record.time) in (76, 77)  # one more row where its command belongs to the row before
-    assert any("3 rows whose time does not go on" in n for n in notes)
+    assert any("3 rows whose time does not increase" in n for n in notes)
     assert any("in no row are both speed and Thrust (gf) steady" in n for n in notes)
     with pytest.raises(CfbError, match="t does not increase"):
         read(tmp_path, {"Time (s)": 0.02 * (np.arange(80) % 20)} | RC)
@@ -273,3 +276,24 @@ def test_a_controller_that_keeps_the_speed_does_not_follow_the_voltage():
     fit = fit_steady([SteadyPoints("a", U, kept, VOLT)])
     assert fit.per_volt is None
     assert fit.gain == pytest.approx(2000, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("column", "reading", "key", "value"),
+    [
+        ("pwm", 65535.0, "u", 1.0),
+        ("pwm", 0.9, "u", 0.9),
+        ("throttle (%)", 40.0, "u", 0.4),
+        ("ESC signal (µs)", 1250.0, "u", 0.25),
+        ("rpm", 60.0, "omega", 2 * np.pi),
+        ("omega [Hz]", 1.0, "omega", 2 * np.pi),
+        ("thrust [g]", 1000.0, "force", 9.81),
+        ("thrust [mN]", 250.0, "force", 0.25),
+        ("torque [Nmm]", 3.0, "torque", 0.003),
+        ("torque [gf·cm]", 1000.0, "torque", 0.0980665),
+        ("vbat [mV]", 3700.0, "vbat", 3.7),
+    ],
+)
+def test_readings_in_si_by_hand(column, reading, key, value):
+    values = in_si(Table({column: np.array([reading, reading])}), Path("bench.csv"), []).values[key]
+    np.testing.assert_allclose(values, value, rtol=1e-12)

@@ -206,7 +206,7 @@ def test_unreadable_bags(path, tmp_path, small):
     with pytest.raises(CfbError, match="there is no such file"):
         read_crazyswarm(path)
     path.write_bytes(b"")
-    with pytest.raises(CfbError, match="this is no ROS bag"):
+    with pytest.raises(CfbError, match="this is not a ROS bag"):
         read_crazyswarm(path)
     path.unlink()
     with pytest.raises(CfbError, match=r"holds no \.mcap and no \.db3"):

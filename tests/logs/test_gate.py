@@ -10,7 +10,7 @@ from synthetic_logs import make_flight, same_data
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
 from cfb_mjx.logs import gate, read_log, validate, write_tabular
-from cfb_mjx.logs.fixes import candidates, command_fixes, fix_of, motor_fixes
+from cfb_mjx.logs.fixes import COMMAND_UNITS, candidates, command_fixes, fix_of, motor_fixes
 from cfb_mjx.logs.gate import judge
 
 
@@ -144,3 +144,21 @@ def test_an_order_under_inverted_commands_is_two_changes(flown):
         mended = fix_of(fix.name).apply(mended)
     assert [fix.name for fix in fixes] == ["command-order=3,2,1,4", "motors=inverted"]
     assert np.abs(mended.command - flown.command).max() < 1e-12
+
+
+@pytest.mark.parametrize(
+    ("unit", "logged", "duty"),
+    [
+        ("percent", 40.0, 0.4),
+        ("pwm16", 65535.0, 1.0),
+        ("dshot", 2047.0, 1.0),
+        ("dshot", 1047.0, 0.5),
+        ("dshot", 20.0, 0.0),
+        ("us", 1250.0, 0.25),
+        ("0-255", 255.0, 1.0),
+        ("0-1000", 250.0, 0.25),
+        ("1023", 1023.0, 1.0),
+    ],
+)
+def test_commands_in_other_units_by_hand(unit, logged, duty):
+    assert COMMAND_UNITS[unit][1](np.array([logged])) == pytest.approx(duty, rel=1e-12)

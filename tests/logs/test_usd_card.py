@@ -15,6 +15,7 @@ from cfb_mjx.files import shipped
 from cfb_mjx.logs import FORMATS, load_mapping, read_log, read_usd_card, rotation, write_mcap
 from cfb_mjx.logs.assembly import decompress_quaternion
 from cfb_mjx.logs.flight_log import FlightLog
+from cfb_mjx.logs.variables import UNITS
 
 FULL = foreign.STATE | foreign.IMU | foreign.MOTOR | foreign.RPM | foreign.BATTERY
 RECORD = 10 + 4 * (10 + 6 + 4 + 1) + 2 * 4  # bytes of a record of these in version 2
@@ -418,3 +419,23 @@ def test_no_damage_goes_unnoticed(small, tmp_path, data):
     with contextlib.suppress(CfbError):
         log = read_log(path, format="usd_card")
     assert log is None or broken == small or log.metadata["warnings"]
+
+
+@pytest.mark.parametrize(
+    ("field", "unit", "logged", "si"),
+    [
+        ("position", "mm", 250.0, 0.25),
+        ("velocity", "cm/s", 250.0, 2.5),
+        ("body_rate", "deg/s", 180.0, np.pi),
+        ("body_rate", "mrad/s", 2500.0, 2.5),
+        ("specific_force", "g", 2.0, 19.62),
+        ("command", "percent", 40.0, 0.4),
+        ("command", "pwm16", 65535.0, 1.0),
+        ("rotor_speed", "rpm", 60.0, 2 * np.pi),
+        # 12 poles are 6 pairs.
+        ("rotor_speed", "erpm", 360.0, 2 * np.pi),
+        ("battery_voltage", "mV", 3700.0, 3.7),
+    ],
+)
+def test_units_of_mappings_by_hand(field, unit, logged, si):
+    assert logged * UNITS[field][unit] == pytest.approx(si, rel=1e-12)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfb_mjx.model import ParasiticDrag, Quadrotor
+from cfb_mjx.model import ParasiticDrag, Quadrotor, specific_force
 from cfb_mjx.model.quadrotor import integrate_commanded, prepare
 from cfb_mjx.model.state import stack, unstack
 from cfb_mjx.model.vector import Vec
@@ -152,3 +152,15 @@ def test_euler_is_off_by_half_a_step_of_velocity(time, fleet, fly_fleet):
     assert flown[5] == pytest.approx(acceleration * time, rel=1e-9)
     error = flown[2] - 0.5 * acceleration * time**2
     assert error / (dt / 2 * acceleration * time) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_specific_force_is_the_acceleration_of_the_rotors_centre_without_gravity(off_center):
+    """A tumbling drone with its centre of gravity elsewhere, against the coupled Newton-Euler equations."""
+    y, _ = helpers.aggressive_manoeuvre(0.1)
+    constants = helpers.constants_of(off_center)
+    # Commands at which the rotors keep their speed: no reactive torque.
+    steady = (helpers.part(y, "rotor_speed") - constants.motor_speed_offset) / constants.motor_gain
+    acceleration = helpers.ode(constants, steady)(0.0, y)[3:6] + np.array([0.0, 0.0, constants.gravity])
+    felt = helpers.rotation_matrix(helpers.part(y, "quaternion")).T @ acceleration
+    assert np.abs(felt[:2]).min() > 0.1
+    np.testing.assert_allclose(specific_force(Quadrotor(off_center), helpers.state_of(y)), felt, rtol=1e-9)

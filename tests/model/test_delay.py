@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import equinox as eqx
 import helpers
 import jax
 import jax.numpy as jnp
@@ -38,7 +39,7 @@ def test_reads_what_was_true_then(delay, expected):
     assert float(jax.jit(DelayLine.read)(line, delay)) == pytest.approx(expected, abs=1e-12)
 
 
-@pytest.mark.parametrize("delay", [0.0121, 0.1, -0.1, float("nan")])
+@pytest.mark.parametrize("delay", [0.0121, 0.1, -0.1, -0.001, float("nan")])
 def test_a_delay_outside_of_the_line_is_no_number(delay):
     line = _line([0.0, 1.0, 2.0, 3.0, 4.0, 5.0])
     with pytest.raises(CfbError, match=r"does not fit in a line of 0\.012 s"):
@@ -49,7 +50,9 @@ def test_a_delay_outside_of_the_line_is_no_number(delay):
 
 
 def test_a_delay_of_the_whole_line_may_be_rounded():
-    line = DelayLine.filled(jnp.float32(1.0), DT, 0.012).push(jnp.float32(2.0))
+    line = DelayLine.filled(jnp.float32(1.0), DT, 0.012)
+    for value in (2.0, 3.0, 4.0):
+        line = line.push(jnp.float32(value))
     assert line.read(jnp.float32(0.012) * (1 + 1e-6)) == 1.0
 
 
@@ -128,3 +131,26 @@ def test_vmap_and_scan():
     np.testing.assert_allclose(read[:, 0], [10, 13, 16, 19])
     np.testing.assert_allclose(read[:, 1], [1, 11, 14, 17])
     np.testing.assert_allclose(read[:, 2], [2, 7, 13.5, 16.5])
+
+
+def test_several_samples_at_once_are_pushed_oldest_first():
+    line = _line([0.0, 1.0, 2.0, 3.0]).push_all(jnp.array([10.0, 11.0]))
+    assert [float(line.read(i * DT)) for i in range(4)] == [11.0, 10.0, 3.0, 2.0]
+
+
+def test_every_number_of_a_state_is_interpolated():
+    """Also body rate, rotor speed and the memory of effects; a quarter of the way to the older sample."""
+    still = np.concatenate([np.arange(1.0, 7.0), [1.0, 0.0, 0.0, 0.0], np.arange(10.0, 17.0)])
+    change = np.concatenate([np.full(6, 4.0), np.zeros(4), np.full(7, 8.0)])
+    older, newer = helpers.state_of(still), helpers.state_of(still + change)
+    older, newer = (eqx.tree_at(lambda s: s.memory, s, (jnp.array([m]),)) for s, m in ((older, 20.0), (newer, 24.0)))
+    read = DelayLine.filled(older, DT, DT).push(newer).read(DT / 4)
+    np.testing.assert_allclose(helpers.pack(read), still + 0.75 * change, rtol=1e-12)
+    np.testing.assert_allclose(read.memory[0], [23.0], rtol=1e-12)
+
+
+def test_a_drone_upside_down_is_read_between_its_two_samples_whatever_came_after():
+    """Turned by 3.0 and 3.3 rad at the two older samples, level at the newest."""
+    line = DelayLine.filled(_state(3.3), DT, 2 * DT).push(_state(3.0)).push(_state(0.0))
+    read = np.asarray(line.read(1.5 * DT).quaternion)
+    assert helpers.attitude_error(read, helpers.part(helpers.pack(_state(3.15)), "quaternion")) < 1e-9

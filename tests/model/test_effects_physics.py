@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from cfb_mjx.model import Quadrotor, State, begin, rollout, rotors
+from cfb_mjx.model import Quadrotor, State, begin, rollout, rotors, step
 from cfb_mjx.model.effects import (
     CATALOGUE,
     BatterySag,
@@ -858,3 +858,16 @@ def test_wind_drag_tilt_and_a_load_follow_newton(guards, fly_fleet):
     assert turn > 0.5
     for part, tolerance in (("position", 0.01 * load), ("velocity", 0.02), ("body_rate", 0.01 * turn)):
         assert np.abs(helpers.part(flown - known[:, :17], part)).max() < tolerance, part
+
+
+def test_a_changed_time_constant_changes_the_reactive_torque_too(guards):
+    """One step without aerodynamic torque: the yaw rate is J_m / J_zz times the change of the rotor speeds."""
+    sign, start = np.array([-1.0, 1.0, -1.0, 1.0]), 1594.0
+    target = 2900.0 * (0.55 + 0.1 * sign)
+    drone = eqx.tree_at(lambda p: p.torque_scale, guards, jnp.zeros(4))
+    # Narrow: each motor is wholly in one direction.
+    model = Quadrotor(drone, (MotorAsymmetry(-0.3, 0.3, 0.1),))
+    after = step(model, State.at_rest((0.0, 0.0, 1.0), start), jnp.asarray(target / 2900.0))
+    lag = 0.05 * np.where(target > start, 0.7, 1.3)
+    speed = target + (start - target) * np.exp(-0.004 / lag)
+    assert float(after.body_rate[2]) == pytest.approx(0.5e-7 * sign @ (speed - start) / 5.9e-5, rel=2e-3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import warnings
 
 import equinox as eqx
 import helpers
@@ -233,3 +234,23 @@ def test_presets_carry_their_effects():
     assert isinstance(model.effects[0], ParasiticDrag)
     assert Quadrotor.from_file(load_model_file("cfb")).effects == ()
     assert isinstance(model.hover_state(), State)
+
+
+@pytest.mark.parametrize(("dt_s", "steps"), [(0.008, 2), (0.004, 1), (0.009, None), (0.010, None), (0.001, None)])
+def test_commands_last_a_whole_number_of_steps(dt_s, steps):
+    model = Quadrotor.from_file("cfb-guards")
+    if steps is None:
+        with pytest.raises(CfbError, match="not a multiple of the simulation step"):
+            model.steps_per_command(dt_s)
+    else:
+        assert model.steps_per_command(dt_s) == steps
+
+
+@pytest.mark.parametrize(("ratio", "said"), [(0.98, True), (1.02, False)])
+def test_a_drone_that_cannot_hover_is_said_to_be_too_heavy(ratio, said):
+    """Full thrust is four times 0.289 N."""
+    mass = 4 * (-0.23 + 0.562 - 0.043) / 9.81 / ratio
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        Quadrotor.from_file(load_model_file("cfb-guards").with_values("a test", mass=mass))
+    assert any("cannot hover" in str(w.message) for w in found) == said

@@ -5,18 +5,19 @@ import json
 from pathlib import Path
 
 import equinox as eqx
+import helpers
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from plant import Plant, fly
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 
 from cfb_mjx.logs import read_log
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid.identification.fitting import fit
-from cfb_mjx.sysid.identification.flight_data import prepare
-from cfb_mjx.sysid.identification.innovation import as_held
+from cfb_mjx.sysid.identification.flight_data import Segments, prepare
+from cfb_mjx.sysid.identification.innovation import as_held, drive, innovations
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.uncertainty import assess, most_contradicted
 from cfb_mjx.sysid.identification.unknowns import at_the_border
@@ -211,3 +212,78 @@ def test_noise_levels_come_back_from_their_vector_at_the_floor_too():
         again = Noise.from_vector(noise.to_vector())
         for one, two in zip(jax.tree.leaves(noise), jax.tree.leaves(again), strict=True):
             np.testing.assert_allclose(two, one, rtol=2e-3)
+
+
+def by_hand(rows, **fields) -> Segments:
+    """A piece of flight without measured rotor speeds, every 10 ms; fields by row."""
+    arrays = {
+        "interval": np.append(0.0, np.full(rows - 1, 0.01)),
+        "valid": np.ones(rows),
+        "command": np.full((rows, 4), 0.55),
+        "doubt": np.zeros((rows, 4)),
+        "excess": np.zeros((rows, 4)),
+        "rotor_speed": np.zeros((rows, 4)),
+        "warm_up": np.zeros(rows),
+        "body_rate": np.zeros((rows, 3)),
+        "specific_force": np.zeros((rows, 3)),
+    } | fields
+    return Segments(**{k: jnp.asarray(v, float)[None] for k, v in arrays.items()}, measured=jnp.zeros(1))
+
+
+NOISE = Noise(
+    *(jnp.asarray(x) for x in ([0.01] * 3, [0.2] * 3, [1.0, 2.0, 3.0], 0.4, 0.3, 0.005, 0.5, 1.0, 20.0, 30.0, 0.3))
+)
+
+
+def test_loads_between_rows_are_means_along_the_motors_exact_path():
+    """By quadrature along the exponentials; force at the rotors' centre by the coupled Newton-Euler equations."""
+    rng = np.random.default_rng(8)
+    drone = eqx.tree_at(lambda p: p.center_of_gravity, NOMINAL, jnp.array([0.003, -0.002, 0.001]))
+    command, excess = rng.uniform(0.3, 0.8, (5, 4)), rng.uniform(-0.02, 0.02, (5, 4))
+    rate = 5 * rng.normal(size=(5, 3))
+    driven = drive(drone, NOISE, by_hand(5, command=command, excess=excess, body_rate=rate), use_measured=False)
+    constants, lag, speed = helpers.constants_of(drone), 0.05, 2900 * command[0]
+    for row in range(1, 5):
+        goal = 2900 * command[row - 1]
+
+        def torque(t, start=speed, goal=goal, more=2900 * excess[row - 1]):
+            at = goal + (start - goal) * np.exp(-t / lag)
+            force, about = helpers.rotor_wrench(constants, at + more, (goal - at) / lag)
+            return about - np.cross(constants.center_of_gravity, force)
+
+        means = [quad(lambda t, i=i: torque(t)[i], 0, 0.01, epsabs=0, epsrel=1e-10)[0] / 0.01 for i in range(3)]
+        np.testing.assert_allclose(driven.torque[0, row - 1], means, rtol=1e-7, atol=1e-12)
+        speed = goal + (speed - goal) * np.exp(-0.01 / lag)
+        y = np.concatenate([np.zeros(6), [1.0, 0, 0, 0], rate[row], speed])
+        felt = helpers.ode(constants, speed / 2900)(0.0, y)[5] + 9.81
+        assert float(driven.force[0, row - 1]) == pytest.approx(felt, rel=1e-9)
+
+
+def test_variances_of_the_first_row_by_hand():
+    """Rotor speeds unknown by 0.1 of the gain each, commands between the rows by 0.3 of the doubt."""
+    segments = by_hand(3, doubt=np.full((3, 4), 0.05))
+    driven = drive(NOMINAL, NOISE, segments, use_measured=False)
+    _, variance = innovations(NOMINAL, NOISE, segments, driven, use_measured=False)
+    dt, lag, s = 0.01, 0.05, 0.55
+    fade = np.exp(-dt / lag)
+    # Slopes of paper eqs. 8 and 9 over rotor speed.
+    lift = (-3 * 0.23 * s**2 + 2 * 0.562 * s - 0.043) / 2900
+    drag = 1e-4 * (-3 * 3.4 * s**2 + 2 * 8.7 * s + 2.9) / 2900
+    inertia, kick = np.array([3.3e-5, 3.6e-5, 5.9e-5]), np.array([0.0, 0.0, 0.5e-7 / 5.9e-5])
+    pull = np.array([0.03535 * lift, 0.03535 * lift, drag]) / inertia - kick / lag
+    start, more = 4 * (0.1 * 2900) ** 2, 4 * (0.3 * 2900 * 0.05 * (1 - fade)) ** 2
+    # Measured once, the disturbance over an interval, the white acceleration, the rotors' error old and new.
+    rate = 0.01**2 + (dt * np.array([1.0, 2.0, 3.0])) ** 2 + 0.2**2 * dt
+    rate += (pull * lag * (1 - fade)) ** 2 * start + (kick + pull * dt / 2) ** 2 * more + 0.01**2
+    force = 0.5**2 + 0.3**2 + (lift / 0.044) ** 2 * (fade**2 * start + more)
+    np.testing.assert_allclose(variance[0, 0, :4], [*rate, force], rtol=1e-6)
+
+
+def test_rows_that_warm_up_and_rotors_that_were_not_measured_do_not_count():
+    rng = np.random.default_rng(9)
+    segments = by_hand(6, warm_up=[1, 1, 1, 0, 0, 0], body_rate=rng.normal(size=(6, 3)), valid=[1, 1, 1, 1, 1, 0])
+    error, variance = innovations(NOMINAL, NOISE, segments, drive(NOMINAL, NOISE, segments))
+    counts = np.zeros((5, 8))
+    counts[2:4, :4] = 1.0
+    np.testing.assert_array_equal(error[0] != 0, counts)
+    np.testing.assert_array_equal(variance[0] == 1, 1 - counts)

@@ -1,5 +1,7 @@
 """Predictions against SciPy, exact data predicted exactly, and the metrics against hand calculations."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +13,12 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.sysid import HORIZONS, evaluate, replay
+from cfb_mjx.sysid.evaluation import _refuse_diverged, before_and_after
 from cfb_mjx.sysid.flight import ROWS, prepare_flight
 from cfb_mjx.sysid.metrics import geodesic_deg, intervals, metrics
 from cfb_mjx.sysid.prediction import start_of_windows, starts_of_windows
 from cfb_mjx.sysid.replay import Lane, replays
+from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.windows import find_windows
 
 MASS, INERTIA, LAG, GAIN, ROTOR_INERTIA, HALF = 0.044, np.array([3.3e-5, 3.6e-5, 5.9e-5]), 0.05, 2900.0, 5e-8, 0.03535
@@ -207,3 +211,55 @@ def test_rotor_speeds_run_on_from_block_to_block(exact_log):
         np.testing.assert_allclose(said.rotor_speed[row], speed, rtol=1e-9)
         target = gain * flight.command[row]
         speed = target + (speed - target) * np.exp(-flight.interval[row] / lag)
+
+
+def test_rotors_run_on_from_the_last_row_to_a_start_between_rows(exact_log):
+    """Against the exact lag of first order; commands beyond the range are clipped."""
+    time = np.arange(0, 2.0, 0.007)
+    command = np.random.default_rng(4).uniform(-0.2, 1.2, (len(time), 4))
+    log = exact_log.rows(np.arange(len(time))).replace(time=time, command=command)
+    windows = find_windows(log, HORIZONS, 0.0, 0.0)
+    found, _ = start_of_windows(Quadrotor.from_file("cfb-guards"), log, windows, 0.0)
+    assert np.ptp(windows.start - time[windows.row]) > 0.003
+    for start, speed in zip(windows.start, found, strict=True):
+        rows = time <= start
+        expected = GAIN * np.clip(command[0], 0, 1)
+        for u, duration in zip(command[rows], np.diff(np.append(time[rows], start)), strict=True):
+            target = GAIN * np.clip(u, 0, 1)
+            expected = target + (expected - target) * np.exp(-duration / LAG)
+        np.testing.assert_allclose(speed, expected, rtol=1e-9)
+
+
+def test_before_and_after_are_told_apart(exact_log, evaluation):
+    other = evaluate(Quadrotor.from_file("cfb"), [exact_log])
+    told = before_and_after(other, evaluation)
+    assert told["hold"] == evaluation.metrics("hold")
+    for name, model in (("before", other), ("after", evaluation)):
+        assert told[name] == model.metrics("commands_in")
+        assert told[f"{name}_rotor_speed_in"] == model.metrics("rotor_speed_in")
+
+
+def test_windows_with_rotor_speed_are_counted(exact_log):
+    """Rotor speeds end at 1.5 s: 500 ms from 0.6, 0.8 and 1.0 s are within."""
+    speed = np.where(exact_log.time[:, None] <= 1.5 + 1e-9, exact_log.rotor_speed, np.nan)
+    told = evaluate(Quadrotor.from_file("cfb-guards"), [exact_log.replace(rotor_speed=speed)])
+    assert told.to_json()["rotor_speed_in_windows"] == 3
+    assert told.logs[0].predictions["rotor_speed_in"].position.shape == (3, len(HORIZONS), 3)
+
+
+def test_the_first_window_that_diverges_is_one_of_those_with_rotor_speed(evaluation):
+    """Of the windows from 0.6 s on, only those from 1.0 s on have rotor speeds; the second of these diverges."""
+    log = evaluation.logs[0]
+    there = log.windows.start > 0.99
+    errors = {"rate": np.where(np.arange(there.sum()) == 1, np.inf, 0.0)[:, None]}
+    spoiled = replace(log, measured=there, errors={"commands_in": None, "rotor_speed_in": errors})
+    with pytest.raises(
+        CfbError, match=r"1 of 6 predictions \(rotor_speed_in\) are not finite, the first from 1\.20 s on"
+    ):
+        _refuse_diverged(spoiled)
+
+
+def test_holding_still_starts_from_what_was_recorded_whatever_the_faults(exact_log, evaluation):
+    faults = SensorFaults(gyro_scale=1.1)
+    held = evaluate(Quadrotor.from_file("cfb-guards"), [exact_log], faults=faults).logs[0].predictions["hold"]
+    np.testing.assert_allclose(held.body_rate, evaluation.logs[0].predictions["hold"].body_rate, rtol=1e-12)

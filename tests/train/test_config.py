@@ -42,7 +42,7 @@ def test_a_reward_from_before_there_was_near_is_the_papers():
 
 def test_a_change_of_a_file_is_asked_for_what_came_later_too(tmp_path):
     (tmp_path / "mine.yaml").write_text("format: cfb_mjx training 1\nreward: {torque: 0.2}")
-    with pytest.raises(CfbError, match=r"mine\.yaml with reward\.position=5: reward gives position, but not near"):
+    with pytest.raises(CfbError, match=r"mine\.yaml with reward\.position=5: reward gives position, but neither near"):
         load_config(tmp_path / "mine.yaml", ("reward.position=5",))
     assert load_config(tmp_path / "mine.yaml", ("reward.position=5", "reward.near=1")).reward.near == 1.0
 
@@ -103,3 +103,12 @@ def test_changes_that_mean_nothing_are_refused(change):
 def test_a_name_that_is_no_training_is_refused():
     with pytest.raises(CfbError, match="no such training"):
         load_config("hover")
+
+
+def test_a_configuration_from_before_there_were_bends_shows_linear_scales_and_world_axes():
+    written = load_config("target").to_mapping()
+    for key in ("position_bend_m", "velocity_bend_mps", "body_position", "body_velocity"):
+        del written["observation"][key]
+    shown = config_from(written, "an old file").observation
+    assert (shown.position_bend_m, shown.velocity_bend_mps) == (0.0, 0.0)
+    assert (shown.body_position, shown.body_velocity) == (False, False)

@@ -163,7 +163,7 @@ def test_a_name_that_other_machines_cannot_reach_is_refused(monkeypatch):
     monkeypatch.setattr(socket, "getaddrinfo", resolve)
     monkeypatch.delenv(BOUND, raising=False)
     assert _arguments(Hosts("localhost:99", 2, 0))["coordinator_bind_address"] == "localhost:99"
-    with pytest.raises(CfbError, match=r"here node-a is 127\.0\.1\.1, where no other machine can reach"):
+    with pytest.raises(CfbError, match=r"node-a is 127\.0\.1\.1 on this machine, where no other machine can reach"):
         _arguments(Hosts("node-a:99", 2, 0))
     _arguments(Hosts("node-a:99", 2, 1))  # only process 0 listens
     monkeypatch.setenv(BOUND, "10.0.0.1:99")
@@ -240,7 +240,7 @@ def test_what_the_first_refuses_all_refuse(cache, alone):
     [
         (("--coordinator", "somewhere"), "write HOST:PORT"),
         (("--coordinator", "a:1", "--processes", "2"), "needs --processes N and --process I"),
-        (("--coordinator", "a:1", "--processes", "2", "--process", "2"), "it is 0 to 1"),
+        (("--coordinator", "a:1", "--processes", "2", "--process", "2"), "it must be 0 to 1"),
         (("--processes", "2"), "need --coordinator"),
         (("--coordinator", "auto", "--process", "1"), "leave them out"),
         (("--coordinator", "auto"), "no cluster is found here"),

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import load_policy
@@ -551,3 +552,74 @@ def test_off_nominal_plants_differ_from_the_nominal_one_and_hover(tmp_path):
         load_plants(base, tmp_path / "p.yaml")
     with pytest.raises(CfbError, match="no such set of plants"):
         load_plants(base, "nothing")
+
+
+def test_the_loss_is_the_articles_written_out():
+    """Schulman et al. 2016 and 2017 in NumPy: advantages, their limit, the clipped ratio, the value's error."""
+    ppo, state, *_, data, _ = collected_after_throwing(slice(1, 2), episode_s=0.08)
+    ppo = Ppo(replace(ppo.settings, smoothness=0.0, advantage_limit=1.5), ppo.task, ppo.nominal)
+    # A policy that has moved on since the flights, so that some ratios are clipped.
+    actor = eqx.tree_at(
+        lambda a: a.network.biases[-1], state.actor, replace_fn=lambda b: b + jnp.array([0.1, -0.1, 0.05, 0.0])
+    )
+    actor = eqx.tree_at(lambda a: a.raw_std, actor, replace_fn=lambda s: s + 0.2)
+    last = data["hidden"][-1]
+    loss = jax.jit(ppo._loss)
+    total, metrics = loss(
+        (actor, state.critic), (jnp.asarray(1.0), jnp.asarray(0.0)), data, last, jax.random.PRNGKey(0)
+    )
+    dearer, _ = loss((actor, state.critic), (jnp.asarray(1.0), jnp.asarray(0.5)), data, last, jax.random.PRNGKey(0))
+
+    s, n = ppo.settings, {k: np.asarray(v, float) for k, v in data.items() if k not in ("seen", "hidden")}
+    # The best reward forever, and what the network says of it.
+    ideal = s.reward_scaling * ppo.task.largest_reward / (1 - s.discount)
+    values, after = (ideal + np.asarray(state.critic(x))[..., 0] for x in (data["hidden"], last))
+    advantage, returns, ahead, beyond = np.zeros_like(values), np.zeros_like(values), 0.0, after
+    for i in reversed(range(len(values))):
+        goes_on, whole = s.discount * (1 - n["failed"][i]), 1 - n["cut"][i]
+        told = n["reward"][i] + goes_on * (after if i == len(values) - 1 else values[i + 1]) - values[i]
+        ahead = whole * told + goes_on * whole * s.gae_lambda * ahead
+        advantage[i] = whole * (n["reward"][i] + goes_on * beyond - values[i])
+        returns[i] = beyond = values[i] + ahead
+    flown = n["flown"]
+
+    def mean(x):
+        return np.sum(flown * x) / np.sum(flown)
+
+    groups, there = advantage.reshape(24, 2, 4), flown.reshape(24, 2, 4)
+    advantage = (groups - (groups * there).sum(-1, keepdims=True) / there.sum(-1, keepdims=True)).reshape(24, 8)
+    most = 1.5 * mean(np.abs(advantage))
+    assert np.any(np.abs(advantage) > most)
+    advantage = np.clip(advantage, -most, most)
+    advantage = advantage - mean(advantage)
+    advantage /= np.sqrt(mean(advantage**2))
+    loc, std = np.asarray(actor.network(data["seen"])), np.log1p(np.exp(np.asarray(actor.raw_std))) + 0.001
+    raw = n["raw"]
+    # log |d tanh(x) / dx| = log(1 - tanh(x)^2)
+    density = (norm.logpdf(raw, loc, std) - np.log1p(-(np.tanh(raw) ** 2))).sum(-1)
+    ratio = np.exp(density - n["log_prob"])
+    assert 0.05 < mean(np.abs(ratio - 1) > s.clipping) < 0.95
+    gain = mean(np.minimum(ratio * advantage, np.clip(ratio, 1 - s.clipping, 1 + s.clipping) * advantage))
+    value_loss = mean((returns - values) ** 2) / 4
+    assert float(metrics["value_loss"] - total) == pytest.approx(gain, abs=1e-6)
+    assert float(metrics["value_loss"]) == pytest.approx(value_loss, rel=1e-5)
+    assert float(metrics["kl"]) == pytest.approx(mean(ratio - 1 - np.log(ratio)), rel=1e-5)
+    # More entropy is a gain.
+    assert float(total - dearer) == pytest.approx(0.5 * float(metrics["entropy"]), rel=1e-4)
+
+
+def test_the_entropy_bonus_falls_to_its_last_share(monkeypatch):
+    """From 0.003 to a fiftieth of that in equal steps; in an update's epochs it is constant."""
+    ppo, state, _, after, data, outcome = collected_after_throwing(slice(0, 0))
+    seen = []
+
+    def epoch(weights, data, last, learnt, key):
+        seen.append([float(w) for w in weights])
+        return learnt, {"kl": jnp.zeros(())}
+
+    monkeypatch.setattr(ppo, "_collect", lambda *_: (after, data, outcome))
+    monkeypatch.setattr(ppo, "_epoch", epoch)
+    monkeypatch.setattr(ppo, "updates", 10)
+    for count in (0, 5, 10):
+        ppo._update(eqx.tree_at(lambda s: s.count, state, jnp.asarray(count)))
+    np.testing.assert_allclose(seen, [[1.0, 3e-3], [1.0, 3e-3 * 0.51], [1.0, 3e-3 * 0.02]], rtol=1e-6)

@@ -59,8 +59,9 @@ class Mellinger(eqx.Module):
     @classmethod
     def hovering(cls, parameters: Parameters) -> Mellinger:
         """Return the firmware's gains with the mass and the counts per newton at which ``parameters`` hover."""
-        weight = parameters.mass * parameters.gravity
-        return cls(mass=parameters.mass, mass_thrust=COUNTS * jnp.mean(hover_command(parameters)) / weight)
+        # The thrust that `step` asks for at rest, wherever the drone flies.
+        asked = parameters.mass * GRAVITY
+        return cls(mass=parameters.mass, mass_thrust=COUNTS * jnp.mean(hover_command(parameters)) / asked)
 
 
 class MellingerState(eqx.Module):
