@@ -125,7 +125,7 @@ def test_a_frozen_estimate_is_left_out(log):
         values[100:140] = values[99]
     found = flown_part(log.replace(**held), HERE)
     assert len(found) == len(log) - 40
-    assert "to the last bit" in found.metadata["warnings"][0]
+    assert "stay exactly the same: 40 rows" in found.metadata["warnings"][0]
 
 
 def test_a_pose_held_between_its_packets_is_not_frozen(log):

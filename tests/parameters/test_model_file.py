@@ -152,7 +152,7 @@ def test_the_delay_of_the_pose_may_have_its_former_name(document, tmp_path):
     save_model_file(model.with_values("me", observation_delay=0.016), tmp_path / "written.yaml")
     assert "observation_delay" not in (tmp_path / "written.yaml").read_text()
     assert load_model_file(tmp_path / "written.yaml").entries["pose_delay"].value == 0.016
-    with pytest.raises(CfbError, match="give pose_delay alone"):
+    with pytest.raises(CfbError, match="give only pose_delay"):
         model.with_values("me", observation_delay=0.016, pose_delay=0.02)
     parameters["pose_delay"] = parameters["observation_delay"]
     with pytest.raises(CfbError, match=r"drone\.yaml: parameters\.observation_delay and parameters\.pose_delay"):
