@@ -216,8 +216,8 @@ def page(results: dict, plants: int, described) -> str:
     bands = list(results[names[0]]["recovered_by_strength"])
     lines += [
         "",
-        "Most of the drones that do not recover are weak. The next table divides the drones by the largest thrust that "
-        "they have with balanced roll, pitch and yaw torques, over their weight (`balanced_thrust_to_weight`; nominal: "
+        "The next table divides the thrown drones by the largest thrust that they have with balanced "
+        "roll, pitch and yaw torques, over their weight (`balanced_thrust_to_weight`; nominal: "
         f"{nominal:.2f}). Each cell is the share that recovers; the number of drones is in the heading.",
         "",
         "| controller | "

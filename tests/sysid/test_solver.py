@@ -46,6 +46,12 @@ def test_solvers_of_optimistix_take_its_place(name, residual, start):
     assert np.asarray(least_squares(residual, start)) == pytest.approx(np.asarray(theirs), abs=1e-4)
 
 
+def test_another_solver_that_does_not_converge_says_so():
+    never = optx.LevenbergMarquardt(rtol=0.0, atol=0.0)
+    with pytest.raises(RuntimeError, match="maximum number of"):
+        jax.block_until_ready(least_squares(decay, jnp.asarray([1.0, 0.0, 0.0]), solver=never))
+
+
 def test_it_is_a_solver_for_anybody():
     """With optimistix's own arguments: auxiliary output, the number of steps, and a derivative through the solution."""
 

@@ -127,14 +127,17 @@ def least_squares(
         residual: of the unknowns; a pytree of arrays, each divided by its noise.
         start: where to begin.
         ridge: one over the standard deviation of each unknown's prior about zero; a large one holds it.
-        solver: of optimistix, such as ``optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)``; None takes `GaussNewton`.
+        solver: of optimistix, such as ``optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)``; it raises an error if it
+            does not converge within optimistix's 256 steps. None takes `GaussNewton`.
     """
 
     def with_prior(x, _):
         return residual(x), ridge * x
 
-    solver = GaussNewton() if solver is None else solver
-    return optx.least_squares(with_prior, solver, start, max_steps=MAX_STEPS, throw=False).value
+    if solver is None:
+        return optx.least_squares(with_prior, GaussNewton(), start, max_steps=MAX_STEPS, throw=False).value
+    # `MAX_STEPS` is for our steps; a solver of the user's that does not converge must not pass for one that does.
+    return optx.least_squares(with_prior, solver, start).value
 
 
 def _linearised(residual: Callable[[Array], PyTree], x: Float[Array, " k"]) -> Quadratic:
