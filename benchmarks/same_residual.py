@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.bodies import RigidBody
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.identification import fitting, flight_data, shooting, shooting_data
+from cfb_mjx.sysid.identification import fitting, flight_data, shooting
 from cfb_mjx.sysid.identification.solver import RIDGE
 from cfb_mjx.sysid.identification.unknowns import Unknowns, choose
 
@@ -38,7 +38,7 @@ class Problem:
 def of_shooting(logs: list[FlightLog], nominal: Parameters, names, use_measured: bool = True) -> Problem:
     """Return the problem of multiple shooting from measured starts, with constant weights."""
     unknowns, body = choose(names, nominal), RigidBody()
-    data = shooting_data.batches(logs, None, float(nominal.pose_delay), use_measured)
+    data = shooting.batches(logs, None, float(nominal.pose_delay), use_measured)
     whiten = shooting._whitening(unknowns, unknowns.start, data, body, False)
 
     @eqx.filter_jit

@@ -34,9 +34,8 @@ from cfb_mjx.runtime import configure_jax, environment
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.flight import usual_delay
 from cfb_mjx.sysid.flow_estimator import fit_flow_estimator
-from cfb_mjx.sysid.nanodrone import QUANTITIES, Contestant, benchmark
+from cfb_mjx.sysid.nanodrone import QUANTITIES, Contestant, benchmark, benchmark_score, score, tune_observer
 from cfb_mjx.sysid.observer import Observer
-from cfb_mjx.sysid.observer_tuning import benchmark_score, score, tune_observer
 from cfb_mjx.sysid.refinement.model_files import by_predictions
 from cfb_mjx.sysid.repeatability import repeated
 from cfb_mjx.sysid.sensor_faults import SensorFaults

@@ -38,8 +38,8 @@ def main() -> None:
     parser.add_argument("--page-only", action="store_true", help="write the page from the stored results")
     arguments = parser.parse_args()
     from cfb_mjx.files import write_json, write_text
-    from cfb_mjx.loop.cells import cells_of
     from cfb_mjx.loop.page import loop_figure
+    from cfb_mjx.loop.steps import cells_of
     from cfb_mjx.runtime import configure_jax
 
     cells = cells_of(arguments.effects, arguments.seeds, arguments.seed)

@@ -20,9 +20,8 @@ from cfb_mjx.control import FirmwarePid, PositionHold
 from cfb_mjx.files import write_json
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.sysid.excitation.conditions import Conditions
 from cfb_mjx.sysid.excitation.design import Problem, optimise
-from cfb_mjx.sysid.excitation.experiment import fly
+from cfb_mjx.sysid.excitation.experiment import Conditions, fly
 from cfb_mjx.sysid.excitation.information import predict
 from cfb_mjx.sysid.excitation.manoeuvres import Limits, roll_pitch, scaled, single_motor
 from cfb_mjx.sysid.identification.fitting import default_parameters, fit

@@ -125,7 +125,7 @@ class Course:
         from cfb_mjx.envs import TargetTask
         from cfb_mjx.model import Quadrotor
         from cfb_mjx.parameters import load_model_file, load_randomisation
-        from cfb_mjx.train.plants import load_plants
+        from cfb_mjx.train.flying import load_plants
 
         described = load_model_file("cfb-guards")
         self.nominal = Quadrotor.from_file(described)
@@ -147,9 +147,8 @@ class Course:
         import jax
 
         from cfb_mjx.control.controllers import find_controller
-        from cfb_mjx.control.manoeuvre import Knobs, Manoeuvre
-        from cfb_mjx.control.manoeuvre_file import ManoeuvreFile, save_manoeuvre
-        from cfb_mjx.train.flip_search import Goal, bounds, search
+        from cfb_mjx.control.manoeuvre import Knobs, Manoeuvre, ManoeuvreFile, save_manoeuvre
+        from cfb_mjx.train.flips import Goal, bounds, search
 
         wanted = FLIPS[name]
         there = (MANOEUVRES / f"{name}.yaml").exists()
@@ -200,8 +199,7 @@ class Course:
         """Draw the figures of the page and write a recording of each flip to out/flips."""
         from cfb_mjx.files import output_folder
         from cfb_mjx.train.flips import flips
-        from cfb_mjx.view.flight_recording import write_flight_recording
-        from cfb_mjx.view.flip import draw_path, flip_figure
+        from cfb_mjx.view.flight import draw_path, flip_figure, write_flight_recording
         from cfb_mjx.view.style import context, new_figure, save
 
         with context():

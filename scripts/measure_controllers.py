@@ -14,7 +14,7 @@ from itertools import pairwise
 
 from campaign import ROOT, facts_line
 
-from cfb_mjx.reproduce.paper import PAPER_FIRMWARE, PAPER_HOVER
+from cfb_mjx.reproduce.controllers import PAPER_FIRMWARE, PAPER_HOVER
 from cfb_mjx.runtime import configure_jax, environment, say
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)

@@ -118,7 +118,7 @@ def page(models: dict[str, ModelFile], results: dict, commands: dict[str, list[s
             "",
             "The observer estimates a torque, a force and, where rotor speed was measured, motor errors from the data",
             "before each window's start. Its noise levels were chosen by predictions of the flights fitted to, with",
-            "equal weight for gentle and square flights (`cfb_mjx.sysid.observer_tuning`): for the plant by the errors",
+            "equal weight for gentle and square flights (`cfb_mjx.sysid.nanodrone`): for the plant by the errors",
             "after 0.5 s, for the predictor by the sums of the benchmark below.",
             "",
             *_levels(results["observer"]),

@@ -23,7 +23,7 @@ def main() -> None:
     found = Reproduce(output=arguments.output, real=arguments.real).run()
     print(found)
     from cfb_mjx.files import output_folder, write_text
-    from cfb_mjx.reproduce.document import markdown, names_of
+    from cfb_mjx.reproduce.item import markdown, names_of
 
     folder = output_folder(ROOT / "docs" / "paper")
     for path in names_of(found.results):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from campaign import ROOT, Run, carry_out, facts_line, study_arguments
 
-from cfb_mjx.reproduce.paper import PAPER_FIRMWARE, PAPER_HOVER
+from cfb_mjx.reproduce.controllers import PAPER_FIRMWARE, PAPER_HOVER
 from cfb_mjx.train.judge import away
 
 MAGNITUDES = (0.0, 0.5, 1.0, 1.5)

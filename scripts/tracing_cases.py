@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.reference_simulator import EFFECTS, Case, fly_campaigns
-from cfb_mjx.sysid.tracing.fits import ERRORS
+from cfb_mjx.sysid.tracing.jointly import ERRORS
 
 ROOT = Path(__file__).resolve().parents[1]
 MILD = ROOT / "benchmarks" / "tracing_mild.json"

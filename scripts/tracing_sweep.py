@@ -22,7 +22,7 @@ from cfb_mjx.files import write_text
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.reference_simulator import Case, fly_campaigns, label
 from cfb_mjx.runtime import configure_jax, environment
-from cfb_mjx.sysid.tracing.fits import ERRORS
+from cfb_mjx.sysid.tracing.jointly import ERRORS
 
 ROOT = Path(__file__).resolve().parents[1]
 

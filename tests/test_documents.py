@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from cfb_mjx import documents
 from cfb_mjx.commands import Fly, load
-from cfb_mjx.control.manoeuvre_file import load_manoeuvre
+from cfb_mjx.control.manoeuvre import load_manoeuvre
 from cfb_mjx.documents import load_yaml, parse_yaml, told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
@@ -24,7 +24,7 @@ from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file, load_randomisation
 from cfb_mjx.sweep import load_sweep, tasks_of
 from cfb_mjx.train.config import FlipTrainingConfig, TrainingConfig, load_config, with_changes
-from cfb_mjx.train.plants import load_plants
+from cfb_mjx.train.flying import load_plants
 
 SWEEP = {
     "format": "cfb_mjx sweep 1",

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from cfb_mjx.bench.operations import operations
+from cfb_mjx.bench.roofline import operations
 
 X = jnp.ones(10, jnp.float32)
 

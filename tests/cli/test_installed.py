@@ -24,7 +24,7 @@ Quadrotor.from_file("cf21b-500", body=MjxBody(floor=True))
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.train import load_config
-from cfb_mjx.train.plants import load_plants
+from cfb_mjx.train.flying import load_plants
 assert list(shipped_policies()) == expected["policies"]
 assert shipped("data", "study", "ppo", "1-0.npz").exists()
 for policy in shipped_policies().values():

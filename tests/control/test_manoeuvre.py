@@ -9,8 +9,19 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cfb_mjx.control.manoeuvre import CATCH, CLIMB, TURN, Knobs, Manoeuvre, roll_angle, unwrapped
-from cfb_mjx.control.manoeuvre_file import ManoeuvreFile, load_manoeuvre, save_manoeuvre, shipped_manoeuvres
+from cfb_mjx.control.manoeuvre import (
+    CATCH,
+    CLIMB,
+    TURN,
+    Knobs,
+    Manoeuvre,
+    ManoeuvreFile,
+    load_manoeuvre,
+    roll_angle,
+    save_manoeuvre,
+    shipped_manoeuvres,
+    unwrapped,
+)
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.envs import Estimate, Layout
 from cfb_mjx.envs.flip import FLIP_LAYOUT

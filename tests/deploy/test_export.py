@@ -16,13 +16,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cfb_mjx.cli import main
-from cfb_mjx.control.manoeuvre_file import load_manoeuvre
+from cfb_mjx.control.manoeuvre import load_manoeuvre
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy, shipped_policies
 from cfb_mjx.deploy import compare, compile_policy, cortex, export_policy, fly_beside
+from cfb_mjx.deploy.check import begin, random_inputs
 from cfb_mjx.deploy.deployment import Deployment, find_deployment
 from cfb_mjx.deploy.export import literal
-from cfb_mjx.deploy.parity import begin, random_inputs
 from cfb_mjx.envs import Layout
 from cfb_mjx.envs.flip import FLIP_LAYOUT
 from cfb_mjx.errors import CfbError

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from cfb_mjx.engine.groups import LANES, grouped
+from cfb_mjx.engine.batching import LANES, grouped
 from cfb_mjx.model import ParasiticDrag, Quadrotor, begin, rollout, rollout_final, step
 from cfb_mjx.model.effects.catalogue import CATALOGUE
 from cfb_mjx.model.vector import Vec

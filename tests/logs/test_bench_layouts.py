@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs.bench_columns import in_si
-from cfb_mjx.logs.bench_layouts import read_bench_table, recognises
-from cfb_mjx.logs.bench_points import SteadyPoints, joined
-from cfb_mjx.logs.bench_tables import MapTable, MotorRecord
+from cfb_mjx.logs.bench_layouts import in_si, read_bench_table, recognises
+from cfb_mjx.logs.bench_tables import MapTable, MotorRecord, SteadyPoints, joined
 from cfb_mjx.logs.tabular import Table, read_table
-from cfb_mjx.sysid.rotors.steady import fit_steady
+from cfb_mjx.sysid.rotors.tables import fit_steady
 
 KF, RPM = 3.72e-8, 30 / np.pi
 RNG = np.random.default_rng(3)

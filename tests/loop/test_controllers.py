@@ -11,15 +11,21 @@ from scipy.spatial.transform import Rotation
 from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.errors import CfbError
 from cfb_mjx.loop import flights, trials
-from cfb_mjx.loop.controllers import controller_of
 from cfb_mjx.loop.flights import FIT, HELD_OUT, fly_campaign
-from cfb_mjx.loop.trials import figure_eight, fly_trials
+from cfb_mjx.loop.trials import controller_of, figure_eight, fly_trials
 from cfb_mjx.reference_simulator import Case, physics
 from cfb_mjx.reference_simulator import constants as c
 from cfb_mjx.reference_simulator.airframe import P, Q, V
-from cfb_mjx.reference_simulator.controller import POSITION, SETPOINT_COLUMNS, VELOCITY, YAW_ANGLE, YAW_RATE
+from cfb_mjx.reference_simulator.controller import (
+    POSITION,
+    SETPOINT_COLUMNS,
+    VELOCITY,
+    YAW_ANGLE,
+    YAW_RATE,
+    OtherController,
+    relative,
+)
 from cfb_mjx.reference_simulator.manoeuvres import MANOEUVRES
-from cfb_mjx.reference_simulator.other_controller import OtherController, relative
 from cfb_mjx.reference_simulator.sensors import QUIET, draw_instruments
 from cfb_mjx.reference_simulator.simulation import Lane, simulate
 

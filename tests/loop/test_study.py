@@ -11,8 +11,8 @@ import pytest
 from cfb_mjx.commands import DemoLoop
 from cfb_mjx.errors import CfbError
 from cfb_mjx.loop import steps
-from cfb_mjx.loop.cells import Cell, cells_of
 from cfb_mjx.loop.page import TITLE, lead, loop_figure, sections
+from cfb_mjx.loop.steps import Cell, cells_of
 from cfb_mjx.loop.study import study
 from cfb_mjx.loop.summary import summarise
 from cfb_mjx.reference_simulator import EFFECTS

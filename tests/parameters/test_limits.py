@@ -41,7 +41,7 @@ from cfb_mjx.sysid.refinement import free_numbers, plausible_numbers
 from cfb_mjx.sysid.sensor_faults import ATTRIBUTES, LIMITS, SensorFaults
 from cfb_mjx.sysid.tracing.hypothesis import bounds
 from cfb_mjx.train.config import load_config
-from cfb_mjx.train.plants import load_plants
+from cfb_mjx.train.flying import load_plants
 from cfb_mjx.train.run import Training
 
 GUARDS = load_model_file("cfb-guards")

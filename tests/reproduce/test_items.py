@@ -18,9 +18,8 @@ from cfb_mjx.files import shipped
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.reproduce import ITEMS, brushed, manoeuvres
-from cfb_mjx.reproduce.document import markdown, page
 from cfb_mjx.reproduce.flights import Given, generated, real_flights
-from cfb_mjx.reproduce.item import Result, Row
+from cfb_mjx.reproduce.item import Result, Row, markdown, page
 from cfb_mjx.reproduce.manoeuvres import bands
 from cfb_mjx.train.flying import STEP_DISTANCE_M, back_and_forth, six_metres
 

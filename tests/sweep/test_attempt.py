@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cfb_mjx.sweep.attempt import TaskFault, attempt
+from cfb_mjx.sweep.drive import TaskFault, attempt
 from cfb_mjx.sweep.folder import open_folder, read_record
 from cfb_mjx.sweep.tasks import Task
 

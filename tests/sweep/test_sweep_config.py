@@ -13,9 +13,8 @@ from cfb_mjx.commands.line import parse
 from cfb_mjx.documents import shipped_names
 from cfb_mjx.errors import CfbError
 from cfb_mjx.sweep import load_sweep, tasks_of
-from cfb_mjx.sweep.kinds import CHOSEN_HERE, EXTRA_FILES, KINDS
-from cfb_mjx.sweep.naming import LONGEST, name_of
-from cfb_mjx.sweep.parameters import Parameters
+from cfb_mjx.sweep.config import CHOSEN_HERE, EXTRA_FILES, KINDS, Parameters
+from cfb_mjx.sweep.tasks import LONGEST, name_of
 
 FLY = {"command": "fly", "arguments": {"controller": "pid"}, "over": {"seed": [0, 1]}}
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from cfb_mjx.sysid.tracing.evidence import Evidence
-from cfb_mjx.sysid.tracing.fits import ERRORS
 from cfb_mjx.sysid.tracing.hypothesis import Fit
+from cfb_mjx.sysid.tracing.jointly import ERRORS
 from cfb_mjx.sysid.tracing.rules import RULES
 
 COUNT = len(ERRORS)

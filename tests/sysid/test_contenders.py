@@ -8,8 +8,8 @@ import pytest
 
 from cfb_mjx.sysid.tracing import trace
 from cfb_mjx.sysid.tracing.evidence import Evidence
-from cfb_mjx.sysid.tracing.fits import ERRORS
 from cfb_mjx.sysid.tracing.hypothesis import Fit, Hypothesis
+from cfb_mjx.sysid.tracing.jointly import ERRORS
 from cfb_mjx.sysid.tracing.rules import RULES
 
 NOTHING = Fit(SimpleNamespace(present=()), None, np.ones(len(ERRORS)), np.ones((1, len(ERRORS))))

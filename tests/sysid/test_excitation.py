@@ -12,9 +12,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import read_log
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.sysid.excitation.conditions import Conditions
 from cfb_mjx.sysid.excitation.design import Problem, optimise, slopes
-from cfb_mjx.sysid.excitation.experiment import fly
+from cfb_mjx.sysid.excitation.experiment import Conditions, fly
 from cfb_mjx.sysid.excitation.information import linearise, log_determinant, marginal_std, predict
 from cfb_mjx.sysid.excitation.manoeuvres import (
     Limits,
@@ -26,8 +25,7 @@ from cfb_mjx.sysid.excitation.manoeuvres import (
     stepped,
     worst,
 )
-from cfb_mjx.sysid.excitation.safety import attained
-from cfb_mjx.sysid.excitation.trials import FLIGHTS
+from cfb_mjx.sysid.excitation.trials import FLIGHTS, attained
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.unknowns import choose
 

@@ -14,12 +14,11 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid.identification import fitting
-from cfb_mjx.sysid.identification.feedback import detect
+from cfb_mjx.sysid.identification.filters import detect
 from cfb_mjx.sysid.identification.fitting import fit
 from cfb_mjx.sysid.identification.flight_data import prepare
 from cfb_mjx.sysid.identification.noise import Noise
-from cfb_mjx.sysid.identification.robust import OUTLIER, tempered
-from cfb_mjx.sysid.identification.solver import RIDGE
+from cfb_mjx.sysid.identification.solver import OUTLIER, RIDGE, tempered
 from cfb_mjx.sysid.identification.uncertainty import assess
 from cfb_mjx.sysid.identification.unknowns import choose
 

@@ -13,11 +13,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import read_log
 from cfb_mjx.logs.bench_tables import record_of
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.sysid.rotors.common_lag import common_lag
-from cfb_mjx.sysid.rotors.motor_likelihood import first_guess, maximise
-from cfb_mjx.sysid.rotors.motor_replay import replay
-from cfb_mjx.sysid.rotors.motor_tracks import ROWS, gather
-from cfb_mjx.sysid.rotors.motors import chi_square_tail, fit_motors
+from cfb_mjx.sysid.rotors.motor_filter import ROWS, first_guess, gather, maximise
+from cfb_mjx.sysid.rotors.motors import chi_square_tail, common_lag, fit_motors, replay
 from cfb_mjx.sysid.rotors.supply import fit_with_sag
 
 # They share fixtures and compiled programs.

@@ -14,9 +14,18 @@ from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import BladeFlapping
 from cfb_mjx.parameters import load_model_file
 from cfb_mjx.sysid import evaluate
-from cfb_mjx.sysid.nanodrone import QUANTITIES, Contestant, benchmark
+from cfb_mjx.sysid.nanodrone import (
+    QUANTITIES,
+    STRIDE,
+    Contestant,
+    benchmark,
+    benchmark_score,
+    levels_of,
+    scaled,
+    score,
+    tune_observer,
+)
 from cfb_mjx.sysid.observer import Observer, fit_observer, observe
-from cfb_mjx.sysid.observer_tuning import STRIDE, benchmark_score, levels_of, scaled, score, tune_observer
 
 # They share fixtures and compiled programs.
 pytestmark = pytest.mark.xdist_group("observer")

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.sysid.rotors.map_shape import shape_of
-from cfb_mjx.sysid.rotors.rotor_maps import fit_map
+from cfb_mjx.sysid.rotors.rotor_maps import fit_map, shape_of
 
 PAPER_THRUST, PAPER_TORQUE = np.array([-0.23, 0.562, -0.043]), 1e-4 * np.array([-3.4, 8.7, 2.9])
 

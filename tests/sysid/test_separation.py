@@ -8,9 +8,9 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import GroundEffect, Wind
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.sysid.excitation.conditions import Conditions
-from cfb_mjx.sysid.excitation.paths import PATHS, SECONDS, path
-from cfb_mjx.sysid.excitation.separation import Told, assumed, separate
+from cfb_mjx.sysid.excitation.experiment import Conditions
+from cfb_mjx.sysid.excitation.information import Told, assumed, separate
+from cfb_mjx.sysid.excitation.manoeuvres import PATHS, SECONDS, path
 
 # Shares compiled programs with the tracing tests.
 pytestmark = pytest.mark.xdist_group("tracing")

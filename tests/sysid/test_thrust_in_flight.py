@@ -12,7 +12,7 @@ import pytest
 
 from cfb_mjx.logs import FlightLog, read_log
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.sysid.rotors.thrust_in_flight import thrust_in_flight
+from cfb_mjx.sysid.rotors.flown_motors import thrust_in_flight
 
 GENERATOR = Path(__file__).resolve().parents[3] / "shared" / "cases" / "fit" / "make_fit_logs.py"
 PAPER = load_model_file("cfb-guards").parameters()

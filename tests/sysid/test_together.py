@@ -18,16 +18,15 @@ from cfb_mjx.sysid.rotors.flown_motors import Told, flown_motors
 from cfb_mjx.sysid.sensor_faults import HEALTHY
 from cfb_mjx.sysid.tracing import closing, motors
 from cfb_mjx.sysid.tracing.evidence import Evidence, alike
-from cfb_mjx.sysid.tracing.fits import beside_hold
 from cfb_mjx.sysid.tracing.hypothesis import Fit, strengths
+from cfb_mjx.sysid.tracing.jointly import beside_hold
 from cfb_mjx.sysid.tracing.motors import MOTORS, motors_of
 from cfb_mjx.sysid.tracing.rules import Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.together import _with, fit_together, names_to_fit, of_type, paired
 from cfb_mjx.sysid.tracing.trace import Trace
-from cfb_mjx.view import closing_sections
-from cfb_mjx.view.closing_words import verdict
+from cfb_mjx.view.closing import _held, verdict
 
 pytestmark = pytest.mark.xdist_group("together")
 
@@ -205,7 +204,7 @@ def test_what_was_declared_of_the_motors_and_left_the_model_is_said(closed):
     found = changed.to_json()
     assert found["dropped"] == ["motor_asymmetry"]
     assert found["motors"]["motor_gain"]["value"] == [1.1] * 4
-    assert "constants were fitted anew): motor_asymmetry." in closing_sections._held(changed)
+    assert "constants were fitted anew): motor_asymmetry." in _held(changed)
 
 
 def test_the_first_paragraph_says_what_the_drone_has_what_it_buys_and_what_to_do(closed):
@@ -284,4 +283,4 @@ def test_what_moved_within_the_type_is_written_with_its_own_number(closed, whole
     assert item["parameters"]["relative"] == pytest.approx(own.parameters["relative"], abs=0.01)
     assert item["spread"] == {"relative": 0.2}
     assert item["uncertainty"]["relative"] > 0
-    assert "Changed within the spread of the type: thrust_scale." in closing_sections._held(typed)
+    assert "Changed within the spread of the type: thrust_scale." in _held(typed)

@@ -23,10 +23,9 @@ from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.closing import close_loop
 from cfb_mjx.sysid.tracing.evidence import dealt, evidence
-from cfb_mjx.sysid.tracing.fits import as_it_is
 from cfb_mjx.sysid.tracing.formula import with_library
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis, moved, neutral_effects, shapes, strengths, term_columns
-from cfb_mjx.sysid.tracing.jointly import beside_each_other, everything, needless, one_by_one, told_apart
+from cfb_mjx.sysid.tracing.jointly import as_it_is, beside_each_other, everything, needless, one_by_one, told_apart
 from cfb_mjx.sysid.tracing.named_effects import fit_named_effects
 from cfb_mjx.sysid.tracing.residuals import find_spectral_lines, residual_rows
 from cfb_mjx.sysid.tracing.search import Search

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from cfb_mjx.control.manoeuvre import CATCH, CLIMB, TURN, Manoeuvre
-from cfb_mjx.control.manoeuvre_file import load_manoeuvre
+from cfb_mjx.control.manoeuvre import CATCH, CLIMB, TURN, Manoeuvre, load_manoeuvre
 from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.deploy.deployment import find_deployment
 from cfb_mjx.envs import TargetTask
@@ -19,10 +18,8 @@ from cfb_mjx.logs.gate import judge
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_randomisation
 from cfb_mjx.train.config import FlipTrainingConfig, config_from, load_config
-from cfb_mjx.train.flight_logs import flight_log
-from cfb_mjx.train.flip_search import Goal, bounds, search, shortfall
-from cfb_mjx.train.flips import FLIP_S, FLIPS, flips, measure, replay
-from cfb_mjx.train.flying import Flight, fly
+from cfb_mjx.train.flips import FLIP_S, FLIPS, Goal, bounds, flips, measure, replay, search, shortfall
+from cfb_mjx.train.flying import Flight, flight_log, fly
 from cfb_mjx.train.run import POLICY, Training, train
 from tests import helpers
 

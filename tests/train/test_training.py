@@ -21,8 +21,7 @@ from cfb_mjx.train import run
 from cfb_mjx.train.analytic import Analytic
 from cfb_mjx.train.brax_compat import brax_ppo, parts
 from cfb_mjx.train.config import AnalyticSettings, PpoSettings, load_config
-from cfb_mjx.train.flying import Hover
-from cfb_mjx.train.plants import load_plants
+from cfb_mjx.train.flying import Hover, load_plants
 from cfb_mjx.train.ppo import Ppo, beside_copies
 from cfb_mjx.train.run import BEST, CHECKPOINT, CURVE, POLICY, UPDATES, Training, segments, train
 from tests.helpers import SMALL_TRAINING, watch_keys

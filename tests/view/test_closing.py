@@ -17,17 +17,15 @@ from cfb_mjx.plugins import plugged
 from cfb_mjx.sysid import evaluate
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.diagnosis import Diagnosis, Reported, Unexplained
-from cfb_mjx.sysid.tracing.fits import Verdict
 from cfb_mjx.sysid.tracing.formula import Term
+from cfb_mjx.sysid.tracing.jointly import Verdict
 from cfb_mjx.sysid.tracing.residuals import UNITS, Smoother, residual_rows
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 from cfb_mjx.sysid.tracing.structure import BLOCK, OFFSET, binned, edges_of, explained, noise_floor, sensor_levels
 from cfb_mjx.sysid.tracing.trace import Found, Trace
-from cfb_mjx.view import closing_sections as sections
-from cfb_mjx.view import closing_words as words
-from cfb_mjx.view.closing import write_report
-from cfb_mjx.view.closing_sections import next_flights
+from cfb_mjx.view import closing
+from cfb_mjx.view.closing import next_flights, write_report
 from tests.own_effect import AIR_DRAG
 from tests.rerun_command import rerun
 from tests.simulated_log import noisy, simulated_log
@@ -96,7 +94,7 @@ def test_page_stands_alone_and_says_what_the_outcome_says(folder, diagnosis):
         assert expected in text
     # What looks alike is named together with the flight that would tell.
     assert "parasitic_drag" in text
-    assert words.experiment("parasitic_drag")[1:] in text
+    assert closing.experiment("parasitic_drag")[1:] in text
     before, after = diagnosis.before.metrics("commands_in"), diagnosis.after.metrics("commands_in")
     low, high = diagnosis.after.intervals("commands_in")["velocity_rmse_mps@0.5s"]
     assert f"{before['velocity_rmse_mps@0.5s']:.3g} [" in text
@@ -202,17 +200,17 @@ def without_structure(diagnosis):
 
 def test_nothing_and_unexplained_in_words(diagnosis):
     nothing = replace(diagnosis, reported=[])
-    assert words.verdict(nothing) == "Nothing is missing beyond chance."
+    assert closing.verdict(nothing) == "Nothing is missing beyond chance."
     term = Term("force_x", "x", "N / (m)", 0.01, 0.001, 30.0)
     nothing.unexplained = Unexplained(SimpleNamespace(terms=[term]), [])
-    assert "no effect of the catalogue accounts for: force_x follows x." in words.verdict(nothing)
+    assert "no effect of the catalogue accounts for: force_x follows x." in closing.verdict(nothing)
 
 
 def test_what_only_the_held_out_flights_show_is_flagged_and_asked_for(diagnosis):
     term = Term("torque_x", "v_x w_z", "N m / (m rad/s^2)", 5e-5, 5e-6, 90.0)
     found = without_structure(replace(diagnosis, unexplained=Unexplained(None, [], [term])))
     where = "in the held-out flights only, torque_x follows v_x w_z"
-    assert f"accounts for: {where}." in words.verdict(found)
+    assert f"accounts for: {where}." in closing.verdict(found)
     report = found.to_json()
     assert report["unexplained"] is True
     assert report["unexplained_because"] == where
@@ -223,7 +221,7 @@ def test_what_only_the_held_out_flights_show_is_flagged_and_asked_for(diagnosis)
     assert found.model_file("drone", {}) == diagnosis.model_file("drone", {})
     assert any("like the held-out ones" in text and where in text for text in next_flights(found))
     fault = replace(diagnosis, reported=diagnosis.reported[:1])
-    assert "fault, not the physics" in words.verdict(fault)
+    assert "fault, not the physics" in closing.verdict(fault)
 
 
 def test_every_effect_has_words():
@@ -231,7 +229,7 @@ def test_every_effect_has_words():
         assert item.meaning
         assert item.experiment
     for signal in (OFFSET, *UNITS):
-        assert any(signal.startswith(key) for key in words.FOLLOWS), signal
+        assert any(signal.startswith(key) for key in closing.FOLLOWS), signal
 
 
 def test_an_effect_from_outside_is_spoken_of_by_what_it_says_of_itself(diagnosis, tmp_path):
@@ -242,13 +240,13 @@ def test_an_effect_from_outside_is_spoken_of_by_what_it_says_of_itself(diagnosis
     own = without_structure(replace(diagnosis, reported=[item], unconfirmed=[replace(item, found=None)]))
     line = "F = -coefficient v, with v the velocity in body axes"
     with plugged(tmp_path / "my effects.py"):
-        assert f"air_drag the model lacks ({line}): coefficient 0.010 ± 0.010 N s/m" in words.verdict(own)
+        assert f"air_drag the model lacks ({line}): coefficient 0.010 ± 0.010 N s/m" in closing.verdict(own)
         flights = "\n".join(next_flights(own))
-        assert words.experiment("air_drag") == "flights that excite air_drag"
+        assert closing.experiment("air_drag") == "flights that excite air_drag"
         assert "Flights that excite air_drag. Why: this shows air_drag, and not rotor_drag; " in flights
         assert "air_drag is known to 100 % only; air_drag was found, but not confirmed" in flights
         assert f"--between air_drag,rotor_drag --model model.yaml --plugin '{tmp_path}/my effects.py' -o" in flights
-        sentence = sections._sentence(item)
+        sentence = closing._sentence(item)
         assert sentence.count(line) == 1
         assert "cannot tell which of this set it is: air_drag, rotor_drag" in sentence
 
@@ -264,7 +262,7 @@ def test_an_effect_from_outside_is_spoken_of_by_what_it_says_of_itself(diagnosis
     ],
 )
 def test_numbers_have_the_digits_they_deserve(value, std, unit, expected):
-    assert words.with_error(value, std, unit) == expected
+    assert closing.with_error(value, std, unit) == expected
 
 
 @pytest.mark.parametrize(
@@ -281,4 +279,4 @@ def test_numbers_have_the_digits_they_deserve(value, std, unit, expected):
 )
 def test_a_report_says_where_the_evidence_lies(domains, words):
     item = Reported("rotor_drag", 1e-9, {}, {}, verdict=Verdict(1.0, 9.0, 1e-9, domains))
-    assert sections._where(item).endswith(words)
+    assert closing._where(item).endswith(words)

@@ -105,8 +105,7 @@ class CloseLoop(Command):
         from cfb_mjx.parameters import load_model_file, save_model_file
         from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
         from cfb_mjx.sysid.tracing.closing import close_loop
-        from cfb_mjx.view.closing import write_report
-        from cfb_mjx.view.closing_words import separating, verdict
+        from cfb_mjx.view.closing import separating, verdict, write_report
         from cfb_mjx.view.style import with_vector_copies
 
         base = load_model_file(self.model, self.set)

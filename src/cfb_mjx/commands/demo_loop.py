@@ -65,7 +65,7 @@ class DemoLoop(Command):
         Raises:
             CfbError: an unknown effect, a folder with results of other settings, or a folder that cannot be written.
         """
-        from cfb_mjx.loop.cells import cells_of
+        from cfb_mjx.loop.steps import cells_of
 
         cells = cells_of(self.effects, self.seeds, self.seed)
         require_no_file(self.output)

@@ -26,7 +26,7 @@ from cfb_mjx.files import VectorFormat, output_folder, require_folder, require_n
 
 if TYPE_CHECKING:
     from cfb_mjx.logs import FlightLog
-    from cfb_mjx.sysid.excitation.conditions import Conditions
+    from cfb_mjx.sysid.excitation.experiment import Conditions
 
 _NOT_OF_PATHS = ("duration", "rate_limit", "altitude_loss", "parameters", "repetitions", "format")
 """Options that ``separate`` does not use."""
@@ -114,7 +114,7 @@ class Separated(Result):
     json: Path | None
 
     def __str__(self) -> str:
-        from cfb_mjx.sysid.excitation.paths import PATHS
+        from cfb_mjx.sysid.excitation.manoeuvres import PATHS
 
         between = " against ".join(self.numbers["between"])
         lines = [f"evidence from one flight of each path for {between}, in nats (10 are enough):\n"]
@@ -203,7 +203,7 @@ class Excite(Command):
         from cfb_mjx.runtime import Progress, configure_jax
 
         configure_jax(x64=True)
-        from cfb_mjx.sysid.excitation.conditions import Conditions
+        from cfb_mjx.sysid.excitation.experiment import Conditions
 
         conditions = Conditions(measured_rotors=self.measured_rotors, disturbance=self.disturbance)
         if names:
@@ -263,8 +263,8 @@ class Excite(Command):
         from cfb_mjx.model import Quadrotor
         from cfb_mjx.parameters import load_model_file
         from cfb_mjx.runtime import environment
-        from cfb_mjx.sysid.excitation.paths import setpoints_csv
-        from cfb_mjx.sysid.excitation.separation import separate
+        from cfb_mjx.sysid.excitation.information import separate
+        from cfb_mjx.sysid.excitation.manoeuvres import setpoints_csv
 
         described = load_model_file(self.model, self.set)
         told = separate(Quadrotor.from_file(described), names, conditions, progress=progress)

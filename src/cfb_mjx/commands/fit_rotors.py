@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from cfb_mjx.sysid.rotors.fitting import RotorFit
     from cfb_mjx.sysid.rotors.motors import GroupFit
     from cfb_mjx.sysid.rotors.rotor_maps import MapFit
-    from cfb_mjx.sysid.rotors.steady import SteadyFit
+    from cfb_mjx.sysid.rotors.tables import SteadyFit
 
 _LIMIT = "the model file has one time constant per motor and no dead time"
 _UNITS = {"thrust": "N", "torque": "N m"}
@@ -213,7 +213,7 @@ class FitRotors(Command):
             if self.json is not None:
                 write_json(self.json, result.numbers)
             if self.figure is not None:
-                from cfb_mjx.sysid.rotors.motor_replay import replay
+                from cfb_mjx.sysid.rotors.motors import replay
                 from cfb_mjx.view.rotors import rotor_figure
 
                 replays = replay(found.motors) if found.motors else []

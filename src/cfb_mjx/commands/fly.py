@@ -190,7 +190,7 @@ class Fly(Command):
             if self.json is not None:
                 write_json(self.json, numbers)
             if any(self._shown.values()):
-                from cfb_mjx.view.flown import write_flights
+                from cfb_mjx.view.flight import write_flights
 
                 title = f"{name}, {task}, {self.model}"
                 # Not None: `_check` allows these files only for flights of one model.
@@ -224,7 +224,7 @@ class Fly(Command):
         if self.on is None:
             return fly(nominal)
         from cfb_mjx.runtime import Progress
-        from cfb_mjx.train.plants import load_plants
+        from cfb_mjx.train.flying import load_plants
 
         drones, bar, found = load_plants(described, self.on), Progress("flying"), {}
         for name, drone in drones.items():
@@ -248,12 +248,10 @@ class Fly(Command):
             CfbError: not a flip policy, a holder that is not a target policy, or invalid settings of the flip.
         """
         from cfb_mjx.control.controllers import find_controller, is_flip_policy
-        from cfb_mjx.control.manoeuvre import Manoeuvre
-        from cfb_mjx.control.manoeuvre_file import load_manoeuvre, save_manoeuvre
+        from cfb_mjx.control.manoeuvre import Manoeuvre, load_manoeuvre, save_manoeuvre
         from cfb_mjx.control.neural import NeuralController
         from cfb_mjx.runtime import Progress
-        from cfb_mjx.train.flip_search import Goal, improved
-        from cfb_mjx.train.flips import FLIPS
+        from cfb_mjx.train.flips import FLIPS, Goal, improved
 
         if not isinstance(turner, NeuralController) or not is_flip_policy(turner):
             raise CfbError(

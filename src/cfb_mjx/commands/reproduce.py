@@ -93,7 +93,7 @@ class Reproduce(Command):
         configure_jax(x64=False)
         from cfb_mjx.reproduce import ITEMS
         from cfb_mjx.reproduce.flights import Given, require_real
-        from cfb_mjx.reproduce.kept import NUMBERS, PAGE, TEXT, keep, kept_in
+        from cfb_mjx.reproduce.item import NUMBERS, PAGE, TEXT, keep, kept_in
         from cfb_mjx.view.style import with_vector_copies
 
         chosen = self._chosen(ITEMS)

@@ -18,9 +18,8 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.control.controllers import Controller
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.engine.batching import axes, differentiated_as, examples, one_of_many
+from cfb_mjx.engine.batching import LANES, PACKED_BYTES, axes, differentiated_as, examples, grouped, one_of_many
 from cfb_mjx.engine.cpu_kernel import one_kernel
-from cfb_mjx.engine.groups import LANES, PACKED_BYTES, grouped
 from cfb_mjx.envs.observation import Estimate, observation, remember
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.rollout import fits_one_kernel, fly_rows, in_components

@@ -10,6 +10,9 @@ Two things differ. First, the count of a motor is its command, u = count / 65535
 compensation, which otherwise treats a count as a thrust. Second, `FirmwarePid.hovering` sets the base thrust to the
 count that hovers: the firmware's own 30000 stands for a thrust, and without the compensation the drone hovers only once
 the integrator has found the difference.
+
+`update` steps three parallel loops of the firmware's ``pid.c``. `PositionHold` holds positions, for code that flies a
+drone with any controller.
 """
 
 from __future__ import annotations
@@ -18,12 +21,77 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from cfb_mjx.control.loop import Gains, Memory, gains, update
 from cfb_mjx.model.rotors import hover_command
 from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.parameters import Parameters
+
+
+class Gains(eqx.Module):
+    """Gains and limits of three parallel loops."""
+
+    kp: tuple[float, float, float]
+    ki: tuple[float, float, float]
+    kd: tuple[float, float, float]
+    integral_limit: tuple[float, float, float]
+    """Limit of the integral of the error, before ``ki``; error unit times s."""
+    output_limit: tuple[float, float, float]
+
+
+def gains(kp, ki=(0, 0, 0), kd=(0, 0, 0), integral_limit=(5000,) * 3, output_limit=(float("inf"),) * 3) -> Gains:
+    """Build `Gains` from numbers; the defaults are the firmware's."""
+    return Gains(*map(_three, (kp, ki, kd, integral_limit, output_limit)))
+
+
+def _three(numbers) -> tuple[float, float, float]:
+    x, y, z = map(float, numbers)
+    return x, y, z
+
+
+class Memory(eqx.Module):
+    """Integral of the error, and the measurement of the previous step."""
+
+    integral: Float[Array, "3"]
+    previous: Float[Array, "3"]
+
+
+def update(
+    gains: Gains,
+    memory: Memory,
+    error: Float[Array, "3"],
+    measured: Float[Array, "3"],
+    dt: float,
+    wraps: Bool[AnyArray, "3"] | bool = False,
+) -> tuple[Memory, Float[Array, "3"]]:
+    """One step: proportional and integral of the error, derivative of the measurement.
+
+    The integral enters the output of the same step. It is limited, but does not stop while the output saturates.
+
+    Args:
+        gains: gains of the three loops.
+        memory: memory of the previous step.
+        error: wanted minus measured value.
+        measured: measurement, of which the derivative is taken.
+        dt: time since the previous step, s.
+        wraps: which channels are angles in deg, with differences along the shorter arc.
+
+    Returns:
+        The new memory and the output.
+    """
+    kp, ki, kd, integral_limit, output_limit = (jnp.asarray(x, error.dtype) for x in vars(gains).values())
+    error = jnp.where(wraps, _short_way(error), error)
+    change = measured - memory.previous
+    change = jnp.where(wraps, _short_way(change), change)
+    integral = jnp.clip(memory.integral + dt * error, -integral_limit, integral_limit)
+    output = kp * error + ki * integral - kd * change / dt
+    return Memory(integral, measured), jnp.clip(output, -output_limit, output_limit)
+
+
+def _short_way(angle_deg):
+    # Equal to the angle modulo a full turn; the derivative is one.
+    return angle_deg - 360.0 * jnp.round(angle_deg / 360.0)
+
 
 COUNTS = 65535.0
 DT = 0.002
@@ -208,3 +276,23 @@ def _signals(measurement: State):
 def _heading_frame(vector: Float[AnyArray, "3"], yaw: Float[Array, ""]) -> Float[Array, "3"]:
     c, s = jnp.cos(yaw), jnp.sin(yaw)
     return jnp.stack([c * vector[0] + s * vector[1], c * vector[1] - s * vector[0], vector[2]])
+
+
+class PositionHold(eqx.Module):
+    """Hold positions with a `FirmwarePid`."""
+
+    pid: FirmwarePid
+
+    def start(self, measurement: State) -> PidState:
+        """Return the memory at the first measurement."""
+        return init(self.pid, measurement)
+
+    def resume(self, memory: PidState, measurement: State) -> PidState:
+        """Return the memory for taking over again."""
+        return resume(self.pid, memory, measurement)
+
+    def command(
+        self, memory: PidState, measurement: State, position: Float[Array, "3"], yaw: Float[Array, ""] | float = 0.0
+    ) -> tuple[PidState, Float[Array, "4"]]:
+        """New memory and command to hold ``position`` [m, world] and ``yaw`` [rad]; call it every `pid.DT` seconds."""
+        return step(self.pid, memory, measurement, Setpoint.hover(position, yaw))

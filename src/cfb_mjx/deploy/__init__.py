@@ -1,10 +1,9 @@
 """Export of trained policies as C for the drone, and the check that the C computes the same commands."""
 
+from cfb_mjx.deploy.check import compare, fly_beside
 from cfb_mjx.deploy.compiled import CompiledPolicy, compile_policy
 from cfb_mjx.deploy.contract import contract
 from cfb_mjx.deploy.export import Exported, export_policy
-from cfb_mjx.deploy.flights import fly_beside
-from cfb_mjx.deploy.parity import compare
 
 __all__ = [
     "CompiledPolicy",

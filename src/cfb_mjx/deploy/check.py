@@ -1,16 +1,190 @@
-"""Check an exported policy: does it compute what it computes in JAX, and what does a step cost on the drone."""
+"""Check an exported policy: does it compute what it computes in JAX, and what does a step cost on the drone.
+
+Three comparisons: commands on random estimates in independent sequences, flights of the compiled C in closed loop with
+the simulated drone beside those of the JAX policy with the same noise, and the cost of a step.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
+from cfb_mjx.control.manoeuvre import Manoeuvre
+from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.deploy import cortex
 from cfb_mjx.deploy.compiled import FLAGS, CompiledPolicy, compile_policy
+from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.deploy.export import Exported
-from cfb_mjx.deploy.flights import fly_beside
-from cfb_mjx.deploy.parity import TOLERANCE, begin, compare, random_inputs
+from cfb_mjx.envs import Estimate, TargetTask, Task
+from cfb_mjx.envs.episode import Episode, reset, step, with_room
+from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.model.state import State
+from cfb_mjx.optional import not_none
+
+SEQUENCES, STEPS = 10_000, 12
+TOLERANCE = 1e-5
+"""Largest difference of a command in [0, 1]."""
+
+
+class Parity(NamedTuple):
+    """Differences between the commands of C and JAX."""
+
+    sequences: int
+    steps: int
+    largest: float
+    """Largest difference of a command, over all sequences, steps and motors."""
+    mean: float
+
+
+def compare(
+    deployment: Deployment, compiled: CompiledPolicy, sequences: int = SEQUENCES, steps: int = STEPS, seed: int = 0
+) -> Parity:
+    """Run both on the same random estimates, each sequence after a reset, and compare every command.
+
+    Args:
+        deployment: the exported policies; a flip begins with the first step.
+        compiled: the compiled C.
+        sequences: number of sequences.
+        steps: steps per sequence, more than the number of commands in a policy's history.
+        seed: seed of the estimates.
+    """
+    inputs = random_inputs(np.random.default_rng(seed), sequences, steps)
+    expected = np.asarray(
+        _commands(deployment.controller, jnp.float32(deployment.hover_command()), jnp.asarray(inputs))
+    )
+    found = np.empty_like(expected)
+    for i in range(sequences):
+        begin(deployment, compiled)
+        found[i] = compiled.steps(inputs[i])
+    difference = np.abs(found.astype(float) - expected)
+    return Parity(sequences, steps, float(difference.max()), float(difference.mean()))
+
+
+def begin(deployment: Deployment, compiled: CompiledPolicy) -> None:
+    """Reset the policy; a flip begins with the next step."""
+    compiled.reset()
+    if deployment.flips:
+        knobs = not_none(deployment.manoeuvre).knobs
+        compiled.set_flip(float(knobs.speed_mps), float(knobs.rate_radps))
+
+
+def random_inputs(generator: np.random.Generator, sequences: int, steps: int) -> np.ndarray:
+    """Random estimates, (sequences, steps, 16), float32: near and far, slow and fast, any attitude."""
+    # Half of the sequences hover about their targets, the others are anywhere.
+    wide = np.where(np.arange(sequences) % 2, 1.0, 0.05)[:, None, None]
+    shape = sequences, steps
+    target = generator.uniform(-3, 3, (sequences, 1, 3)) * np.ones((*shape, 1))
+    position = target + 6 * wide * generator.standard_normal((*shape, 3))
+    velocity = 4 * wide * generator.standard_normal((*shape, 3))
+    rotation = generator.standard_normal((*shape, 3)) * np.pi * wide
+    angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
+    quaternion = np.concatenate([np.cos(angle / 2), rotation / angle * np.sin(angle / 2)], axis=-1)
+    body_rate = 12 * wide * generator.standard_normal((*shape, 3))
+    return np.concatenate([position, velocity, quaternion, body_rate, target], axis=-1).astype(np.float32)
+
+
+@eqx.filter_jit
+def _commands(controller, hover, inputs):
+    def one(rows):
+        def estimate(row):
+            return Estimate(row[:3] - row[13:], row[3:6], row[6:10], row[10:13])
+
+        def step(memory, row):
+            return controller.command(memory, estimate(row))
+
+        first = controller.start(estimate(rows[0]), jnp.full(4, hover))
+        return jax.lax.scan(step, first, rows)[1]
+
+    return jax.vmap(one)(inputs)
+
+
+Flier = NeuralController | Manoeuvre
+
+
+class Beside(NamedTuple):
+    """Two flights: C and JAX."""
+
+    position: np.ndarray
+    """(2, steps, 3), relative to the target, m."""
+    command: np.ndarray
+    """(2, steps, 4)."""
+    dt: float
+    """Time between two commands, s."""
+
+    def command_difference(self, seconds: float | None = None) -> float:
+        """Largest difference of a command, over all motors and the first ``seconds``."""
+        until = None if seconds is None else round(seconds / self.dt)
+        return float(np.abs(self.command[0, :until] - self.command[1, :until]).max())
+
+    @property
+    def distance_m(self) -> float:
+        """Largest distance between the two drones at the same time."""
+        return float(np.linalg.norm(self.position[0] - self.position[1], axis=-1).max())
+
+
+def fly_beside(
+    deployment: Deployment,
+    compiled: CompiledPolicy,
+    seconds: float,
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    seed: int = 0,
+) -> Beside:
+    """Fly both from hover, with the noise of trainings.
+
+    Args:
+        deployment: the exported policies; a flip begins with the first step.
+        compiled: the compiled C.
+        seconds: duration, s.
+        offset: start relative to the target, m.
+        seed: seed of the noise, the same for both.
+    """
+    plant = deployment.plant()
+    controller, dt = deployment.controller, deployment.controller.control_dt_s
+    if dt < plant.dt:
+        plant = replace(plant, dt=dt)
+    task = TargetTask(layout=deployment.holder.controller.layout, lumped_delay=deployment.holder.lumped_delay)
+    task, start = with_room(task, plant), plant.hover_state(offset)
+    hover = jnp.full(4, deployment.hover_command(), jnp.float32)
+    steps = round(seconds / dt)
+    position, command = np.empty((2, steps, 3)), np.empty((2, steps, 4), np.float32)
+
+    for which in range(2):
+        episode, memory = _first(task, plant, controller, start, hover, jax.random.PRNGKey(seed))
+        begin(deployment, compiled)
+        for i in range(steps):
+            if which == 0:
+                seen = episode.estimate
+                u = compiled.step(seen.position, seen.velocity, seen.quaternion, seen.body_rate)
+            else:
+                memory, u = _commanded(controller, memory, episode.estimate)
+            command[which, i] = u
+            episode = _flown(task, episode, jnp.asarray(u, jnp.float32))
+            position[which, i] = episode.state.position
+    return Beside(position, command, dt)
+
+
+# Compiled once for all flights of a policy.
+@eqx.filter_jit
+def _first(task: Task, plant: Quadrotor, controller: Flier, start: State, hover: Array, key: Array):
+    episode = reset(task, plant, key, start)
+    return episode, controller.start(episode.estimate, hover)
+
+
+@eqx.filter_jit
+def _commanded(controller: Flier, memory: Any, estimate: Estimate):
+    return controller.command(memory, estimate)
+
+
+@eqx.filter_jit
+def _flown(task: Task, episode: Episode, u: Array) -> Episode:
+    return step(task, episode, u)[0]
+
 
 NEAR_M = 1e-3
 """Largest distance between the flights of C and JAX."""

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cfb_mjx.control.manoeuvre import Manoeuvre
-from cfb_mjx.control.manoeuvre_file import ManoeuvreFile, load_manoeuvre, shipped_manoeuvres
+from cfb_mjx.control.manoeuvre import Manoeuvre, ManoeuvreFile, load_manoeuvre, shipped_manoeuvres
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, shipped_policies
 from cfb_mjx.errors import CfbError

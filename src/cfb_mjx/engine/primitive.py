@@ -2,7 +2,7 @@
 
 Under ``vmap``, a step becomes thirty small kernels over all drones, and its derivative two hundred, and every number
 passes through memory between them. On CPU the drones are therefore flown a few at a time through all steps, each group
-in one compiled function (`cfb_mjx.engine.groups`) whose numbers stay in the nearest cache; the same holds for the
+in one compiled function (`cfb_mjx.engine.batching`) whose numbers stay in the nearest cache; the same holds for the
 derivatives. To form groups an operation must know its batch, which code under ``vmap`` does not: hence primitives of
 JAX. There are three: the flight, the push of its tangents forward, and the pull of its cotangents back. They are
 defined by the same steps under ``vmap``, ``jvp`` and ``vjp``, which is also how they are computed on other devices.
@@ -22,7 +22,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
-from cfb_mjx.engine.groups import LANES, grouped
+from cfb_mjx.engine.batching import LANES, grouped
 from cfb_mjx.engine.lanes import PACKING, Flight, System, flown, pulled, pushed
 from cfb_mjx.optional import not_none
 

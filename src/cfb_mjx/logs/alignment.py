@@ -12,8 +12,7 @@ import itertools
 
 import numpy as np
 
-from cfb_mjx.logs.flight_log import FlightLog
-from cfb_mjx.logs.gaps import stretches
+from cfb_mjx.logs.flight_log import FlightLog, stretches
 from cfb_mjx.optional import not_none
 
 BAND_HZ = (5.0, 17.0)

@@ -1,8 +1,12 @@
-"""One flight as arrays: the only form in which the rest of the library sees measured data."""
+"""One flight as arrays: the only form in which the rest of the library sees measured data.
+
+A gap in the samples is defined here too, for every kind of recording.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -12,7 +16,29 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import plain
-from cfb_mjx.logs.gaps import longest_step, stretches
+
+
+def longest_step(interval: float) -> float:
+    """Longest step between two rows without a gap, s: three nominal intervals + 0.5 ms."""
+    return 3.0 * interval + 0.5e-3
+
+
+def stretches(time: np.ndarray, longest: float) -> list[slice]:
+    """The contiguous stretches of rows between steps longer than ``longest`` (s), in order."""
+    gaps = np.flatnonzero(np.diff(time) > longest) + 1
+    return [slice(a, b) for a, b in itertools.pairwise([0, *gaps.tolist(), len(time)]) if b > a]
+
+
+def changes(values: np.ndarray) -> np.ndarray:
+    """(n,) mask of the rows of (n, columns) that differ from the row before; the first row counts as different."""
+    return np.concatenate([[True], (np.diff(values, axis=0) != 0).any(axis=1)])
+
+
+def runs(mask: np.ndarray) -> list[tuple[int, int]]:
+    """Runs of true values, each as its first row and the row after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
 
 REQUIRED = ("time", "position", "velocity", "quaternion", "body_rate", "specific_force", "command")
 OPTIONAL = ("rotor_speed", "battery_voltage")

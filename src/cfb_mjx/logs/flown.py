@@ -13,8 +13,7 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
-from cfb_mjx.logs.flight_log import FlightLog
-from cfb_mjx.logs.gaps import changes, runs
+from cfb_mjx.logs.flight_log import FlightLog, changes, runs
 
 _CARRIES = 0.5  # share of the hover command below which, for longer than a flip, the drone is not flying
 _FLIP = 0.7  # s, longest time with low motors in flight

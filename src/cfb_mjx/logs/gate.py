@@ -9,8 +9,7 @@ import numpy as np
 from cfb_mjx.logs import consistency, motor_checks
 from cfb_mjx.logs.consistency import ORDER, Relation
 from cfb_mjx.logs.fixes import TIMES, Fix, candidates, fix_of, motor_fixes
-from cfb_mjx.logs.flight_log import FlightLog
-from cfb_mjx.logs.gaps import changes
+from cfb_mjx.logs.flight_log import FlightLog, changes
 
 _ROWS = 6000  # rows of a long log, those with the most motion, on which changes are tried
 _UNTOLD, _GONE = 0.5, 2.0  # cost of an axis that a change makes immobile, or impossible to compare

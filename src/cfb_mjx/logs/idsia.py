@@ -15,8 +15,7 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import alignment, rotation
-from cfb_mjx.logs.flight_log import FlightLog, quantise_time
-from cfb_mjx.logs.gaps import runs
+from cfb_mjx.logs.flight_log import FlightLog, quantise_time, runs
 from cfb_mjx.logs.tabular import Table, read_table, require_numbers
 
 POSITION, VELOCITY = ("x", "y", "z"), ("vx", "vy", "vz")

@@ -13,8 +13,7 @@ import numpy as np
 
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
-from cfb_mjx.logs.flight_log import FlightLog
-from cfb_mjx.logs.gaps import longest_step
+from cfb_mjx.logs.flight_log import FlightLog, longest_step
 from cfb_mjx.logs.resample import interpolate
 
 POSITION, ATTITUDE = (0.045, 3), (0.025, 2)

@@ -9,8 +9,7 @@ from pathlib import Path
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes
 from cfb_mjx.logs.bench_layouts import Bench, read_bench_table, recognises
-from cfb_mjx.logs.bench_points import SteadyPoints, ThrustPoints, joined
-from cfb_mjx.logs.bench_tables import MapTable, MotorRecord, record_of
+from cfb_mjx.logs.bench_tables import MapTable, MotorRecord, SteadyPoints, ThrustPoints, joined, record_of
 from cfb_mjx.logs.flight_log import FlightLog
 from cfb_mjx.logs.reading import read_log
 from cfb_mjx.logs.tabular import read_table

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.logs.gaps import changes, longest_step
+from cfb_mjx.logs.flight_log import changes, longest_step
 
 _MOSTLY_NEW = 0.7
 RADIO_WRAP_MS = 1 << 24  # a log packet has three bytes for its time stamp in ms, which overflows after 4.7 h

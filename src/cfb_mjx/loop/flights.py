@@ -16,7 +16,7 @@ import numpy as np
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
-from cfb_mjx.loop.controllers import controller_of
+from cfb_mjx.loop.trials import controller_of
 from cfb_mjx.reference_simulator import Case
 from cfb_mjx.reference_simulator import constants as c
 from cfb_mjx.reference_simulator.campaigns import draw_drone, recorded

@@ -1,12 +1,17 @@
 """Steps of a cell. Each step writes files to a folder, resumes after an interruption, and skips work already done.
 
 The folder ``policies`` holds the policies shared by the cells of one seed, and ``own`` the files of one cell.
+
+A cell is one drone, with one effect and one seed. Its policies are trained on the declared model, on randomised drones,
+and further on the corrected model.
 """
 
 from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +19,117 @@ import jax
 
 from cfb_mjx.commands.close_loop import CloseLoop
 from cfb_mjx.control.policy_file import load_policy
+from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_json
 from cfb_mjx.logs import write_mcap
 from cfb_mjx.loop import flights, trials
-from cfb_mjx.loop.cells import Cell
 from cfb_mjx.loop.flights import fly_campaign
-from cfb_mjx.loop.policies import BOTH, CONFIG, FURTHER, RANDOMISED, policy_file, train_policy
 from cfb_mjx.loop.trials import fly_trials
-from cfb_mjx.runtime import environment, say
-from cfb_mjx.train.config import load_config
+from cfb_mjx.reference_simulator import EFFECTS, Case
+from cfb_mjx.runtime import Progress, environment, say
+from cfb_mjx.train.config import load_config, with_changes
+from cfb_mjx.train.run import POLICY, Training, train
+
+FIRST_SEED, BETWEEN_SEEDS = 61_000, 100
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One drone.
+
+    Attributes:
+        effect: the effect that the declared model lacks.
+        seed: seed of the policies; together with the position of the effect in the list, of all other random draws.
+    """
+
+    effect: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Name of the cell and of its folder."""
+        return f"{self.effect}-{self.seed}"
+
+    @property
+    def case(self) -> Case:
+        """The drone in the reference simulator."""
+        return Case(self.name, self.seed + 1 + list(EFFECTS).index(self.effect), ((self.effect, 1.0),))
+
+
+def cells_of(effects: Iterable[str], seeds: int, first: int = FIRST_SEED) -> list[Cell]:
+    """Cells of all effects and seeds, ordered by seed, so that an unfinished study contains every effect.
+
+    Args:
+        effects: names of the effects; duplicates are dropped.
+        seeds: number of seeds.
+        first: the first seed.
+
+    Raises:
+        CfbError: an unknown effect, or no effect.
+    """
+    effects = list(dict.fromkeys(effects))
+    known = [name for name in EFFECTS if not name.startswith(("outside", "sensor"))]
+    if unknown := [name for name in effects if name not in known]:
+        raise CfbError(f"--effects {unknown[0]}: there is no such effect; choose from {', '.join(known)}.")
+    if not effects:
+        raise CfbError(f"--effects: name at least one of {', '.join(known)}.")
+    return [Cell(effect, first + BETWEEN_SEEDS * k) for k in range(seeds) for effect in effects]
+
+
+CONFIG = "loop"
+"""Name of the shipped configuration ``configs/loop.yaml``."""
+FURTHER = ("analytic.updates=200", "analytic.learning_rate=1.0e-3")
+"""Changes for further training on the corrected model and, for a fair comparison, on the declared model."""
+RANDOMISED = ("randomisation.magnitude=1.0", "analytic.updates=700")
+"""Changes for the randomised policy: the paper's spread, and as many updates as `CONFIG` and `FURTHER` together."""
+BOTH = (*FURTHER, RANDOMISED[0])
+"""Changes for further training of the randomised policy on the corrected model."""
+DONE = "training.json"
+
+
+def train_policy(
+    what: str,
+    folder: Path,
+    seed: int,
+    changes: tuple[str, ...] = (),
+    model: Path | None = None,
+    start: Path | None = None,
+) -> dict[str, Any]:
+    """Train a policy, or resume an interrupted training. A finished training is not repeated.
+
+    Args:
+        what: description of the training, for the terminal.
+        folder: folder of this policy.
+        seed: seed of all random draws.
+        changes: changes to the configuration `CONFIG`.
+        model: model file that replaces the declared model.
+        start: policy file from which the training starts; None starts from random weights.
+
+    Returns:
+        The last row of the learning curve.
+    """
+    if (folder / DONE).exists():
+        return json.loads((folder / DONE).read_text(encoding="utf-8"))
+    say(f"training {what}")
+    bar, facts = Progress(what), environment()
+    versions = {name: facts[name] for name in ("cfb_mjx", "jax", "jaxlib", "python")}
+    choices = {"seed": seed, "model": None if model is None else str(model)}
+    training = Training.prepare(with_changes(load_config(CONFIG, changes), **choices), versions, start)
+    with jax.enable_x64(False):
+        rows = train(
+            training,
+            folder,
+            resume=True,
+            progress=lambda done, total, rate, left: bar(done, total, f"{left:.0f} s left"),
+        )
+    write_json(folder / DONE, rows[-1])
+    return rows[-1]
+
+
+def policy_file(folder: Path) -> Path:
+    """File in which `train_policy` stores the policy."""
+    return folder / POLICY
+
 
 FLOWN, CLOSED, LEARNT, LEARNT_BOTH = "flown.json", "closed", "corrected", "both"
 KEPT = ("effects", "unexplained", "unexplained_because", "unconfirmed")

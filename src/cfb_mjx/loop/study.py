@@ -10,7 +10,7 @@ from typing import Any
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, write_json
 from cfb_mjx.loop import steps
-from cfb_mjx.loop.cells import Cell
+from cfb_mjx.loop.steps import Cell
 from cfb_mjx.runtime import say
 
 RESULT = "result.json"

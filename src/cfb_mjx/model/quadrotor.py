@@ -34,8 +34,7 @@ from cfb_mjx.model.integrate import END, INTEGRATORS, MIDDLE, START
 from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec, rotate_inverse
 from cfb_mjx.parameters import SPECIFICATIONS, ModelFile, Parameters, load_model_file
-from cfb_mjx.parameters.limits import concrete
-from cfb_mjx.parameters.parameters import physical_inertia
+from cfb_mjx.parameters.parameters import concrete, physical_inertia
 
 
 class Quadrotor(eqx.Module):

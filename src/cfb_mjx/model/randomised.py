@@ -20,7 +20,7 @@ from cfb_mjx.model.effects import Effect
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters import Randomisation, sample_parameters
 from cfb_mjx.parameters import require_possible as require_possible_parameters
-from cfb_mjx.parameters.limits import concrete
+from cfb_mjx.parameters.parameters import concrete
 from cfb_mjx.parameters.randomisation import Range, largest_magnitude
 
 

@@ -19,10 +19,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from cfb_mjx.documents import load_named, load_yaml, refuse_unknown, told
 from cfb_mjx.errors import CfbError
 from cfb_mjx.optional import not_none
-from cfb_mjx.parameters.limits import concrete
 from cfb_mjx.parameters.model_file import FORMAT as MODEL_FORMAT
 from cfb_mjx.parameters.model_file import ModelFile, load_model_file, preset_names
-from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters, current_names
+from cfb_mjx.parameters.parameters import SPECIFICATIONS, Parameters, concrete, current_names
 
 FORMAT = "cfb_mjx randomisation 1"
 UNIFORM = math.sqrt(3)

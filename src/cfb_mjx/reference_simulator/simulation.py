@@ -10,8 +10,7 @@ import numpy as np
 from cfb_mjx.reference_simulator import constants as c
 from cfb_mjx.reference_simulator import physics
 from cfb_mjx.reference_simulator.airframe import BOB, BOB_V, ESC, LAGGED, PLAIN_ROWS, ROWS, SPEED, P, Q, V, W, advance
-from cfb_mjx.reference_simulator.controller import DITHER, POSITION, YAW_ANGLE, Controller
-from cfb_mjx.reference_simulator.other_controller import OtherController, relative
+from cfb_mjx.reference_simulator.controller import DITHER, POSITION, YAW_ANGLE, Controller, OtherController, relative
 from cfb_mjx.reference_simulator.sensors import Instruments, LowPass, Recorder
 
 CHUNK = 250  # ticks of noise drawn at a time

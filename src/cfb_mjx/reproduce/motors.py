@@ -28,8 +28,7 @@ def motor_step(folder: Path, real: Path | None) -> Result:
     """Fit T and K to the rotor speed after steps of the command."""
     from cfb_mjx.logs.bench_tables import MotorRecord, read_bench, record_of
     from cfb_mjx.parameters import load_model_file
-    from cfb_mjx.sysid.rotors.motor_replay import replay
-    from cfb_mjx.sysid.rotors.motors import fit_motors
+    from cfb_mjx.sysid.rotors.motors import fit_motors, replay
 
     nominal = load_model_file("cfb-guards").parameters()
     steps = read_bench(shipped("data", "bench", "motor_steps.csv"))

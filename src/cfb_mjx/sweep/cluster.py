@@ -1,4 +1,7 @@
-"""Workers by Ray: started on this machine for one sweep, or those of an existing cluster. No other module uses Ray."""
+"""Workers by Ray: started on this machine for one sweep, or those of an existing cluster. No other module uses Ray.
+
+Other machines must see the folders of the sweep, which is checked first.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,9 +23,32 @@ from typing import Any
 
 from cfb_mjx import __version__
 from cfb_mjx.errors import CfbError
-from cfb_mjx.sweep.attempt import Outcome, TaskFault
-from cfb_mjx.sweep.probe import look, say_hello
-from cfb_mjx.sweep.workers import environment
+from cfb_mjx.sweep.drive import Outcome, TaskFault, environment
+
+PATIENCE_S = 10.0
+"""Time to wait for a new file; network file systems show it with a delay."""
+
+
+@contextmanager
+def say_hello(folder: Path) -> Iterator[Path]:
+    """Create a file in the folder during the block, for other machines to look for."""
+    handle, name = tempfile.mkstemp(prefix=".seen-", dir=folder)
+    os.close(handle)
+    try:
+        yield Path(name)
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def look(marker: str, place: str, patience_s: float = PATIENCE_S) -> tuple[str, str | None]:
+    """Return the library's version on this machine, and the folder that it does not see (None: it sees both)."""
+    end = time.monotonic() + patience_s
+    while not Path(marker).exists():
+        if time.monotonic() > end:
+            return __version__, str(Path(marker).parent)
+        time.sleep(0.2)
+    return __version__, None if Path(place).is_dir() else place
+
 
 ANSWER_S = 15.0
 """Time within which a cluster must answer."""

@@ -13,8 +13,8 @@ from typing import Any
 
 from cfb_mjx.commands.command import text
 from cfb_mjx.files import together, write_json, write_text
+from cfb_mjx.sweep.config import KINDS
 from cfb_mjx.sweep.folder import Folder, read_record
-from cfb_mjx.sweep.kinds import KINDS
 from cfb_mjx.sweep.tasks import Task
 
 CSV, JSON = "results.csv", "results.json"

@@ -1,9 +1,13 @@
-"""Fly controllers and measure them: hover, a step of six metres, recovery."""
+"""Fly controllers and measure them: hover, a step of six metres, recovery.
+
+Named sets of drones are flown alike. Flights can be written as logs for `cfb evaluate`, `cfb fit` and `cfb view`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -13,12 +17,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.control.controllers import Controller
+from cfb_mjx.documents import is_named, load_named, refuse_unknown, told
 from cfb_mjx.envs.episode import Task, reset, settled_command, step, with_room
 from cfb_mjx.envs.observation import Layout
 from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import FlightLog
+from cfb_mjx.logs.rotation import to_body
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import balanced_thrust_to_weight
 from cfb_mjx.model.state import State
+from cfb_mjx.parameters import ModelFile
 
 HOVER_S, SETTLING_S = 6.0, 1.0
 """The paper's hover test: its duration, and the initial time that is not counted."""
@@ -289,3 +298,82 @@ def nominal_task(task: _AnyTask) -> _AnyTask:
 
 TESTS: dict[str, Callable[..., tuple[Any, Flight]]] = {"hover": hover, "step": six_metres, "recover": recovery}
 """Tests by name; each takes controller, task, nominal drone and keys, and returns measurements and flights."""
+
+
+FORMAT = "cfb_mjx plants 1"
+
+
+def load_plants(base: ModelFile, name_or_path: str | Path = "off-nominal") -> dict[str, Quadrotor]:
+    """Read the drones of a shipped set or a YAML file: ``base`` with the effects that each entry adds.
+
+    Args:
+        base: model without these effects.
+        name_or_path: name of a set, or file.
+
+    Raises:
+        CfbError: there is no such set, an entry has no name, an effect is unknown, or a value is impossible.
+    """
+    path, document = load_named(name_or_path, "set of plants", FORMAT, "plants")
+    plants = {}
+    refuse_unknown(document, {"format", "name", "description", "plants"}, path, "")
+    listed = document.get("plants") or []
+    if not isinstance(listed, list):
+        raise CfbError(f"{path}: 'plants' must be a list, found {told(listed)}.")
+    for item in listed:
+        effects = item.get("effects") if isinstance(item, dict) else None
+        if not isinstance(effects, list) or not all(map(is_named, effects)) or "name" not in item:
+            raise CfbError(f"{path}: every plant needs a name and a list of effects, found {told(item)}.")
+        refuse_unknown(item, {"name", "why", "effects"}, path, "plants.")
+        if str(item["name"]) in plants:
+            raise CfbError(f"{path}: two plants have the name {item['name']}; give each its own name.")
+        where = f"{path}: plant {item['name']}"
+        described = replace(base, name=str(item["name"]), effects=(*base.effects, *effects), path=where)
+        plants[described.name] = Quadrotor.from_file(described)
+    if not plants:
+        raise CfbError(f"{path}: contains no plants.")
+    return plants
+
+
+def flight_log(flown: Flight, dt: float, name: str, gravity: float = 9.81, drone: int = 0) -> FlightLog:
+    """Convert one flight to a log: true states, without delay or sensor noise, one row per command.
+
+    The specific force is the mean over the control step before a row, as from a filtered accelerometer, in the body
+    axes at the middle of that step: in a flip the body turns by a tenth of a radian from there to the end of the step.
+
+    Args:
+        flown: flights, axes (drones, steps).
+        dt: time between two commands, s.
+        name: name of the log.
+        gravity: gravitational acceleration, m/s^2.
+        drone: index of the drone.
+
+    Raises:
+        CfbError: the drone failed so early that its flight has no rows.
+    """
+    flight = {key: np.asarray(getattr(flown, key), float)[drone] for key in _FIELDS}
+    # A row holds the command after it.
+    rows = steps_flown(flown, drone) - 1
+    if rows < 2:
+        raise CfbError(f"{name}: the drone failed at once; there is no flight to log.")
+    velocity, quaternion = flight["velocity"], flight["quaternion"][:rows]
+    change = np.diff(velocity[:rows], axis=0, prepend=velocity[:1]) / dt
+    change[0] = change[1]
+    # Same sign as the row before: a quaternion and its negative are the same attitude.
+    along = quaternion * np.sign(np.sum(quaternion * np.roll(quaternion, 1, axis=0), axis=1, keepdims=True))
+    middle = along + np.roll(quaternion, 1, axis=0)
+    middle[0] = quaternion[0]
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    return FlightLog(
+        time=dt * np.arange(1, rows + 1),
+        position=flight["position"][:rows],
+        velocity=velocity[:rows],
+        quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
+        body_rate=flight["body_rate"][:rows],
+        specific_force=to_body(middle, change + np.array([0.0, 0.0, gravity])),
+        command=np.clip(flight["command"][1 : rows + 1], 0.0, 1.0),
+        rotor_speed=flight["rotor_speed"][:rows],
+        metadata={"name": name, "source": "simulated by cfb fly", "format": "simulated", "observation_delay": 0.0},
+    )
+
+
+_FIELDS = ("position", "velocity", "quaternion", "body_rate", "command", "rotor_speed")

@@ -14,8 +14,7 @@ from cfb_mjx.control.controllers import Controller
 from cfb_mjx.envs import TargetTask
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file, load_randomisation
-from cfb_mjx.train.flying import Hover, hover
-from cfb_mjx.train.plants import load_plants
+from cfb_mjx.train.flying import Hover, hover, load_plants
 
 FLIGHTS, RANDOM_DRONES = 64, 512
 SENSORS = {

@@ -1,4 +1,9 @@
-"""Figure of the flights of a controller: position, speed and commands over time."""
+"""Figure of the flights of a controller: position, speed and commands over time.
+
+`write_flights` writes the flights of a controller as figure, recording, film or log. Flips have a figure of their own,
+as in the paper: path in the YZ plane, roll angle, roll rate and vertical speed. The recording has drones and paths in
+3D, set-point, thrust, commands and rates.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cfb_mjx.view.style import check_path, context, new_figure, save
+from cfb_mjx.control.manoeuvre import TURN, roll_angle, unwrapped
+from cfb_mjx.logs import write_mcap
+from cfb_mjx.model import Quadrotor, rotors
+from cfb_mjx.train.flips import FLOOR_M
+from cfb_mjx.train.flying import Flight, flight_log, steps_flown
+from cfb_mjx.view.film import Path3D, write_film
+from cfb_mjx.view.recorder import Plot, Tab, recording
+from cfb_mjx.view.style import COLOURS, MEASURED, check_path, context, new_figure, save
 
 _SHOWN = 60
 """Largest number of flights in the figure; more lines would cover each other."""
@@ -47,3 +59,201 @@ def flight_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
         figure.suptitle(title + shown, fontsize=10)
         figure.subplots_adjust(left=0.11, right=0.98, bottom=0.08, top=0.94, hspace=0.12)
         save(figure, path)
+
+
+_BLUE, _RED, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#e8e8e8"
+
+
+def flip_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
+    """Draw flips.
+
+    Args:
+        flown: a `cfb_mjx.train.flying.Flight` from `cfb_mjx.train.flips.flips`, axes (drones, steps).
+        dt: time between two commands, s.
+        path: figure to write.
+        title: title of the figure.
+    """
+    path = check_path(path)
+    position, velocity, rate = (np.asarray(x)[:_SHOWN] for x in (flown.position, flown.velocity, flown.body_rate))
+    roll = np.degrees(np.asarray(unwrapped(roll_angle(flown.quaternion[:_SHOWN]))))
+    time, count = dt * (1 + np.arange(position.shape[1])), len(flown.position)
+    shown, fade = _watched(flown, dt), 1.0 if count == 1 else 0.3
+    with context():
+        figure = new_figure(8.4, 4.6)
+        grid = figure.add_gridspec(3, 2, width_ratios=(1, 1.25))
+        plane = figure.add_subplot(grid[:, 0])
+        draw_path(plane, flown, dt, fade)
+        plane.set_aspect("equal", adjustable="datalim")
+        plane.set_ylabel("z, m")
+        if count == 1:
+            plane.legend(loc="best")
+        rows = (
+            ("roll, deg", roll),
+            ("roll rate, deg/s", np.degrees(rate[..., 0])),
+            ("vertical speed, m/s", velocity[..., 2]),
+        )
+        above = None
+        for i, (label, values) in enumerate(rows):
+            axis = above = figure.add_subplot(grid[i, 1], sharex=above)
+            axis.plot(time, values.T, color=_BLUE, linewidth=0.9, alpha=fade)
+            axis.set_ylabel(label)
+            axis.set_xlim(0, shown)
+            inside = values[:, time <= shown]
+            if np.isfinite(inside).any():
+                axis.set_ylim(*_padded(np.nanmin(inside), np.nanmax(inside)))
+            if count == 1:
+                turning = time[np.asarray(flown.watched)[0] == TURN]
+                axis.axvspan(turning[0] - dt, turning[-1], color=_GREY, linewidth=0)
+            if i < 2:
+                axis.tick_params(labelbottom=False)
+            else:
+                axis.set_xlabel("time, s")
+        more = "" if count <= _SHOWN else f" ({_SHOWN} of {count} flights)"
+        figure.suptitle(title + more, fontsize=10)
+        figure.subplots_adjust(left=0.08, right=0.98, bottom=0.11, top=0.92, hspace=0.15, wspace=0.25)
+        save(figure, path)
+
+
+def draw_path(axis, flown, dt: float, alpha: float = 1.0) -> None:
+    """Draw the paths of flips in the YZ plane; for a single flight also the drone, as a bar."""
+    position, until = np.asarray(flown.position)[:_SHOWN], round(_watched(flown, dt) / dt)
+    way = position[:, :until]
+    if len(way) == 1:
+        phase = np.asarray(flown.watched)[0, :until]
+        for which, colour in enumerate((_GREEN, _RED, _BLUE)):
+            there = np.flatnonzero(phase == which)
+            if len(there):
+                piece = way[0, max(0, there[0] - 1) : there[-1] + 1]
+                axis.plot(piece[:, 1], piece[:, 2], color=colour, label=("climb", "turn", "catch")[which])
+        angle = np.asarray(unwrapped(roll_angle(flown.quaternion[:1, :until])))[0]
+        for i in _apart(way[0, :, 1:], angle):
+            y, z = way[0, i, 1:]
+            across = 0.05 * np.array([np.cos(angle[i]), np.sin(angle[i])])
+            up = 0.04 * np.array([-np.sin(angle[i]), np.cos(angle[i])])
+            axis.plot([y - across[0], y + across[0]], [z - across[1], z + across[1]], color=MEASURED, linewidth=0.8)
+            axis.plot([y, y + up[0]], [z, z + up[1]], color=MEASURED, linewidth=0.5)
+    else:
+        for one in way:
+            axis.plot(one[:, 1], one[:, 2], color=_BLUE, linewidth=0.8, alpha=alpha)
+    axis.set_xlabel("y, m")
+
+
+def _apart(way: np.ndarray, angle: np.ndarray) -> list[int]:
+    """Rows at which the drone is drawn: 8 cm or an eighth of a turn from the last one."""
+    kept = [0]
+    for i in range(1, len(way)):
+        moved, turned = np.linalg.norm(way[i] - way[kept[-1]]), abs(angle[i] - angle[kept[-1]])
+        if moved > 0.08 or turned > np.pi / 4:
+            kept.append(i)
+    return kept
+
+
+def _watched(flown, dt: float) -> float:
+    """End of the shown time, s: 1.5 s after the last flight has ended its turn."""
+    before = (np.asarray(flown.watched) <= TURN).sum(axis=-1).max() * dt
+    return min(before + 1.5, dt * flown.position.shape[-2])
+
+
+def _padded(low: float, high: float) -> tuple[float, float]:
+    margin = 0.06 * max(high - low, 1e-3)
+    return low - margin, high + margin
+
+
+DRONES = 40
+"""Largest number of drones in a recording."""
+_MOTORS = ("M1", "M2", "M3", "M4")
+
+
+def write_flight_recording(path: str | Path, flown, dt: float, thrust=None) -> None:
+    """Write a recording that `rerun` opens.
+
+    Every drone has its pose and path under ``world/<number>``; the set-point is ``world/set-point``. Commands, body
+    rates and velocities of the first drone are under ``signal``.
+
+    Args:
+        path: file to write, ``.rrd``.
+        flown: a `cfb_mjx.train.flying.Flight` with axes (drones, steps).
+        dt: time between two commands, s.
+        thrust: (drones, steps, 4) N, drawn as arrows on the first drone; None: no arrows.
+
+    Raises:
+        CfbError: rerun is not installed or the file cannot be written.
+    """
+    position, quaternion = np.asarray(flown.position), np.asarray(flown.quaternion)
+    time = dt * (1 + np.arange(position.shape[1]))
+    signals = {
+        "command": (np.asarray(flown.command)[0], _MOTORS),
+        "body rate": (np.degrees(np.asarray(flown.body_rate)[0]), ("x, deg/s", "y, deg/s", "z, deg/s")),
+        "velocity": (np.asarray(flown.velocity)[0], ("x, m/s", "y, m/s", "z, m/s")),
+    }
+    plots = tuple(Plot(name, (f"signal/{_entity(name)}/**",)) for name in signals)
+    # Drones that failed may be far away or have NaN positions.
+    well = position[np.isfinite(position).all(axis=-1) & ~np.asarray(flown.failed)]
+    seen = np.stack([well.min(axis=0), well.max(axis=0)]) if len(well) else None
+    with recording("cfb_fly", [Tab("flight", "world", plots, seen)], path) as recorder:
+        recorder.world("world")
+        recorder.point("world/set-point", time[:1], np.zeros((1, 3)), COLOURS["commands_in"])
+        for i in range(min(DRONES, len(position))):
+            there = np.isfinite(position[i]).all(axis=1)
+            recorder.line(f"world/{i}/way", position[i][there])
+            arrows = None if thrust is None or i else np.asarray(thrust)[0]
+            recorder.drone(f"world/{i}/drone", time, position[i], quaternion[i], arrows)
+        for name, (values, labels) in signals.items():
+            for column, label in zip(values.T, labels, strict=True):
+                recorder.series(f"signal/{_entity(name)}/{label[:2].strip(',')}", time, column, label)
+
+
+def _entity(name: str) -> str:
+    return name.replace(" ", "_")
+
+
+HEIGHT_M = 1.0
+"""Height of the target above the floor of a film, m; flips are shown `FLOOR_M` above it."""
+
+
+def write_flights(
+    flown: Flight,
+    dt: float,
+    nominal: Quadrotor,
+    title: str = "",
+    flips: bool = False,
+    figure: Path | None = None,
+    recording: Path | None = None,
+    video: Path | None = None,
+    log: Path | None = None,
+) -> None:
+    """Write the requested files.
+
+    Args:
+        flown: flights, axes (drones, steps).
+        dt: time between two commands, s.
+        nominal: model whose thrust curve gives the thrust arrows.
+        title: title of the figure.
+        flips: whether the flights are flips.
+        figure: file of the figure; None writes none.
+        recording: file of the rerun recording; None writes none.
+        video: file of a film of the first flight; None writes none.
+        log: file of a flight log of the first flight; None writes none.
+
+    Raises:
+        CfbError: a file cannot be written, or a program or library for it is not installed.
+    """
+    parameters = nominal.changed_parameters()
+    if figure is not None:
+        (flip_figure if flips else flight_figure)(flown, dt, figure, title)
+    if recording is not None:
+        thrust = np.asarray(rotors.thrust(parameters, flown.rotor_speed[:1]))
+        write_flight_recording(recording, flown, dt, thrust)
+    if video is not None:
+        thrust = np.asarray(rotors.thrust(parameters, flown.rotor_speed[0]))
+        write_film(video, _first(flown, dt, thrust, FLOOR_M if flips else HEIGHT_M))
+    if log is not None:
+        write_mcap(flight_log(flown, dt, log.stem, float(parameters.gravity)), log)
+
+
+def _first(flown: Flight, dt: float, thrust: np.ndarray, height_m: float) -> Path3D:
+    """The first flight, for a film; if the drone is lost, up to that time."""
+    rows = slice(steps_flown(flown))
+    position = np.asarray(flown.position[0], float) + np.array([0.0, 0.0, height_m])
+    time = dt * (1 + np.arange(len(position)))
+    return Path3D(time[rows], position[rows], np.asarray(flown.quaternion[0])[rows], thrust[rows])

@@ -12,7 +12,7 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.model import Quadrotor, rotors
 from cfb_mjx.sysid.evaluation import Evaluation, LogEvaluation
 from cfb_mjx.sysid.tracing.residuals import Residuals
-from cfb_mjx.view.closing_recording import record_flight, record_predictions, record_residuals, tab
+from cfb_mjx.view.closing import record_flight, record_predictions, record_residuals, tab
 from cfb_mjx.view.film import Path3D, write_film
 from cfb_mjx.view.recorder import AXES, Plot, Recorder, part, recording
 from cfb_mjx.view.style import COLOURS

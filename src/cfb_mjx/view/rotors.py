@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.sysid.rotors.motor_replay import Replay
+from cfb_mjx.sysid.rotors.motors import Replay
 from cfb_mjx.sysid.rotors.rotor_maps import MapFit
 from cfb_mjx.view import style
 

@@ -10,8 +10,7 @@ from jaxtyping import Array
 
 from cfb_mjx.model.rotors import RotorLoads
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.limits import Limits
-from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.parameters.parameters import Limits, Parameters
 
 INERTIAL, CONSTRAINT, EXPECTATION = 9, 10, 11
 """Values of `Effect.rank` for effects that act on the body after all others: effects that use the torque of all forces

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import mean_hover_ratio, number, vector
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 STILL = 0.01
 """Speed that is added to the speed along the discs (root of the sum of squares), so that it is differentiable at rest,

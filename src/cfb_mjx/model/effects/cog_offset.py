@@ -10,8 +10,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.model.effects.base import Effect
 from cfb_mjx.model.effects.fields import vector
-from cfb_mjx.parameters.limits import Limits
-from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.parameters.parameters import Limits, Parameters
 
 
 class CogOffset(Effect):

@@ -18,8 +18,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Effect, Memory, Motors
 from cfb_mjx.model.effects.fields import command_before, number
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.limits import Limits
-from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.parameters.parameters import Limits, Parameters
 
 
 class EscRateLimit(Effect):

@@ -17,7 +17,7 @@ from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import HOVER_SPEED, number
 from cfb_mjx.model.rotors import TORQUE_SIGNS
 from cfb_mjx.model.vector import Vec, rotate_inverse
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 _V, _W, _P = ("v_x", "v_y", "v_z"), ("w_x", "w_y", "w_z"), ("x", "y", "z")
 _SPEEDS = ("n", "n_roll", "n_pitch", "n_yaw")

@@ -20,7 +20,7 @@ from cfb_mjx.model.effects.base import Condition, Effect
 from cfb_mjx.model.effects.fields import hub_positions, number
 from cfb_mjx.model.rotors import RotorLoads
 from cfb_mjx.model.vector import Vec, rotate
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 REFERENCE = 0.1
 """Height of the rotors above the floor at which the strength is defined, m."""

@@ -23,8 +23,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Memory
 from cfb_mjx.model.effects.fields import number, vector
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.limits import Limits
-from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.parameters.parameters import Limits, Parameters
 
 HARMONICS = 12
 """Number of cosines per axis."""

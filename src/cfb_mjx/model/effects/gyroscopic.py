@@ -21,8 +21,7 @@ from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.rotors import YAW_SIGNS
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.limits import Limits
-from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.parameters.parameters import Limits, Parameters
 
 
 class Gyroscopic(Effect):

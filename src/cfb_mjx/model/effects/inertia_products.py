@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import INERTIAL, Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import vector
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 
 class InertiaProducts(Effect):

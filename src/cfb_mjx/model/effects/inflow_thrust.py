@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect
 from cfb_mjx.model.effects.fields import HOVER_SPEED, hub_velocities, number
 from cfb_mjx.model.rotors import RotorLoads
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 
 class InflowThrust(Effect):

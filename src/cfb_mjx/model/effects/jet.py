@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect
 from cfb_mjx.model.effects.fields import number, vector
 from cfb_mjx.model.vector import Vec, rotate
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 
 class Jet(Effect):

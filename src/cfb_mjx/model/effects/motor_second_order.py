@@ -17,8 +17,7 @@ from cfb_mjx.model.effects.base import Effect, Memory, Motors
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.effects.motor_time_constant import MotorTimeConstant
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.limits import Limits
-from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.parameters.parameters import Limits, Parameters
 
 
 class MotorSecondOrder(Effect):

@@ -17,8 +17,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Memory, Motors
 from cfb_mjx.model.effects.fields import HOVER_SPEED, number
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.limits import Limits
-from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.parameters.parameters import Limits, Parameters
 
 
 class MotorThermalDrift(Effect):

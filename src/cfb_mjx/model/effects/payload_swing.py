@@ -25,8 +25,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import CONSTRAINT, Condition, Effect, Memory, Wrench
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec, rotate, rotate_inverse
-from cfb_mjx.parameters.limits import Limits
-from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.parameters.parameters import Limits, Parameters
 
 FOLLOWING = 8.0
 """Twice the damping of the observer's error along a log, 1/s."""

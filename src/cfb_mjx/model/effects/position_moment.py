@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import mean_hover_ratio, vector
 from cfb_mjx.model.vector import Vec, rotate_inverse
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 
 class PositionMoment(Effect):

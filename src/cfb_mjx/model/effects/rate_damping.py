@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect, Wrench
 from cfb_mjx.model.effects.fields import mean_hover_ratio, number
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 
 class RateDamping(Effect):

@@ -26,8 +26,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import EXPECTATION, Condition, Effect, Memory, Wrench
 from cfb_mjx.model.effects.fields import number
 from cfb_mjx.model.vector import Vec
-from cfb_mjx.parameters.limits import Limits
-from cfb_mjx.parameters.parameters import Parameters
+from cfb_mjx.parameters.parameters import Limits, Parameters
 
 
 class RegressionDilution(Effect):

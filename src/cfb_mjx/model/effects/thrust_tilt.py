@@ -20,7 +20,7 @@ from cfb_mjx.model.effects.cog_offset import CogOffset
 from cfb_mjx.model.effects.fields import hub_positions, number, vector
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.optional import not_none
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 
 class ThrustTilt(Effect):

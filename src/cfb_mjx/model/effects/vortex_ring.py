@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.model.effects.base import Condition, Effect
 from cfb_mjx.model.effects.fields import HOVER_SPEED, hub_velocities, number
 from cfb_mjx.model.rotors import RotorLoads
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 _CURVE = (-1.125, -1.372, -1.718, -0.655)
 _WINDMILL = -2.0

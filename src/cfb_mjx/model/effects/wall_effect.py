@@ -22,7 +22,7 @@ from cfb_mjx.model.effects.fields import hub_positions, number, vector
 from cfb_mjx.model.effects.ground_effect import beside_surface
 from cfb_mjx.model.rotors import RotorLoads
 from cfb_mjx.model.vector import Vec, rotate, rotate_inverse
-from cfb_mjx.parameters.limits import Limits
+from cfb_mjx.parameters.parameters import Limits
 
 
 class WallEffect(Effect):

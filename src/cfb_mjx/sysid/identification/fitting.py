@@ -19,7 +19,7 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import with_gyro_in_time
-from cfb_mjx.sysid.identification.feedback import detect
+from cfb_mjx.sysid.identification.filters import detect
 from cfb_mjx.sysid.identification.flight_data import Segments, prepare
 from cfb_mjx.sysid.identification.innovation import (
     CHANNELS,
@@ -32,9 +32,8 @@ from cfb_mjx.sysid.identification.innovation import (
 )
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.result import Fit, summarise
-from cfb_mjx.sysid.identification.robust import surprise, tempered
 from cfb_mjx.sysid.identification.shooting import shoot
-from cfb_mjx.sysid.identification.solver import RIDGE, least_squares, most_likely
+from cfb_mjx.sysid.identification.solver import RIDGE, least_squares, most_likely, surprise, tempered
 from cfb_mjx.sysid.identification.uncertainty import assess, most_contradicted
 from cfb_mjx.sysid.identification.unknowns import GROUPS, OFFSETS, UNITS, Unknowns, at_the_border, choose
 

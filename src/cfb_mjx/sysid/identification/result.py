@@ -9,7 +9,7 @@ import numpy as np
 from cfb_mjx.errors import CfbError
 from cfb_mjx.parameters import SPECIFICATIONS, Entry, ModelFile, Parameters
 from cfb_mjx.sysid.fitted import Estimate, numbers_of
-from cfb_mjx.sysid.identification.feedback import Feedback
+from cfb_mjx.sysid.identification.filters import Feedback
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.uncertainty import Uncertainty, power_product
 from cfb_mjx.sysid.identification.unknowns import OFFSETS, UNITS, Unknowns

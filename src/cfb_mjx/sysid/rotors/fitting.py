@@ -17,12 +17,11 @@ from cfb_mjx.logs.flown import flown_part
 from cfb_mjx.logs.rotor_files import RotorFiles
 from cfb_mjx.parameters import Entry, ModelFile
 from cfb_mjx.sysid.fitted import Estimate, numbers_of
+from cfb_mjx.sysid.rotors.flown_motors import ThrustInFlight, thrust_in_flight
 from cfb_mjx.sysid.rotors.motors import ENTRIES, MotorFit
 from cfb_mjx.sysid.rotors.rotor_maps import MapFit
-from cfb_mjx.sysid.rotors.steady import SteadyFit, fit_steady
 from cfb_mjx.sysid.rotors.supply import Extras, fit_under_supply
-from cfb_mjx.sysid.rotors.tables import fit_maps, require_one_rotor
-from cfb_mjx.sysid.rotors.thrust_in_flight import ThrustInFlight, thrust_in_flight
+from cfb_mjx.sysid.rotors.tables import SteadyFit, fit_maps, fit_steady, require_one_rotor
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,15 @@
 The paper's model (section III-B, eq. 5) has one time constant T and a gain K. Optional extras are an offset (the steady
 speed is then affine in the command), separate time constants for spin-up and spin-down, and a dead time. Each extra is
 tested against the model without it. The estimator is described in `cfb_mjx.sysid.rotors.motor_filter`.
+
+If extras are fitted, `common_lag` finds the single time constant equivalent to the whole motor.
+
+A direct fit of a model without dead time would explain the dead time by noise and bias the constants. Instead, the full
+motor is fitted first. Then the single lag is chosen whose response to the recorded commands is closest to that of the
+full motor. Both responses are simulated from the commands alone, so neither noise nor feedback biases this
+least-squares step.
+
+`replay` simulates fitted motors with the recorded commands.
 """
 
 from __future__ import annotations
@@ -11,6 +20,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaincc
@@ -19,10 +30,58 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.bench_tables import MotorRecord
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.fitted import Estimate, numbers_of
-from cfb_mjx.sysid.rotors.common_lag import common_lag
-from cfb_mjx.sysid.rotors.motor_filter import DEAD_TIME_UNIT, Motor
-from cfb_mjx.sysid.rotors.motor_likelihood import Optimum, first_guess, maximise
-from cfb_mjx.sysid.rotors.motor_tracks import MotorData, gather
+from cfb_mjx.sysid.rotors.motor_filter import (
+    DEAD_TIME_UNIT,
+    Motor,
+    MotorData,
+    Optimum,
+    Tracks,
+    first_guess,
+    gather,
+    maximise,
+    simulate,
+    undisturbed,
+)
+
+
+@eqx.filter_jit
+def _response(vector, tracks: Tracks):
+    def speed(x):
+        found = simulate(Motor.from_vector(x), tracks) * tracks.judged
+        return found, found
+
+    slope, found = jax.jacfwd(speed, has_aux=True)(vector)
+    return found, slope
+
+
+def common_lag(full: Optimum, data: MotorData) -> tuple[float, float]:
+    """Time constant of the closest single lag, and its standard deviation, s.
+
+    Args:
+        full: fit with spin-up and spin-down constants, a dead time, or both.
+        data: recordings to which it was fitted.
+    """
+    tracks = jax.tree.map(jnp.asarray, data.tracks)
+    goal, full_slope = (np.asarray(x) for x in _response(jnp.asarray(full.vector), tracks))
+    vector = np.array(full.vector)
+    motor = full.motor
+    vector[2:4], vector[4] = np.log(max(0.5 * (motor.spin_up + motor.spin_down) + motor.dead_time, 2e-3)), 0.0
+    slope = np.zeros_like(goal)
+    for _ in range(12):
+        found, slope = (np.asarray(x) for x in _response(jnp.asarray(vector), tracks))
+        slope = slope[..., 2] + slope[..., 3]
+        change = np.sum(slope * (goal - found)) / np.sum(slope**2)
+        vector[2:4] += np.clip(change, -0.5, 0.5)
+        if abs(change) < 1e-8:
+            break
+    # Derivative of the closest lag with respect to the constants of the full motor; gain and offset affect both alike.
+    moved = np.einsum("sn,snk->k", slope, full_slope) / np.sum(slope**2) @ full.directions
+    level = [i for i, name in enumerate(full.names) if name in ("motor_gain", "motor_speed_offset")]
+    moved[level] = 0.0
+    std = float(np.sqrt(moved @ full.uncertainty.covariance @ moved))
+    lag = float(np.exp(vector[2]))
+    return lag, std * lag
+
 
 UNITS = {
     "motor_time_constant": "s",
@@ -344,3 +403,48 @@ def _differences(groups: dict[int, GroupFit]) -> dict[str, float]:
 def chi_square_tail(value: float, degrees: int) -> float:
     """Probability that a chi-square variable with ``degrees`` degrees of freedom exceeds ``value``."""
     return float(gammaincc(jnp.asarray(degrees / 2), jnp.asarray(value / 2)))
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Simulation of one motor over the piece of its recordings in which the command varies most.
+
+    Attributes:
+        motor: number 1 to 4; 0 if not known.
+        time: (n,) s from the start of the piece.
+        command: (n,) in [0, 1].
+        measured: (n,) rotor speed, rad/s; NaN where missing.
+        simulated: (n,) rotor speed from the commands alone, rad/s.
+        rms: of measured minus simulated speed over all recordings of the motor, rad/s.
+    """
+
+    motor: int
+    time: np.ndarray
+    command: np.ndarray
+    measured: np.ndarray
+    simulated: np.ndarray
+    rms: float
+
+
+def replay(fit: MotorFit) -> list[Replay]:
+    """Simulate every motor from its commands, with its own constants if it was fitted separately."""
+    found = []
+    for number in sorted({n for record in fit.records for n in record.motors}):
+        data = gather(fit.records, number)
+        if data is None:
+            continue
+        tracks = data.tracks
+        vector = fit.motors.get(number, fit.common).optimum.vector
+        simulated = np.asarray(undisturbed(jnp.asarray(vector), jax.tree.map(jnp.asarray, tracks)).rotor_speed)
+        judged = tracks.judged > 0
+        error = (tracks.rotor_speed - simulated)[judged]
+        # Do not show a piece that is much shorter than the others, even if the command varies a lot in it.
+        enough = judged.sum(axis=1) >= 0.5 * judged.sum(axis=1).max()
+        moves = [float(np.std(c[j])) if ok else -1.0 for c, j, ok in zip(tracks.command, judged, enough, strict=True)]
+        shown = int(np.argmax(moves))
+        rows = slice(0, int(np.flatnonzero(judged[shown])[-1]) + 1)
+        measured = np.where(tracks.measured[shown] > 0, tracks.rotor_speed[shown], np.nan)
+        columns = (tracks.time[shown], tracks.command[shown], measured, simulated[shown])
+        time, command, measured, alone = (np.asarray(column)[rows] for column in columns)
+        found.append(Replay(number, time, command, measured, alone, float(np.sqrt(np.mean(error**2)))))
+    return found

@@ -13,7 +13,7 @@ from cfb_mjx.model.effects.battery_sag import NOMINAL_VOLTAGE, BatterySag
 from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.rotors.motors import MotorFit, each_motor, fit_again, fit_motors
-from cfb_mjx.sysid.rotors.steady import VARIES
+from cfb_mjx.sysid.rotors.tables import VARIES
 
 SURE = 3.0
 """Significance that a slope needs, in standard deviations."""

@@ -17,9 +17,9 @@ from cfb_mjx.sysid.refinement.numbers import PLANT
 from cfb_mjx.sysid.sensor_faults import HEALTHY
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint
 from cfb_mjx.sysid.tracing.diagnosis import Diagnosis, Reported, Unexplained
-from cfb_mjx.sysid.tracing.fits import Verdict, confirm, prediction_errors
 from cfb_mjx.sysid.tracing.formula import Proposal, explain, only_there
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
+from cfb_mjx.sysid.tracing.jointly import Verdict, confirm, prediction_errors
 from cfb_mjx.sysid.tracing.residuals import SpectralLine, find_spectral_lines, residual_rows
 from cfb_mjx.sysid.tracing.rules import RULES, Rules
 from cfb_mjx.sysid.tracing.search import Search

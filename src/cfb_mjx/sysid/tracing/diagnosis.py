@@ -25,10 +25,10 @@ from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Entry, ModelFile
 from cfb_mjx.sysid.evaluation import Evaluation, before_and_after
 from cfb_mjx.sysid.sensor_faults import HEALTHY, SensorFaults
-from cfb_mjx.sysid.tracing.fits import Verdict
 from cfb_mjx.sysid.tracing.formula import Proposal, Term
 from cfb_mjx.sysid.tracing.hypothesis import FORMULA, Hypothesis
 from cfb_mjx.sysid.tracing.innovations import FIRST, levels_from
+from cfb_mjx.sysid.tracing.jointly import Verdict
 from cfb_mjx.sysid.tracing.residuals import Residuals, SpectralLine, aligned, residual_rows
 from cfb_mjx.sysid.tracing.rules import Rules
 from cfb_mjx.sysid.tracing.search import Search

@@ -12,8 +12,8 @@ import numpy as np
 
 from cfb_mjx.model.effects.formula import AXES, PLACES, TERMS, ResidualFormula
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, evidence, solve
-from cfb_mjx.sysid.tracing.fits import confirm, prediction_errors
 from cfb_mjx.sysid.tracing.hypothesis import FORMULA, LEAD_SPREAD, Column, Hypothesis, Linear, term_columns
+from cfb_mjx.sysid.tracing.jointly import confirm, prediction_errors
 from cfb_mjx.sysid.tracing.rules import Rules, enough
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.trace import Trace

@@ -38,8 +38,8 @@ from cfb_mjx.sysid.refinement.numbers import HELD, PLANT
 from cfb_mjx.sysid.refinement.predictions import kinds_alike
 from cfb_mjx.sysid.rotors.flown_motors import Motors
 from cfb_mjx.sysid.tracing.evidence import Evidence, alike, covariance, solve
-from cfb_mjx.sysid.tracing.fits import beside_hold
 from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Column, Hypothesis, moved, neutral_effects, strengths
+from cfb_mjx.sysid.tracing.jointly import beside_hold
 from cfb_mjx.sysid.tracing.motors import MOTORS, motors_of, with_motors
 from cfb_mjx.sysid.tracing.rules import Rules
 from cfb_mjx.sysid.tracing.search import Search

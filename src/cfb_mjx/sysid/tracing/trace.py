@@ -18,9 +18,20 @@ from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.checkpoint import Checkpoint, Progress
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, solve
-from cfb_mjx.sysid.tracing.fits import ERRORS, as_it_is, completed, confirm, fitted, prediction_errors
 from cfb_mjx.sysid.tracing.hypothesis import LEAD_SPREAD, SHIFT, Column, Fit, Hypothesis, Linear
-from cfb_mjx.sysid.tracing.jointly import beside_each_other, borne_out, everything, one_by_one, told_apart
+from cfb_mjx.sysid.tracing.jointly import (
+    ERRORS,
+    as_it_is,
+    beside_each_other,
+    borne_out,
+    completed,
+    confirm,
+    everything,
+    fitted,
+    one_by_one,
+    prediction_errors,
+    told_apart,
+)
 from cfb_mjx.sysid.tracing.rules import RULES, Rules
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import SensorCheck, check_sensors
