@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.envs.observation import Estimate, rotation_matrix
+from cfb_mjx.envs.observation import StateEstimate, rotation_matrix
 
 STEPS = 5
 """Control steps per evaluation of the network: 10 ms, as in its training."""
@@ -56,11 +56,11 @@ class RaptorController(eqx.Module):
         )
         return cls(*jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(float)), arrays))
 
-    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Memory:
+    def start(self, estimate: StateEstimate, command: Float[Array, "4"]) -> Memory:
         """Return the memory at take-over."""
         return Memory(self.hidden, 2 * command - 1, jnp.asarray(0))
 
-    def command(self, memory: Memory, estimate: Estimate) -> tuple[Memory, Float[Array, "4"]]:
+    def command(self, memory: Memory, estimate: StateEstimate) -> tuple[Memory, Float[Array, "4"]]:
         """Return the new memory and the command."""
         hidden, action = self._asked(memory, estimate)
         due = memory.held == 0
@@ -68,7 +68,7 @@ class RaptorController(eqx.Module):
         action = jnp.where(due, action, memory.action)
         return Memory(hidden, action, (memory.held + 1) % STEPS), (action + 1) / 2
 
-    def _asked(self, memory: Memory, estimate: Estimate) -> tuple[Array, Array]:
+    def _asked(self, memory: Memory, estimate: StateEstimate) -> tuple[Array, Array]:
         position = jnp.clip(estimate.position, -LARGEST_POSITION_ERROR_M, LARGEST_POSITION_ERROR_M)
         velocity = jnp.clip(estimate.velocity, -LARGEST_VELOCITY_ERROR_MPS, LARGEST_VELOCITY_ERROR_MPS)
         seen = jnp.concatenate(

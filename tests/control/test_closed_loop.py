@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cfb_mjx.control import NeuralController, closed_loop, find_controller, rollout_closed_loop
-from cfb_mjx.envs.observation import Estimate, Layout
+from cfb_mjx.envs.observation import Layout, StateEstimate
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import MjxBody, Quadrotor, begin
 from cfb_mjx.model.effects import effect_from_mapping
@@ -55,7 +55,7 @@ def written_out(model, controller, state, commands, target=(0.0, 0.0, 0.0)):
     hold = round(controller.control_dt_s / model.dt)
 
     def seen(at):
-        return Estimate(at.position - jnp.asarray(target), at.velocity, at.quaternion, at.body_rate)
+        return StateEstimate(at.position - jnp.asarray(target), at.velocity, at.quaternion, at.body_rate)
 
     def one(carry, _):
         state, memory = carry

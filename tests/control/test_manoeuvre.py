@@ -23,7 +23,7 @@ from cfb_mjx.control.manoeuvre import (
     unwrapped,
 )
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.envs import Estimate, Layout
+from cfb_mjx.envs import Layout, StateEstimate
 from cfb_mjx.envs.flip import FLIP_LAYOUT
 from cfb_mjx.errors import CfbError
 
@@ -32,12 +32,12 @@ TURNER = NeuralController.random(jax.random.PRNGKey(1), FLIP_LAYOUT, (8,))
 KNOBS = Knobs(climb_m=2.0, climb_s=0.08, turn_s=0.16, speed_mps=1.0, rate_radps=17.0)
 
 
-def estimate(velocity=0.0, roll=0.0, position=0.0) -> Estimate:
+def estimate(velocity=0.0, roll=0.0, position=0.0) -> StateEstimate:
     q = Rotation.from_rotvec([roll, 0, 0]).as_quat()[[3, 0, 1, 2]]
-    return Estimate(jnp.full(3, position), jnp.array([0.0, 0.0, velocity]), jnp.asarray(q), jnp.zeros(3))
+    return StateEstimate(jnp.full(3, position), jnp.array([0.0, 0.0, velocity]), jnp.asarray(q), jnp.zeros(3))
 
 
-def phases(knobs: Knobs, estimates: list[Estimate]) -> list[int]:
+def phases(knobs: Knobs, estimates: list[StateEstimate]) -> list[int]:
     controller = Manoeuvre(HOLDER, TURNER, knobs)
     memory, found = controller.start(estimates[0], jnp.full(4, 0.55)), []
     advance = jax.jit(lambda memory, seen: controller.command(memory, seen))
@@ -81,8 +81,8 @@ def test_each_phase_flies_the_policy_it_should():
     np.testing.assert_allclose(catching, HOLDER.command(HOLDER.start(seen, 0.55), seen)[1], rtol=1e-6)
 
 
-def replace_position(seen: Estimate, position) -> Estimate:
-    return Estimate(position, seen.velocity, seen.quaternion, seen.body_rate)
+def replace_position(seen: StateEstimate, position) -> StateEstimate:
+    return StateEstimate(position, seen.velocity, seen.quaternion, seen.body_rate)
 
 
 def test_the_integral_of_the_catch_begins_with_the_catch():

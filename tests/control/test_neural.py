@@ -10,7 +10,7 @@ import pytest
 
 from cfb_mjx.control.neural import Network, NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
-from cfb_mjx.envs import Estimate, Layout
+from cfb_mjx.envs import Layout, StateEstimate
 from cfb_mjx.errors import CfbError
 
 LAYOUT = Layout(past_estimates=2, past_commands=3, integral=True)
@@ -35,7 +35,7 @@ def test_the_network_is_plain_matrix_algebra(activation):
 
 def test_an_untrained_controller_hovers_blindly_and_stays_in_range():
     controller = NeuralController.random(jax.random.PRNGKey(0), LAYOUT, hover=0.55)
-    rest = Estimate(jnp.zeros(3), jnp.zeros(3), jnp.array([1.0, 0, 0, 0]), jnp.zeros(3))
+    rest = StateEstimate(jnp.zeros(3), jnp.zeros(3), jnp.array([1.0, 0, 0, 0]), jnp.zeros(3))
     memory, command = controller.command(controller.start(rest, jnp.full(4, 0.55)), rest)
     np.testing.assert_allclose(command, 0.55, atol=0.02)
     np.testing.assert_allclose(memory.commands[0], 2 * command - 1)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cfb_mjx.envs import PAPER_REWARD, Layout, Noise, Starts, TargetReward, TargetTask, observe, reset, step
 from cfb_mjx.envs.episode import QUIET
-from cfb_mjx.envs.observation import Estimate, frame, observation, remember, start
+from cfb_mjx.envs.observation import StateEstimate, frame, observation, remember, start
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, State, rollout
 from cfb_mjx.parameters import load_randomisation
@@ -160,7 +160,7 @@ def test_small_lengths_are_shown_as_they_are_and_large_ones_by_their_logarithm(n
         layout = Layout(position_limit_m=20.0, position_bend_m=0.1, velocity_bend_mps=0.1, velocity_scale_mps=0.1)
         index = {"position": 1, "velocity": 4}[what]
         along = jnp.array([0.0, 1.0, 0.0]) * unit
-        return frame(layout, Estimate(**at | {what: along}, quaternion=jnp.array([1.0, 0.0, 0.0, 0.0])))[index]
+        return frame(layout, StateEstimate(**at | {what: along}, quaternion=jnp.array([1.0, 0.0, 0.0, 0.0])))[index]
 
     for what in ("position", "velocity"):
         assert 0 < shown(what, near) <= near / 0.1 + 1e-9
@@ -251,7 +251,7 @@ def test_position_and_velocity_have_axes_of_their_own_choice(body_position, body
         body_velocity=body_velocity,
     )
     quaternion = jnp.asarray(turn.as_quat()[[3, 0, 1, 2]])
-    shown = frame(layout, Estimate(jnp.asarray(position), jnp.asarray(velocity), quaternion, jnp.zeros(3)))
+    shown = frame(layout, StateEstimate(jnp.asarray(position), jnp.asarray(velocity), quaternion, jnp.zeros(3)))
     np.testing.assert_allclose(shown[:3], turn.inv().apply(position) if body_position else position, atol=1e-9)
     np.testing.assert_allclose(shown[3:6], turn.inv().apply(velocity) if body_velocity else velocity, atol=1e-9)
 
@@ -259,7 +259,7 @@ def test_position_and_velocity_have_axes_of_their_own_choice(body_position, body
 def test_commands_before_the_first_are_shown_as_those_after_it():
     """From -1 to 1, as 2 u - 1; the newest first."""
     layout, zero = Layout(past_commands=3), jnp.zeros(3)
-    at = Estimate(zero, zero, jnp.array([1.0, 0.0, 0.0, 0.0]), zero)
+    at = StateEstimate(zero, zero, jnp.array([1.0, 0.0, 0.0, 0.0]), zero)
     memory = start(layout, at, jnp.array([0.5, 0.6, 0.75, 1.0]))
     np.testing.assert_allclose(memory.commands, [[0.0, 0.2, 0.5, 1.0]] * 3, atol=1e-12)
     memory = remember(layout, memory, at, jnp.array([0.0, 0.25, 0.5, 0.75]))
@@ -270,7 +270,7 @@ def test_the_integral_and_the_set_points_are_shown_in_their_units():
     """An error of 0.2 m for 400 steps of 8 ms is 0.64 m s, beyond the limit of 0.6; one of 5 m counts as 0.3 m."""
     layout = Layout(past_estimates=0, past_commands=0, integral=True, setpoint_scales=(2.0, 20.0))
     at = dict.fromkeys(("velocity", "body_rate"), jnp.zeros(3))
-    at = Estimate(jnp.array([0.2, -0.1, 5.0]), quaternion=jnp.array([1.0, 0.0, 0.0, 0.0]), **at)
+    at = StateEstimate(jnp.array([0.2, -0.1, 5.0]), quaternion=jnp.array([1.0, 0.0, 0.0, 0.0]), **at)
 
     def after(steps):
         memory = jax.lax.fori_loop(

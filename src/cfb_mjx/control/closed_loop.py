@@ -20,7 +20,7 @@ from cfb_mjx.control.controllers import Controller
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.engine.batching import LANES, PACKED_BYTES, axes, differentiated_as, examples, grouped, one_of_many
 from cfb_mjx.engine.cpu_kernel import one_kernel
-from cfb_mjx.envs.observation import Estimate, observation, remember
+from cfb_mjx.envs.observation import StateEstimate, observation, remember
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.rollout import fits_one_kernel, fly_rows, in_components
 from cfb_mjx.model.state import State, stack
@@ -186,7 +186,7 @@ def _loop(drones: _Drones, parts: Sequence[Any], hold: int, commands: int, every
 
     def seen(prepared, at, target):
         state = whole(prepared, at)
-        return Estimate(state.position - target, state.velocity, state.quaternion, state.body_rate)
+        return StateEstimate(state.position - target, state.velocity, state.quaternion, state.body_rate)
 
     def moved(prepared, at, command):
         return fly_rows(prepared, at, Vec.unstack(command[None]), hold)

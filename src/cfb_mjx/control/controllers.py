@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from cfb_mjx.control import mellinger, pid
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
-from cfb_mjx.envs.observation import Estimate
+from cfb_mjx.envs.observation import StateEstimate
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
@@ -26,11 +26,11 @@ class Controller(Protocol):
         """Time between two commands, s."""
         ...
 
-    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
+    def start(self, estimate: StateEstimate, command: Float[Array, "4"]) -> Any:
         """Return the memory at take-over; ``command`` is the command at which the rotors turn."""
         ...
 
-    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
+    def command(self, memory: Any, estimate: StateEstimate) -> tuple[Any, Float[Array, "4"]]:
         """Return the new memory and the command of M1..M4, each in [0, 1]."""
         ...
 
@@ -41,11 +41,11 @@ class PidController(eqx.Module):
     firmware: pid.FirmwarePid
     control_dt_s: float = eqx.field(static=True, default=pid.DT)
 
-    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
+    def start(self, estimate: StateEstimate, command: Float[Array, "4"]) -> Any:
         """Return a memory with empty integrators."""
         return pid.init(self.firmware, _measured(estimate))
 
-    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
+    def command(self, memory: Any, estimate: StateEstimate) -> tuple[Any, Float[Array, "4"]]:
         """Return the new memory and the command of M1..M4, each in [0, 1]."""
         return pid.step(self.firmware, memory, _measured(estimate), pid.Setpoint.hover(jnp.zeros(3)))
 
@@ -56,11 +56,11 @@ class MellingerController(eqx.Module):
     firmware: mellinger.Mellinger
     control_dt_s: float = eqx.field(static=True, default=pid.DT)
 
-    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> Any:
+    def start(self, estimate: StateEstimate, command: Float[Array, "4"]) -> Any:
         """Return a memory with empty integrators."""
         return mellinger.init(_measured(estimate))
 
-    def command(self, memory: Any, estimate: Estimate) -> tuple[Any, Float[Array, "4"]]:
+    def command(self, memory: Any, estimate: StateEstimate) -> tuple[Any, Float[Array, "4"]]:
         """Return the new memory and the command of M1..M4, each in [0, 1]."""
         return mellinger.step(self.firmware, memory, _measured(estimate), jnp.zeros(3))
 
@@ -87,7 +87,7 @@ def is_flip_policy(controller: Controller) -> bool:
     return bool(getattr(getattr(controller, "layout", None), "setpoint_scales", ()))
 
 
-def _measured(estimate: Estimate) -> State:
+def _measured(estimate: StateEstimate) -> State:
     return State(estimate.position, estimate.velocity, estimate.quaternion, estimate.body_rate, jnp.zeros(4))
 
 

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.documents import load_named, parse_yaml, refuse_unknown, shipped_names, told
-from cfb_mjx.envs.observation import Estimate, Memory, observation, remember
+from cfb_mjx.envs.observation import Memory, StateEstimate, observation, remember
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_text
 from cfb_mjx.model.state import AnyArray
@@ -92,14 +92,14 @@ class Manoeuvre(eqx.Module):
         """Time between two commands, s."""
         return self.holder.control_dt_s
 
-    def start(self, estimate: Estimate, command: Float[Array, "4"]) -> ManoeuvreMemory:
+    def start(self, estimate: StateEstimate, command: Float[Array, "4"]) -> ManoeuvreMemory:
         """Return the memory at take-over."""
         climb, catch = (self.holder.start(seen, command) for seen in (self._raised(estimate), estimate))
         turn, roll = self.turner.start(estimate, command), roll_angle(estimate.quaternion)
         nothing = jnp.asarray(0)
         return ManoeuvreMemory(climb, turn, catch, nothing, nothing, roll, jnp.zeros_like(roll))
 
-    def command(self, memory: ManoeuvreMemory, estimate: Estimate) -> tuple[ManoeuvreMemory, Float[Array, "4"]]:
+    def command(self, memory: ManoeuvreMemory, estimate: StateEstimate) -> tuple[ManoeuvreMemory, Float[Array, "4"]]:
         """Return the new memory and the command of M1..M4, each in [0, 1]."""
         phase, count, roll, turned = self._advance(memory, estimate)
         raised, held, turning = self._raised(estimate), self.holder.layout, self.turner.layout
@@ -115,7 +115,7 @@ class Manoeuvre(eqx.Module):
         climbed, spun = remember(held, memory.climb, raised, u), remember(turning, memory.turn, estimate, u)
         return ManoeuvreMemory(climbed, spun, caught, phase, count, roll, turned), u
 
-    def _advance(self, memory: ManoeuvreMemory, estimate: Estimate):
+    def _advance(self, memory: ManoeuvreMemory, estimate: StateEstimate):
         """Phase of the next command, number of commands in it so far, roll angle, and angle turned."""
         roll, knobs = roll_angle(estimate.quaternion), self.knobs
         turned = jnp.where(memory.phase == TURN, memory.turned + nearest(roll - memory.roll), 0.0)
@@ -126,7 +126,7 @@ class Manoeuvre(eqx.Module):
         over = ((memory.phase == CLIMB) & climbed) | ((memory.phase == TURN) & round_about)
         return memory.phase + over, jnp.where(over, 1, memory.count + 1), roll, turned
 
-    def _raised(self, estimate: Estimate) -> Estimate:
+    def _raised(self, estimate: StateEstimate) -> StateEstimate:
         up = jnp.zeros_like(estimate.position).at[2].set(self.knobs.climb_m)
         return eqx.tree_at(lambda e: e.position, estimate, estimate.position - up)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cfb_mjx.envs.observation import Estimate, Layout, Memory, observation, remember, start
+from cfb_mjx.envs.observation import Layout, Memory, StateEstimate, observation, remember, start
 from cfb_mjx.errors import CfbError
 
 ACTIVATIONS: dict[str, Callable] = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
@@ -105,12 +105,12 @@ class NeuralController(eqx.Module):
         network = self.network
         return NeuralController(WrittenOut(network.weights, network.biases, network.activation), self.layout)
 
-    def start(self, estimate: Estimate, command: Float[Array, " 4 *drones"] | float = 0.55) -> Memory:
+    def start(self, estimate: StateEstimate, command: Float[Array, " 4 *drones"] | float = 0.55) -> Memory:
         """Return the memory of a controller that has commanded ``command`` on ``estimate`` for long."""
         return start(self.layout, estimate, command)
 
     def command(
-        self, memory: Memory, estimate: Estimate, setpoint: Float[Array, " setpoints *drones"] | None = None
+        self, memory: Memory, estimate: StateEstimate, setpoint: Float[Array, " setpoints *drones"] | None = None
     ) -> tuple[Memory, Float[Array, " 4 *drones"]]:
         """New memory and command; call it every ``layout.control_dt_s``. Policies with set-points need ``setpoint``."""
         u = self.act(observation(self.layout, memory, estimate, setpoint))

@@ -21,7 +21,7 @@ from cfb_mjx.deploy import cortex
 from cfb_mjx.deploy.compiled import FLAGS, CompiledPolicy, compile_policy
 from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.deploy.export import Exported
-from cfb_mjx.envs import Estimate, TargetTask, Task
+from cfb_mjx.envs import StateEstimate, TargetTask, Task
 from cfb_mjx.envs.episode import Episode, reset, step, with_room
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
@@ -93,7 +93,7 @@ def random_inputs(generator: np.random.Generator, sequences: int, steps: int) ->
 def _commands(controller, hover, inputs):
     def one(rows):
         def estimate(row):
-            return Estimate(row[:3] - row[13:], row[3:6], row[6:10], row[10:13])
+            return StateEstimate(row[:3] - row[13:], row[3:6], row[6:10], row[10:13])
 
         def step(memory, row):
             return controller.command(memory, estimate(row))
@@ -177,7 +177,7 @@ def _first(task: Task, plant: Quadrotor, controller: Flier, start: State, hover:
 
 
 @eqx.filter_jit
-def _commanded(controller: Flier, memory: Any, estimate: Estimate):
+def _commanded(controller: Flier, memory: Any, estimate: StateEstimate):
     return controller.command(memory, estimate)
 
 

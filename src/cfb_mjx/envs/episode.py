@@ -20,7 +20,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cfb_mjx.envs import observation as seen
-from cfb_mjx.envs.observation import Estimate, Layout, Memory
+from cfb_mjx.envs.observation import Layout, Memory, StateEstimate
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
@@ -237,8 +237,8 @@ class Episode(eqx.Module):
     past: DelayLine
     """Past values of `Pose`, because estimates are delayed."""
     memory: Memory
-    estimate: Estimate
-    """Estimate that the controller sees now."""
+    estimate: StateEstimate
+    """What the controller sees now."""
     count: Int[Array, ""]
     key: PRNGKeyArray
 
@@ -334,7 +334,7 @@ def privileged(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array,
     """
     state, parameters = episode.state, episode.model.parameters
     position = state.position - episode.target
-    true = seen.frame(task.layout, Estimate(position, state.velocity, state.quaternion, state.body_rate))
+    true = seen.frame(task.layout, StateEstimate(position, state.velocity, state.quaternion, state.body_rate))
     errors = task.errors(state, episode.target, episode.setpoint)
     parts = [true, errors, jnp.sqrt(errors), state.rotor_speed / parameters.reference_rotor_speed]
     parts.append(episode.memory.integral / task.layout.integral_limit_ms)
@@ -403,7 +403,7 @@ def _pose(state: State) -> Pose:
     return Pose(state.position, state.velocity, state.quaternion, state.body_rate)
 
 
-def _estimate(task: Task, model: Quadrotor, past: DelayLine, target: Array, key: PRNGKeyArray) -> Estimate:
+def _estimate(task: Task, model: Quadrotor, past: DelayLine, target: Array, key: PRNGKeyArray) -> StateEstimate:
     parameters, noise = model.parameters, task.noise
     delay = parameters.pose_delay
     if noise.pose_jitter_s:
@@ -417,7 +417,7 @@ def _estimate(task: Task, model: Quadrotor, past: DelayLine, target: Array, key:
     # Interpolation between two unit quaternions is slightly shorter than one.
     q = late.quaternion / jnp.sqrt(jnp.sum(late.quaternion**2))
     turned = Vec.unstack(parameters.attitude_offset + noise.attitude_rad * draws[6:9])
-    return Estimate(
+    return StateEstimate(
         late.position - target + noise.position_m * draws[:3],
         late.velocity + noise.velocity_mps * draws[3:6],
         multiply(Vec.unstack(q), exponential(turned * 0.5)).stack(),

@@ -76,7 +76,7 @@ BEFORE_BENDS = {"position_bend_m": 0.0, "velocity_bend_mps": 0.0, "body_position
 ``position_scale_m`` and none of these fields."""
 
 
-class Estimate(eqx.Module):
+class StateEstimate(eqx.Module):
     """Output of the state estimator."""
 
     position: Float[AnyArray, " 3 *drones"]
@@ -112,7 +112,7 @@ def rotation_matrix(q: Float[AnyArray, " 4 *drones"]) -> Float[Array, "3 3 *dron
     )
 
 
-def frame(layout: Layout, estimate: Estimate) -> Float[Array, " frame *drones"]:
+def frame(layout: Layout, estimate: StateEstimate) -> Float[Array, " frame *drones"]:
     """Scaled numbers of one estimate."""
     turn = rotation_matrix(estimate.quaternion)
 
@@ -144,7 +144,7 @@ def _bent(length: Float[Array, " *drones"], bend: float) -> Float[Array, " *dron
     return bend * jnp.arcsinh(length / bend) / length
 
 
-def start(layout: Layout, estimate: Estimate, command: Float[Array, " 4 *drones"] | float) -> Memory:
+def start(layout: Layout, estimate: StateEstimate, command: Float[Array, " 4 *drones"] | float) -> Memory:
     """Memory of a controller that has seen ``estimate`` and commanded ``command`` [0 to 1] for long."""
     shown = frame(layout, estimate)
     drones = shown.shape[1:]
@@ -154,7 +154,7 @@ def start(layout: Layout, estimate: Estimate, command: Float[Array, " 4 *drones"
 
 
 def observation(
-    layout: Layout, memory: Memory, estimate: Estimate, setpoint: Float[Array, " setpoints *drones"] | None = None
+    layout: Layout, memory: Memory, estimate: StateEstimate, setpoint: Float[Array, " setpoints *drones"] | None = None
 ) -> Float[Array, " size *drones"]:
     """Input of the network, (``layout.size``,).
 
@@ -175,7 +175,7 @@ def observation(
     return jnp.concatenate(parts)
 
 
-def remember(layout: Layout, memory: Memory, estimate: Estimate, command: Float[Array, " 4 *drones"]) -> Memory:
+def remember(layout: Layout, memory: Memory, estimate: StateEstimate, command: Float[Array, " 4 *drones"]) -> Memory:
     """Memory after ``command`` [0 to 1] on ``estimate``; call it once every ``layout.control_dt_s``."""
     frames, commands = memory.frames, memory.commands
     if layout.past_estimates:

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.envs.observation import Estimate
+from cfb_mjx.envs.observation import StateEstimate
 from cfb_mjx.errors import CfbError
 from cfb_mjx.reference_simulator import Case
 from cfb_mjx.reference_simulator import constants as c
@@ -57,12 +57,12 @@ def controller_of(controllers: Sequence[NeuralController]) -> OtherController:
 
 @eqx.filter_jit
 def _start(controllers, *shown):
-    return jax.vmap(lambda controller, *of: controller.start(Estimate(*of)))(controllers, *shown)
+    return jax.vmap(lambda controller, *of: controller.start(StateEstimate(*of)))(controllers, *shown)
 
 
 @eqx.filter_jit
 def _command(controllers, memories, *shown):
-    return jax.vmap(lambda controller, memory, *of: controller.command(memory, Estimate(*of)))(
+    return jax.vmap(lambda controller, memory, *of: controller.command(memory, StateEstimate(*of)))(
         controllers, memories, *shown
     )
 
