@@ -19,7 +19,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = ("tutorial", "my-drone", "train-and-deploy", "choosing", "adding-an-effect", "effects", "faq", "scaling")
+PAGES = (
+    *("tutorial", "my-drone", "train-and-deploy", "choosing", "adding-an-effect", "effects", "faq", "scaling"),
+    "swarms",
+)
 BLOCK = re.compile(r"^```python\n(?P<code>.*?)^```\n(?:\n```text\n(?P<output>.*?)^```\n)?", re.S | re.M)
 
 

@@ -1,6 +1,5 @@
 """Commands that write several files: a rerun that is stopped between them leaves those of the run before."""
 
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -53,7 +52,7 @@ def test_a_loop_stopped_at_its_report_leaves_model_and_report_of_the_run_before(
     nothing = {"reported": [], "unexplained": None, "together": None}
     outcome = SimpleNamespace(model_file=lambda *_: load_model_file("cfb"), to_json=dict, **nothing)
     monkeypatch.setattr("cfb_mjx.sysid.tracing.closing.close_loop", lambda *_, **__: outcome)
-    monkeypatch.setitem(sys.modules, "cfb_mjx.view.closing", SimpleNamespace(write_report=stop))
+    monkeypatch.setattr("cfb_mjx.view.closing.write_report", stop)
     arguments = ["close-loop", "--fit", tmp_path / "fit.mcap", "--held-out", tmp_path / "held.mcap", "-o", folder]
     assert cli.main(list(map(str, arguments))) == 130
     assert set(contents(folder).values()) == {b"old"}

@@ -34,6 +34,8 @@ from cfb_mjx.model.vector import Vec
 from cfb_mjx.parameters import load_model_file
 
 AIR_ONLY, DRAG = ("gust", "jet"), 0.03
+ABOVE = [0.03, 0.02, 1.4, 0.2, *[0.0] * 14, 0.3, 0.0, -3.1, 0.1, *[0.0] * 14]
+"""Another drone, as the memory of `Downwash` holds it, above where the flights begin."""
 STEP = 1e-5
 """Of the difference quotients, as a share of the prior's width."""
 INSIDE = (0.7, 0.4, 0.6, 0.8)
@@ -95,9 +97,10 @@ def test_every_effect_describes_itself(name):
 
 
 def _sensed(model: Quadrotor, state: State) -> State:
-    """The state once a log has told a voltage and a time: only then do some effects show."""
+    """The state once a log has told a voltage, a time and another drone: only then do some effects show."""
     memory = [jax.tree.map(Vec.unstack, memory) for memory in begin(model, state).memory]
-    reading = Reading(voltage=jnp.asarray(3.9, jnp.result_type(float)), time=jnp.asarray(6.0, jnp.result_type(float)))
+    told = (jnp.asarray(x, jnp.result_type(float)) for x in (3.9, 6.0))
+    reading = Reading(*told, (Vec.unstack(jnp.asarray(ABOVE, jnp.result_type(float))),))
     memory = [effect.sense(each, reading) for effect, each in zip(model.effects, memory, strict=True)]
     memory = jax.tree.map(lambda v: v.stack(), tuple(memory), is_leaf=lambda x: isinstance(x, Vec))
     return dataclasses.replace(state, memory=memory)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfb_mjx.commands.command import Command, Model, OtherLogs, OutputFolder, Pairs, Result, command
+from cfb_mjx.commands.command import Command, FlownWith, Model, OtherLogs, OutputFolder, Pairs, Result, command
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import VectorFormat, output_folder, require_no_file, together, write_json
 
@@ -76,6 +76,8 @@ class CloseLoop(Command):
         output: folder to write to.
         fit: flights of one drone to fit, with different manoeuvres; at least 10 s in total. Required.
         held_out: other flights of the same drone, for the evaluation; nothing is fitted to them. Required.
+        flown_with: logs of another drone that flew at the same time, one for each log of --fit and then of --held-out,
+            in the same order; its wake is then an effect that can be found. Times of one clock, positions of one frame.
         model: preset or model YAML that is compared with the flights and corrected.
         set: changes to the model's parameters, for instance mass=0.045 (kg).
         format: also write the report's figures as vector graphics, pdf or svg, into the folder figures.
@@ -85,6 +87,7 @@ class CloseLoop(Command):
     output: OutputFolder
     fit: OtherLogs = ()
     held_out: OtherLogs = ()
+    flown_with: FlownWith = ()
     model: Model = "cfb-guards"
     set: Pairs = ()
     format: VectorFormat | None = None
@@ -134,15 +137,16 @@ class CloseLoop(Command):
         return Closed(numbers, folder / "report.html", model, known)
 
     def _read(self) -> tuple[list[FlightLog], list[FlightLog]]:
-        from cfb_mjx.commands.fitted import require_apart
-        from cfb_mjx.logs import read_log, require_own_names
+        from cfb_mjx.commands.fitted import read_together, require_apart
+        from cfb_mjx.logs import require_own_names
 
         if not self.fit or not self.held_out:
             raise CfbError(
                 "close-loop needs flights to fit (--fit LOG...) and other flights to evaluate on (--held-out LOG...)."
             )
         require_apart(self.fit, self.held_out)
-        logs, judged = [read_log(path) for path in self.fit], [read_log(path) for path in self.held_out]
+        flights = read_together([*self.fit, *self.held_out], self.flown_with)
+        logs, judged = flights[: len(self.fit)], flights[len(self.fit) :]
         for group in (logs, judged):
             require_own_names(group)
         if sum(log.duration for log in logs) < LEAST_SECONDS:

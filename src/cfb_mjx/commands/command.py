@@ -68,6 +68,7 @@ Folder = Annotated[Path | None, tyro.conf.arg(aliases=["-o"], metavar="FOLDER")]
 Files = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
 Logs = Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="LOG...")]
 OtherLogs = Annotated[tuple[Path, ...], tyro.conf.arg(metavar="LOG...")]
+FlownWith = Annotated[tuple[Path, ...], tyro.conf.arg(aliases=["--with"], metavar="LOG...")]
 Model = Annotated[str, tyro.conf.arg(metavar="MODEL")]
 Devices = Annotated[int, Within(1)]
 if TYPE_CHECKING:

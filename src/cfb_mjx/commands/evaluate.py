@@ -7,7 +7,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cfb_mjx.commands.command import Command, Devices, Figure, File, Logs, Model, Pairs, Result, command, lines_of
+from cfb_mjx.commands.command import (
+    Command,
+    Devices,
+    Figure,
+    File,
+    FlownWith,
+    Logs,
+    Model,
+    Pairs,
+    Result,
+    command,
+    lines_of,
+)
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, write_json
 from cfb_mjx.terminal import aligned
@@ -54,6 +66,7 @@ class Evaluate(Command):
 
     Attributes:
         logs: flight logs (MCAP, parquet, csv).
+        flown_with: logs of another drone that flew at the same time, one for each log, in the same order.
         model: preset (cfb-guards, cfb, cfb-fleet, cfb-idsia, cf21b-500, cf2x) or model YAML.
         set: changes to the model's parameters, for instance mass=0.045 (kg).
         json: JSON file for the results.
@@ -63,6 +76,7 @@ class Evaluate(Command):
     """
 
     logs: Logs
+    flown_with: FlownWith = ()
     model: Model = "cfb-guards"
     set: Pairs = ()
     json: File = None
@@ -76,13 +90,14 @@ class Evaluate(Command):
         Raises:
             CfbError: bad logs, an invalid model, or files that cannot be written.
         """
-        from cfb_mjx.logs import estimate_command_shift, read_log
+        from cfb_mjx.commands.fitted import read_together
+        from cfb_mjx.logs import estimate_command_shift
         from cfb_mjx.runtime import Progress, configure_jax, environment
 
         if not self.logs:
             raise CfbError("evaluate needs at least one log; see 'cfb evaluate --help'.")
         require_folder(self.json, self.figure)
-        logs = [read_log(path) for path in self.logs]  # before jax loads, so that a bad log is refused at once
+        logs = read_together(self.logs, self.flown_with)  # before jax loads, so that a bad log is refused at once
         configure_jax(x64=True, devices=self.devices)
         from cfb_mjx.devices import Devices
         from cfb_mjx.model import Quadrotor

@@ -1,4 +1,4 @@
-"""Shared by all commands that fit a model: the check of the held-out logs, and the provenance of the model."""
+"""Shared by the commands that read logs and fit models: drones that flew together, held-out logs, provenance."""
 
 from __future__ import annotations
 
@@ -6,9 +6,33 @@ import shlex
 from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cfb_mjx import __version__
 from cfb_mjx.errors import CfbError
+
+if TYPE_CHECKING:
+    from cfb_mjx.logs import FlightLog
+
+
+def read_together(paths: Sequence[Path], others: Sequence[Path]) -> list[FlightLog]:
+    """Read logs, each with that of another drone that flew at the same time.
+
+    Args:
+        paths: the logs.
+        others: logs of the other drone, one for each of ``paths`` in the same order; empty if the drone flew alone.
+
+    Raises:
+        CfbError: a bad log, other numbers of logs, or logs that do not overlap in time.
+    """
+    from cfb_mjx.logs import read_log, with_other
+
+    if others and len(others) != len(paths):
+        raise CfbError(
+            f"--with: {len(others)} logs of another drone for {len(paths)} logs; give one for each, in the same order."
+        )
+    logs = [read_log(path) for path in paths]
+    return [with_other(log, read_log(other)) for log, other in zip(logs, others, strict=True)] if others else logs
 
 
 def require_apart(fit: Sequence[Path], held_out: Sequence[Path]) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from cfb_mjx.commands.command import (
     Command,
     File,
+    FlownWith,
     Logs,
     Model,
     ModelOutput,
@@ -75,6 +76,8 @@ class Refine(Command):
         effects: names of effects (docs/effects.md) with commas between them. Default: the effects of the model.
             plant stands for all effects that an undamaged drone without load usually needs.
         held_out: other flights, for the evaluation; nothing is fitted to them.
+        flown_with: logs of another drone that flew at the same time, one for each log and then for each of --held-out,
+            in the same order.
         model: preset or model YAML to start from.
         set: changes to the model's parameters before the fit, for instance mass=0.045 (kg).
         estimator: what the parameters are fitted to.
@@ -91,6 +94,7 @@ class Refine(Command):
     output: ModelOutput
     effects: str | None = None
     held_out: OtherLogs = ()
+    flown_with: FlownWith = ()
     model: Model = "cfb-guards"
     set: Pairs = ()
     estimator: Literal["predictions", "innovations"] = "predictions"
@@ -138,7 +142,8 @@ class Refine(Command):
 
     def _flights(self) -> tuple[list[FlightLog], list[FlightLog]]:
         """Check the arguments, and read the flights to fit and the held-out flights."""
-        from cfb_mjx.logs import read_log, require_own_names
+        from cfb_mjx.commands.fitted import read_together
+        from cfb_mjx.logs import require_own_names
 
         if not self.logs:
             raise CfbError("refine needs at least one log; see 'cfb refine --help'.")
@@ -148,7 +153,8 @@ class Refine(Command):
             raise CfbError(
                 "--predictor and --weight are for --estimator predictions; leave them out, or use that estimator."
             )
-        logs, judged = ([read_log(path) for path in paths] for paths in (self.logs, self.held_out))
+        flights = read_together([*self.logs, *self.held_out], self.flown_with)
+        logs, judged = flights[: len(self.logs)], flights[len(self.logs) :]
         for group in (logs, judged):
             require_own_names(group)
         return logs, judged

@@ -12,7 +12,7 @@ from cfb_mjx.logs.mcap_reader import read_mcap
 from cfb_mjx.logs.mcap_writer import write_mcap
 from cfb_mjx.logs.radio_csv import read_radio_csv
 from cfb_mjx.logs.reading import FORMATS, read_log
-from cfb_mjx.logs.resample import resample
+from cfb_mjx.logs.resample import resample, with_other
 from cfb_mjx.logs.tabular import read_tabular, write_tabular
 from cfb_mjx.logs.ulog import read_ulog
 from cfb_mjx.logs.usd_card import read_usd_card
@@ -39,6 +39,7 @@ __all__ = [
     "require_own_names",
     "resample",
     "validate",
+    "with_other",
     "write_mcap",
     "write_tabular",
 ]

@@ -42,6 +42,7 @@ def runs(mask: np.ndarray) -> list[tuple[int, int]]:
 
 REQUIRED = ("time", "position", "velocity", "quaternion", "body_rate", "specific_force", "command")
 OPTIONAL = ("rotor_speed", "battery_voltage")
+_BESIDE = "other"
 # An alias, because inside the class the name slice is a method.
 Rows = np.ndarray | slice
 _WIDTH = {
@@ -52,7 +53,9 @@ _WIDTH = {
     "specific_force": 3,
     "command": 4,
     "rotor_speed": 4,
+    _BESIDE: 9,
 }
+_ARRAYS = (*REQUIRED, *OPTIONAL, _BESIDE)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -73,6 +76,9 @@ class FlightLog:
         battery_voltage: (n,) V; None if not measured.
         metadata: JSON-like mapping with at least ``name``, ``source`` (file name), ``format`` and
             ``observation_delay`` (s by which position, velocity and quaternion lag their row's time; None: unknown).
+        other: (n, 9) another drone that flew at the same time, at the rows' own times, world: position (m), velocity
+            (m/s), and thrust over mass as a vector (m/s^2); NaN where unknown, None if there is none. `with_other`
+            adds it; files do not hold it.
 
     Raises:
         ValueError: an array has the wrong shape. Only shapes are checked here; `validate` checks the content.
@@ -88,12 +94,13 @@ class FlightLog:
     rotor_speed: np.ndarray | None = None
     battery_voltage: np.ndarray | None = None
     metadata: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    other: np.ndarray | None = None
 
     def __post_init__(self):
         n = len(self.time)
-        for field in (*REQUIRED, *OPTIONAL):
+        for field in _ARRAYS:
             value = getattr(self, field)
-            if value is None and field in OPTIONAL:
+            if value is None and field not in REQUIRED:
                 continue
             shape = (n, _WIDTH[field]) if field in _WIDTH else (n,)
             array = np.array(value, dtype=np.float64, order="C")
@@ -152,7 +159,7 @@ class FlightLog:
 
     def rows(self, index: Rows) -> FlightLog:
         """The rows selected by ``index`` (a mask, indices or a slice)."""
-        arrays = {f: getattr(self, f) for f in (*REQUIRED, *OPTIONAL)}
+        arrays = {f: getattr(self, f) for f in _ARRAYS}
         return self.replace(**{f: None if a is None else a[index] for f, a in arrays.items()})
 
     def replace(self, **changes) -> FlightLog:
@@ -174,7 +181,7 @@ class FlightLog:
 
     def __reduce__(self):
         # A mappingproxy cannot be pickled.
-        return FlightLog, (*(getattr(self, f) for f in (*REQUIRED, *OPTIONAL)), dict(self.metadata))
+        return FlightLog, (*(getattr(self, f) for f in (*REQUIRED, *OPTIONAL)), dict(self.metadata), self.other)
 
 
 def require_own_names(logs: Sequence[FlightLog]) -> None:

@@ -1,13 +1,18 @@
-"""Resample a log to a uniform time grid, without samples in its gaps."""
+"""Resample a log to a uniform time grid without samples in its gaps, and bring two drones' logs onto one clock."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import rotation
 from cfb_mjx.logs.flight_log import FlightLog, quantise_time
 
-_LINEAR = ("position", "velocity", "body_rate", "specific_force", "battery_voltage")
+_LINEAR = ("position", "velocity", "body_rate", "specific_force", "battery_voltage", "other")
+_SMOOTHING = 0.05
+"""Time over which the other drone's specific force is averaged, s: its wake does not follow vibrations."""
+_STANDS = 0.02
+"""Mean command below which the other drone's rotors do not turn."""
 
 
 def interpolate(time: np.ndarray, values: np.ndarray, instants: np.ndarray) -> np.ndarray:
@@ -68,3 +73,39 @@ def resample(log: FlightLog, rate: float) -> FlightLog:
         metadata={"resampled_hz": float(rate)},
         **fields,
     )
+
+
+def with_other(log: FlightLog, other: FlightLog) -> FlightLog:
+    """Add the motion of another drone that flew at the same time.
+
+    Args:
+        log: the flight.
+        other: flight of the other drone. Both logs have one clock and one world frame.
+
+    Returns:
+        The log with `FlightLog.other`; NaN where the other log has no rows.
+
+    Raises:
+        CfbError: the other log covers less than half of the flight.
+    """
+    time, delay = other.time, other.observation_delay or 0.0
+    before = np.clip(np.searchsorted(time, log.time, side="right") - 1, 0, len(time) - 1)
+    after = np.minimum(before + 1, len(time) - 1)
+    there = (log.time >= time[0]) & (log.time <= time[-1]) & (time[after] - time[before] <= other.gap_threshold)
+    if there.mean() < 0.5:
+        raise CfbError(
+            f"{other.name}: covers {there.mean():.0%} of {log.name} ({log.time[0]:.1f} to {log.time[-1]:.1f} s; the "
+            f"other drone {time[0]:.1f} to {time[-1]:.1f} s); give the log of a drone that flew at the same time, with "
+            "times of one clock."
+        )
+    rows = max(1, round(_SMOOTHING / other.nominal_interval))
+    mean = np.convolve(np.pad(other.specific_force[:, 2], rows // 2, mode="edge"), np.ones(rows) / rows, mode="valid")
+    lift = np.where(other.command.mean(axis=1) > _STANDS, np.maximum(mean[: len(time)], 0.0), 0.0)
+    # The pose of a row is older than the row.
+    w, x, y, z = interpolate(time - delay, rotation.tidy(other.quaternion), log.time).T
+    up = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z], axis=1)
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    seen = [interpolate(time - delay, values, log.time) for values in (other.position, other.velocity)]
+    thrust = np.interp(log.time, time, lift)[:, None] * up
+    found = np.concatenate([*seen, thrust], axis=1)
+    return log.replace(other=np.where(there[:, None], found, np.nan), metadata={"other": other.name})

@@ -15,6 +15,9 @@ PLAIN_ROWS = 17
 ESC, LAGGED, BOB, BOB_V, FLEX = slice(17, 21), slice(21, 25), slice(25, 28), slice(28, 31), slice(31, 33)
 ROWS = 33
 STRING_RATE, STRING_DAMPING = 75.0, 0.25  # rad/s, and damping ratio of the stretching string
+WAKE_BEGINS = 0.05  # m below the other drone
+LONGEST_WAKE = 1.0  # s
+WAKE_MOMENTUM = 0.8047  # of the profile, over that of a uniform jet of half its width
 WORLD_EFFECTS = frozenset({"wind", "tether", "wall", "bob_mass"})
 
 
@@ -59,7 +62,8 @@ def derivative(p: SimpleNamespace, x: np.ndarray, command: np.ndarray, held: Sim
         command: commands that the speed controllers receive, (4, F).
         held: inputs that are constant over a tick: ``gain`` (4, F) rad/s; the unexplained accelerations ``push``
             (3, F) m/s^2, world axes, and ``twist`` (3, F) rad/s^2; ``gust`` (2, F) N; ``phase`` (F,) of the rotating
-            load at time 0, rad.
+            load at time 0, rad; ``past``, a function of an age (F,) in s that returns where the other drones were:
+            position (3, F), thrust axis (3, F) and thrust (F,).
         time: s.
 
     Returns:
@@ -75,6 +79,8 @@ def derivative(p: SimpleNamespace, x: np.ndarray, command: np.ndarray, held: Sim
         p, held.gain, command, speed, x[ESC] if extra else None, x[LAGGED] if extra else None
     )
     force, moment = rotor_wrench(p, x[2], rotation, body_velocity, w, speed, speed_rate)
+    if "wake" in p.on:
+        _add_wake(p, x[P], rotation, held.past, force, moment)
     rates = np.zeros_like(x)
     if "body_drag" in p.on:
         square = (body_velocity**2).sum(0)
@@ -121,6 +127,39 @@ def derivative(p: SimpleNamespace, x: np.ndarray, command: np.ndarray, held: Sim
         if "flex" in p.on:
             rates[32] -= rate[1]
     return rates, specific
+
+
+def _add_wake(p, position, rotation, past, force, moment):
+    """Add the push of the other drone's wake on each hub, a turbulent jet with the momentum of that drone's thrust.
+
+    The profile is that measured by Bauersfeld et al. (2025).
+    """
+    early, late = np.zeros(position.shape[1]), np.full(position.shape[1], LONGEST_WAKE)
+    there, axis, thrust = past(early)
+    for _ in range(9):  # bisection: the age of the air that is here now, which slows down as the wake widens
+        age = 0.5 * (early + late)
+        there, axis, thrust = past(age)
+        below = np.maximum(-((position - there) * axis).sum(0), 0.0)
+        pace = p.wake_pace * np.maximum(_flow(thrust), 1e-3)
+        older = below * (p.wake_width + 0.5 * p.wake_growth * below) > pace * age
+        early, late = np.where(older, age, early), np.where(older, late, age)
+    for rotor in range(4):
+        x, y = c.ROTOR_X[rotor], c.ROTOR_Y[rotor]
+        away = position + rotation[:, 0] * x + rotation[:, 1] * y - there
+        below = np.maximum(-(away * axis).sum(0), 0.0)
+        beside2 = (away**2).sum(0) - (away * axis).sum(0) ** 2
+        half = p.wake_width + p.wake_growth * below
+        speed = _flow(thrust) / half / (1 + 0.4142 * beside2 / half**2) ** 2 * (1 - np.exp(-below / WAKE_BEGINS))
+        push = turn_back(rotation, -axis * (0.25 * p.wake * speed**2))
+        force += push
+        moment[0] += y * push[2]
+        moment[1] -= x * push[2]
+        moment[2] += x * push[1] - y * push[0]
+
+
+def _flow(thrust):
+    """Speed on the axis of a jet with this thrust, times its half width, m^2/s."""
+    return np.sqrt(thrust / (c.AIR_DENSITY * np.pi * WAKE_MOMENTUM))
 
 
 def _world_force(p, x, held, rates):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from cfb_mjx.logs import FlightLog
 from cfb_mjx.reference_simulator import constants as c
 from cfb_mjx.reference_simulator import effects, physics
 from cfb_mjx.reference_simulator.controller import POSITION
-from cfb_mjx.reference_simulator.manoeuvres import MANOEUVRES
+from cfb_mjx.reference_simulator.manoeuvres import MANOEUVRES, crossing
 from cfb_mjx.reference_simulator.sensors import Instruments, draw_instruments, row_ticks
 from cfb_mjx.reference_simulator.simulation import Flight, Lane, simulate
 
@@ -43,12 +43,18 @@ class Case:
 
 @dataclass(frozen=True)
 class Campaign:
-    """Logs of one drone; ``truth`` has the labels and all random draws."""
+    """Logs of one drone; ``truth`` has the labels and all random draws.
+
+    ``fit_others`` and ``held_out_others`` are the logs of a second drone, one for each flight; empty unless the case
+    has the effect ``downwash``.
+    """
 
     case: Case
     fit: list[FlightLog]
     held_out: list[FlightLog]
     truth: dict
+    fit_others: list[FlightLog] = field(default_factory=list)
+    held_out_others: list[FlightLog] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -77,16 +83,25 @@ def fly_campaigns(cases: list[Case], duration_scale: float = 1.0) -> list[Campai
     drawn = [_draw(case, duration_scale) for case in cases]
     waiting = [plan for plans, _ in drawn for plan in plans]
     logs: dict[tuple[int, int], FlightLog] = {}
+    others: dict[tuple[int, int], FlightLog] = {}
     order = {id(plan): (i, plan.index) for i, (plans, _) in enumerate(drawn) for plan in plans}
     for attempt in range(TRIES):
-        flights = [_lane(plan, attempt) for plan in waiting]
-        crashed = []
-        for plan, lane, flight in zip(waiting, flights, simulate(flights), strict=True):
-            if flight.crashed:
+        lanes = [_lane(plan, attempt) for plan in waiting]
+        second = {i: _second(plan, lanes[i], attempt) for i, plan in enumerate(waiting) if plan.drone["wake"] > 0}
+        places = {i: len(lanes) + k for k, i in enumerate(second)}
+        lanes = [replace(lane, other=places.get(i)) for i, lane in enumerate(lanes)] + list(second.values())
+        flights, crashed = simulate(lanes), []
+        for i, plan in enumerate(waiting):
+            place = places.get(i, i)
+            if flights[i].crashed or flights[place].crashed:
                 crashed.append(plan)
-            else:
-                logs[order[id(plan)]] = _log(plan, lane, flight, attempt)
-                drawn[order[id(plan)][0]][1]["tries"][plan.index] = attempt + 1
+                continue
+            logs[order[id(plan)]] = _log(plan, lanes[i], flights[i], attempt)
+            if place != i:
+                rng = np.random.default_rng([plan.case.seed, plan.index, attempt, 3])
+                name = f"other_{plan.index + 1:02d}"
+                others[order[id(plan)]] = recorded(lanes[place], flights[place], rng, name)
+            drawn[order[id(plan)][0]][1]["tries"][plan.index] = attempt + 1
         waiting = crashed
         if not waiting:
             break
@@ -96,7 +111,9 @@ def fly_campaigns(cases: list[Case], duration_scale: float = 1.0) -> list[Campai
     for i, (plans, truth) in enumerate(drawn):
         own = [(plan.held_out, logs[i, plan.index]) for plan in plans]
         fit, held_out = [log for held, log in own if not held], [log for held, log in own if held]
-        campaigns.append(Campaign(cases[i], fit, held_out, truth))
+        own = [(plan.held_out, others[i, plan.index]) for plan in plans if (i, plan.index) in others]
+        beside = [log for held, log in own if not held], [log for held, log in own if held]
+        campaigns.append(Campaign(cases[i], fit, held_out, truth, *beside))
     return campaigns
 
 
@@ -142,6 +159,19 @@ def _lane(plan: _Plan, attempt: int) -> Lane:
         plan.instruments,
         setpoints,
         rows + MARGIN,
+        voltage=rng.uniform(3.4, 3.95),
+        gyro_bias=0.003 * rng.standard_normal(3),
+        rng=noise,
+    )
+
+
+def _second(plan: _Plan, lane: Lane, attempt: int) -> Lane:
+    """Draw the flight of a second, nominal drone that crosses over the first."""
+    rng, noise = np.random.default_rng([plan.case.seed, plan.index, attempt, 2]).spawn(2)
+    return replace(
+        lane,
+        drone=physics.nominal(),
+        setpoints=crossing(rng, lane.setpoints),
         voltage=rng.uniform(3.4, 3.95),
         gyro_bias=0.003 * rng.standard_normal(3),
         rng=noise,

@@ -288,3 +288,15 @@ def prop_damage(rng, drone, strength):
 def motor_hysteresis(rng, drone, strength):
     """Speed controllers with hysteresis (play)."""
     return put(drone, play=strength * rng.uniform(0.006, 0.015), play_share=rng.uniform(0.6, 1.0))
+
+
+@effect
+def downwash(rng, drone, strength):
+    """The wake of a second drone, which then takes part in all flights."""
+    return put(
+        drone,
+        wake=strength * rng.uniform(0.003, 0.006),
+        wake_width=rng.uniform(0.035, 0.055),
+        wake_growth=rng.uniform(0.06, 0.1),
+        wake_pace=rng.uniform(0.45, 0.75),
+    )

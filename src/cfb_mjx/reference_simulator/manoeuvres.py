@@ -112,6 +112,30 @@ def _yaw(goal, rng, rate: float, turn: float, pause=(0.5, 2.0)) -> None:
     goal[:, YAW_ANGLE] += np.cumsum(speed) * STEP
 
 
+def crossing(rng, below: np.ndarray) -> np.ndarray:
+    """Set-points of a second drone that crosses over one with the set-points ``below``, at changing heights."""
+    goal = np.zeros_like(below)
+    t = np.arange(len(below)) * STEP
+    # It follows the other slowly, and sweeps over it.
+    width = round(1.5 / STEP)
+    padded = np.pad(below[:, POSITION], ((width, width), (0, 0)), mode="edge")
+    window = np.hanning(width) / np.hanning(width).sum()
+    middle = np.stack([np.convolve(x, window, mode="same")[width:-width] for x in padded.T], axis=1)
+    for axis, period in ((0, rng.uniform(2.5, 3.5)), (1, rng.uniform(4.0, 6.0))):
+        middle[:, axis] += rng.uniform(0.2, 0.35) * np.sin(2 * np.pi * t / period + rng.uniform(0, 2 * np.pi))
+    rise = 0.55 + 0.25 * np.sin(2 * np.pi * t / rng.uniform(9.0, 13.0) + rng.uniform(0, 2 * np.pi))
+    # A drone that sinks as fast as its wake flies in it, so this one keeps its height while the other climbs and sinks.
+    reach = round(3.0 / STEP)
+    highest = np.pad(below[:, POSITION.stop - 1], (2 * reach, 2 * reach), mode="edge")
+    highest = np.max(np.lib.stride_tricks.sliding_window_view(highest, 2 * reach + 1), axis=1)
+    window = np.hanning(2 * reach + 1) / np.hanning(2 * reach + 1).sum()
+    middle[:, 2] = np.convolve(highest, window, mode="valid") + rise
+    goal[:, POSITION] = middle
+    goal[:, VELOCITY] = np.gradient(middle, STEP, axis=0)
+    goal[:, ACCELERATION] = np.gradient(goal[:, VELOCITY], STEP, axis=0)
+    return goal
+
+
 @manoeuvre
 def lateral(rng, seconds, vigour):
     goal = _route(

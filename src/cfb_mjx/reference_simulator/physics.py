@@ -62,6 +62,10 @@ NOMINAL: dict[str, object] = {
     "wall": 0.0,  # N
     "wall_x": 1.0,
     "wall_depth": 0.5,
+    "wake": 0.0,  # N s^2/m^2: force in another drone's wake over the square of the air's speed
+    "wake_width": 0.045,  # m from the axis at which the wake's speed has fallen to half, beside the other drone
+    "wake_growth": 0.077,  # growth of that width per distance
+    "wake_pace": 0.6,  # speed at which the wake moves on, over that of the air on its axis
     # These change the logged columns only.
     "motor_shift": 0,  # ticks by which the motor columns are late
     "extra_delay": 0,  # ticks by which pose and velocity are later than declared

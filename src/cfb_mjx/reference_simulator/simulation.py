@@ -9,7 +9,22 @@ import numpy as np
 
 from cfb_mjx.reference_simulator import constants as c
 from cfb_mjx.reference_simulator import physics
-from cfb_mjx.reference_simulator.airframe import BOB, BOB_V, ESC, LAGGED, PLAIN_ROWS, ROWS, SPEED, P, Q, V, W, advance
+from cfb_mjx.reference_simulator.airframe import (
+    BOB,
+    BOB_V,
+    ESC,
+    LAGGED,
+    LONGEST_WAKE,
+    PLAIN_ROWS,
+    ROWS,
+    SPEED,
+    P,
+    Q,
+    V,
+    W,
+    advance,
+    rotation_of,
+)
 from cfb_mjx.reference_simulator.controller import DITHER, POSITION, YAW_ANGLE, Controller, OtherController, relative
 from cfb_mjx.reference_simulator.sensors import Instruments, LowPass, Recorder
 
@@ -26,6 +41,8 @@ PLAYS = np.array([0.4, 1.0, 1.6])
 """Widths of the play elements of a speed controller, relative to their mean."""
 EXTRA = frozenset({"esc_rate", "second_lag", "bob_mass", "flex"})
 DELAY_RING = 16
+WAKE_RING = round(LONGEST_WAKE / c.TICK) + 2
+"""Ticks for which the positions of other drones are kept."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +57,7 @@ class Lane:
         voltage: voltage of the unloaded battery at the start, V.
         gyro_bias: bias of the gyro, (3,), rad/s.
         rng: generator of the noise in the control loop.
+        other: index of the lane of another drone that flies at the same time; this drone feels its wake.
     """
 
     drone: dict[str, np.ndarray]
@@ -49,6 +67,7 @@ class Lane:
     voltage: float
     gyro_bias: np.ndarray
     rng: np.random.Generator
+    other: int | None = None
 
 
 @dataclass(frozen=True)
@@ -69,7 +88,7 @@ class Flight:
 
 
 def simulate(lanes: list[Lane], other: OtherController | None = None) -> list[Flight]:
-    """Simulate all flights at once. A flight does not depend on the others.
+    """Simulate all flights at once. A flight depends on that of its ``other`` drone, and on no further one.
 
     Args:
         lanes: flights to simulate.
@@ -117,6 +136,10 @@ class _Loop:
         self.charge, self.current = np.zeros(count), np.full(count, HOVER_CURRENT)
         self.resting = np.array([lane.voltage for lane in lanes])
         self.crashed = np.zeros(count, dtype=bool)
+        # A drone that flies alone would feel its own wake, whose coefficient is zero.
+        self.source = np.array([i if lane.other is None else lane.other for i, lane in enumerate(lanes)])
+        self.p.wake = p.wake * np.array([lane.other is not None for lane in lanes])
+        self.wakes, self.newest = np.zeros((0, 7, count)), 0
 
     def step(self, tick: int) -> None:
         """Simulate one tick: measure, control, record, integrate."""
@@ -199,7 +222,29 @@ class _Loop:
             twist=self.wander[3:6],
             gust=p.gust * self.wander[6:],
             phase=self.phase,
+            past=self._past() if "wake" in p.on else None,
         )
+
+    def _past(self):
+        """Return a function of an age (F,) in s: where the other drones were, and their thrust."""
+        x = self.x[:, self.source]
+        thrust = c.thrust_curve(x[SPEED]).sum(0)
+        now = np.concatenate([x[P], rotation_of(x[Q])[:, 2], thrust[None]])
+        if not len(self.wakes):
+            self.wakes = np.repeat(now[None], WAKE_RING, axis=0)
+        self.newest = newest = (self.newest + 1) % WAKE_RING
+        self.wakes[newest] = now
+        kept, lanes = self.wakes, np.arange(len(self.lanes))
+
+        def past(age):
+            ticks = np.broadcast_to(age, lanes.shape) / c.TICK
+            before = np.minimum(ticks.astype(int), WAKE_RING - 2)
+            share = ticks - before
+            later, earlier = (kept[(newest - before - k) % WAKE_RING, :, lanes].T for k in (0, 1))
+            found = later + share * (earlier - later)
+            return found[:3], found[3:6], found[6]
+
+        return past
 
     def _check(self, tick):
         """Mark crashed flights, and reset them to hover so that they do not overflow."""

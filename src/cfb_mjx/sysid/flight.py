@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from cfb_mjx.devices import last_repeated
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.logs.rotation import tidy
+from cfb_mjx.model.effects.downwash import KNOWN
 from cfb_mjx.model.state import AnyArray
 from cfb_mjx.parameters import Parameters
 
@@ -26,6 +28,8 @@ WARM_UP = 0.3
 """Time after the start and after every gap in which rotor speeds are not yet known from commands, s: six motor lags."""
 MEASURED_SHARE = 0.98
 """Rotor speeds are used if every motor has at least this share of valid readings."""
+_AROUND = np.linspace(-0.6, 0.5, 23)
+"""Times around a row to which the other drone's path is fitted, s."""
 _VOLTAGE_SMOOTHING = 0.02
 """Time constant of the voltage's low-pass filter, s. It is short, because smoothing the dips under load would make
 `battery_sag` look weaker."""
@@ -56,6 +60,8 @@ class Flight(eqx.Module):
     """1 if all motors' rotor speeds were measured throughout."""
     voltage: Float[AnyArray, " n"]
     """Battery voltage, smoothed over past rows, V; NaN if not measured."""
+    other: Float[AnyArray, "n 36"]
+    """Another drone, as `cfb_mjx.model.effects.downwash.Other`; NaN if unknown."""
     fresh: Float[AnyArray, " n"]
     """1 at the first row and at the first row after a gap."""
     valid: Float[AnyArray, " n"]
@@ -125,6 +131,7 @@ def prepare_flight(log: FlightLog, delay: float, gyro_delay: float) -> Flight:
         "command": np.clip(log.command, 0.0, 1.0),
         "rotor_speed": speed,
         "voltage": _smoothed_voltage(log),
+        "other": _other_of(log),
         "fresh": fresh,
         "valid": valid.astype(float),
     }
@@ -156,6 +163,33 @@ def _rotor_speed(log: FlightLog) -> tuple[np.ndarray, bool]:
             return np.zeros((len(log), 4)), False
         out[:, motor] = np.interp(log.time, log.time[good], out[good, motor])
     return out, True
+
+
+def _other_of(log: FlightLog) -> np.ndarray:
+    """Polynomials of the other drone's path and wake about every row, (n, 36).
+
+    They are of the fifth degree, fitted to the time of a prediction after the row and that of a wake before it: the
+    other drone's path is known, like the commands.
+    """
+    nothing = np.full((len(log), 3 * sum(KNOWN)), np.nan)
+    if log.other is None:
+        return nothing
+    known = np.asarray(np.isfinite(log.other).all(axis=1))
+    if not known.any():
+        return nothing
+    pushed = log.other[:, 6:]
+    size = np.sqrt(np.maximum(np.linalg.norm(pushed, axis=1, keepdims=True), 1e-9))
+    at = log.time[:, None] + _AROUND
+    # Beyond its ends the other log is extended by constant velocity, so that the ends bend no path.
+    clipped = np.clip(at, log.time[known][0], log.time[known][-1])
+    path = interpolate(log.time[known], log.other[known, :3], clipped)
+    path += (at - clipped)[..., None] * interpolate(log.time[known], log.other[known, 3:6], clipped)
+    wake = interpolate(log.time[known], (-pushed / size)[known], clipped)
+    found = []
+    for values, count in zip((path, wake), KNOWN, strict=True):
+        powers = [_AROUND**k / math.factorial(k) for k in range(count)]
+        found.append(np.einsum("ks,nsi->nki", np.linalg.pinv(np.stack(powers, axis=1)), values))
+    return np.where(known[:, None], np.concatenate(found, axis=1).reshape(len(log), -1), np.nan)
 
 
 def _smoothed_voltage(log: FlightLog) -> np.ndarray:

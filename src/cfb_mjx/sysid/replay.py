@@ -164,6 +164,9 @@ def _rows(lanes: list[Lane], first: int, last: int) -> dict[str, np.ndarray]:
     for key in _READ:
         some = {at: np.asarray(getattr(flight, key))[rows[at]] for at, flight in flights.items()}
         found[key] = np.stack([some[id(lane.flight)] for lane in lanes])
+    if any(np.isfinite(flight.other).any() for flight in flights.values()):
+        some = {at: np.asarray(flight.other)[rows[at]] for at, flight in flights.items()}
+        found["other"] = np.stack([some[id(lane.flight)] for lane in lanes])
     return found | {"driven": np.stack([np.asarray(lane.driven)[rows[id(lane.flight)]] for lane in lanes])}
 
 
@@ -217,12 +220,13 @@ def _along(model: Quadrotor, lead: Array, share: Array, rows: dict[str, Array], 
         rows["voltage"][:-1],
         rows["time"][:-1],
         Vec.unstack(felt),
+        (Vec.unstack(rows["other"][:-1]),) if "other" in rows else (),
     )
 
     def row(carry, inputs):
         speed, memory = carry
-        at, command, dt, here, there, voltage, time, felt = inputs
-        reading = Reading(voltage, time)
+        at, command, dt, here, there, voltage, time, felt, other = inputs
+        reading = Reading(voltage, time, other)
         memory = tuple(effect.sense(m, reading) for effect, m in zip(model.effects, memory, strict=True))
         prepared = prepare(model, dt)
         path, moved = commanded_path(prepared, speed, memory, command)

@@ -13,6 +13,7 @@ from cfb_mjx.model.effects.catalogue import (
 )
 from cfb_mjx.model.effects.cog_offset import CogOffset
 from cfb_mjx.model.effects.command_delay import CommandDelay
+from cfb_mjx.model.effects.downwash import Downwash
 from cfb_mjx.model.effects.esc_rate_limit import EscRateLimit
 from cfb_mjx.model.effects.formula import ResidualFormula
 from cfb_mjx.model.effects.ground_effect import GroundEffect
@@ -53,6 +54,7 @@ __all__ = [
     "CogOffset",
     "CommandDelay",
     "Condition",
+    "Downwash",
     "Effect",
     "EscRateLimit",
     "GroundEffect",

@@ -66,6 +66,8 @@ class Reading(eqx.Module):
     """Battery voltage under load, V; NaN if unknown."""
     time: Array
     """Time since the log began, s."""
+    other: tuple[Vec, ...] = ()
+    """Other drones that flew at the same time (`cfb_mjx.model.effects.downwash.Other`); NaN while one is unknown."""
 
 
 class Effect(eqx.Module):
@@ -95,6 +97,8 @@ class Effect(eqx.Module):
     strengths: ClassVar[tuple[str, ...]]
     probes: ClassVar[tuple[dict[str, float], ...]] = ({},)
     searched: ClassVar[bool] = True
+    needs: ClassVar[str | None] = None
+    """Attribute of a flight log without which no flight shows the effect; a search then leaves it out."""
     assumed: ClassVar[tuple[str, ...]] = ()
     """Fields that no flight determines; fits leave them as given."""
     said_by: ClassVar[dict[str, str]] = {}

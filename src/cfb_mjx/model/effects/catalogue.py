@@ -23,6 +23,7 @@ from cfb_mjx.model.effects.battery_sag import BatterySag
 from cfb_mjx.model.effects.blade_flapping import BladeFlapping
 from cfb_mjx.model.effects.cog_offset import CogOffset
 from cfb_mjx.model.effects.command_delay import CommandDelay
+from cfb_mjx.model.effects.downwash import Downwash
 from cfb_mjx.model.effects.esc_rate_limit import EscRateLimit
 from cfb_mjx.model.effects.formula import ResidualFormula
 from cfb_mjx.model.effects.ground_effect import GroundEffect
@@ -87,6 +88,7 @@ _PHYSICS: dict[str, type[Effect]] = {
         Wind,
         Gust,
         Jet,
+        Downwash,
         PositionMoment,
         RateDamping,
         PayloadSwing,

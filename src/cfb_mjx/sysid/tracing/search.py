@@ -135,7 +135,9 @@ class Search:
         logs = [sensors.corrected(log) for log in logs]
         noise = sensor_noise(logs, FILTERED_GYRO if sensors.faults.gyro_lag else 1e-3)
         asked_for = {*named, *(type(effect).name for effect in declared)}
-        looked_for = tuple(name for name, kind in CATALOGUE.items() if kind.searched or name in asked_for)
+        measured = {kind.needs for kind in CATALOGUE.values() if any(_has(log, kind.needs) for log in logs)}
+        searched = {name for name, kind in CATALOGUE.items() if kind.searched and kind.needs in measured}
+        looked_for = tuple(name for name in CATALOGUE if name in searched | asked_for)
         return cls(parameters, logs, delay, noise, looked_for, declared, rules)
 
     @property
@@ -418,3 +420,7 @@ def _sample(blocks: Blocks) -> Blocks:
     # If there are fewer blocks than that, each counts once.
     first = np.concatenate([[True], np.diff(chosen) > 0])
     return Blocks(picked.signals, picked.interval, picked.valid * first[:, None, None])
+
+
+def _has(log: FlightLog, needed: str | None) -> bool:
+    return needed is None or getattr(log, needed, None) is not None
