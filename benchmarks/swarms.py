@@ -212,8 +212,8 @@ of a perfect model, and the share of the achievable improvement that is reached 
 - Wakes older than 0.6 s, more than about a metre below, are taken to be of that age.
 - A drone that sinks as fast as its own wake flies in it, which the model leaves out.
 - Within 2.5 motor distances (25 cm) the four jets have not merged.
-- The force on a Crazyflie 2.1 agrees with what was measured (Neural-Swarm, 2020) within a factor of two; another
-  measurement (gym-pybullet-drones, 2021) is five times larger. Fit the coefficient to your drones.
+- The force on a Crazyflie 2.1 agrees with what was measured (Neural-Swarm, 2020) within a factor of two; the fit of
+  gym-pybullet-drones (2021) is several times larger. Fit the coefficient to your drones.
 """.replace("{steps}", str(STEPS)).replace("{drones}", str(DRONES))
 
 

@@ -243,12 +243,14 @@ def _neighbours(prepared: Prepared, at: Components) -> tuple[Array, Array]:
         squares = jax.vmap(one)(jax.tree.map(lambda x: x[others], _seen_by(own, wakes)))
         return jnp.where(there, squares, -1.0)
 
-    likely = jax.vmap(speeds, in_axes=(0, 0, 0, 0, None))(prepared, place, others, there, MARGIN)
+    now, soon = (
+        jax.vmap(speeds, in_axes=(0, 0, 0, 0, None))(prepared, place, others, there, wider) for wider in (0.0, MARGIN)
+    )
+    likely = jnp.maximum(now, soon)
     near = []
     for _ in range(min(NEIGHBOURS, count - 1)):
         near.append(jnp.argmax(likely, axis=1)[:, None])
         likely = jnp.where(jnp.arange(len(offsets)) == near[-1], -1.0, likely)
-    now = jax.vmap(speeds, in_axes=(0, 0, 0, 0, None))(prepared, place, others, there, 0.0)
     left = jnp.sqrt(jnp.where(likely < 0, 0.0, now).max())
     if count > WINDOW + 1:
         # At the distance r beside its axis, wherever along it, a wake is no faster than 0.505 w / r.
