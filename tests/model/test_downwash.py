@@ -44,7 +44,7 @@ def test_the_momentum_of_the_jet_is_the_thrust(distance):
     begun, wake = effect.wake_at(of(0.0, 0.0, 0.0), still(distance), GUARDS)
     r = np.linspace(0.0, 4.0, 40_001)
     away = Vec(jnp.asarray(r), 0.0 * r, 0.0 * r - distance)
-    speed = -np.asarray(effect.air_speed(away, wake).components[2])
+    speed = -np.asarray(effect.air_velocity(away, wake).components[2])
     assert begun.components[2] == distance
     flow = np.trapezoid(AIR_DENSITY * speed**2 * 2 * np.pi * r, r)
     assert flow == pytest.approx(float(GUARDS.mass) * GRAVITY, rel=2e-3)

@@ -237,7 +237,7 @@ def _neighbours(prepared: Prepared, at: Components) -> tuple[Array, Array]:
 
         def one(other):
             begun, wake = effect.wake_at(here, other, own.parameters)
-            air = effect.air_speed(here - begun, wake)
+            air = effect.air_velocity(here - begun, wake)
             return air.dot(air)
 
         squares = jax.vmap(one)(jax.tree.map(lambda x: x[others], _seen_by(own, wakes)))
@@ -253,7 +253,7 @@ def _neighbours(prepared: Prepared, at: Components) -> tuple[Array, Array]:
         likely = jnp.where(jnp.arange(len(offsets)) == near[-1], -1.0, likely)
     left = jnp.sqrt(jnp.where(likely < 0, 0.0, now).max())
     if count > WINDOW + 1:
-        # At the distance r beside its axis, wherever along it, a wake is no faster than 0.505 w / r.
+        # At the distance r beside a vertical axis, wherever along it, a wake is no faster than 0.505 w / r.
         apart = x[order][WINDOW + 1 :] - x[order][: -WINDOW - 1]
         strength = jnp.sqrt(wake.dot(wake).max() / (0.805 * jnp.pi * AIR_DENSITY))
         left = jnp.maximum(left, 0.505 * strength / jnp.maximum(apart.min(), 1e-3))

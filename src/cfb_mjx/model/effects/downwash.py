@@ -40,8 +40,6 @@ LONGEST_S = 0.6
 ROUNDS = 3
 """Evaluations of where the other drone was when the air left it; each uses the age that follows from the one before."""
 _FALL = math.sqrt(2.0) - 1.0
-
-
 FORECAST, KNOWN = (3, 2), (6, 6)
 """Number of vectors of another drone's path, i.e. its position and derivatives, and of its wake: in a simulation, which
 forecasts them from the present state, and along a log, where the whole path is known."""
@@ -61,9 +59,8 @@ class Other(NamedTuple):
 
     def after(self, time: Any) -> Other:
         """The other drone after some time, s."""
-        return Other(
-            *(tuple(_later(own[k:], time) for k in range(len(own))) for own in (self.path, self.wake)),
-        )
+        path, wake = (tuple(_later(own[k:], time) for k in range(len(own))) for own in self)
+        return Other(path, wake)
 
 
 def _later(derivatives: Sequence[Vec], time: Any) -> Vec:
@@ -95,7 +92,9 @@ class Downwash(Effect):
         "L. Bauersfeld, K. Muller, D. Ziegler, F. Coletti, D. Scaramuzza, Robotics meets Fluid Dynamics: A "
         "Characterization of the Induced Airflow below a Quadrotor as a Turbulent Jet, IEEE RA-L 2025 (spreading "
         "0.0767, virtual origin 5.8 motor distances above the drone); K. P. Jain, T. Fortmuller, J. Byun, S. "
-        "Makiharju, M. Mueller, Modeling of aerodynamic disturbances for proximity flight of multirotors, ICUAS 2019"
+        "Makiharju, M. Mueller, Modeling of aerodynamic disturbances for proximity flight of multirotors, ICUAS 2019; "
+        "P. Davies, M. Fisher, M. Barratt, The characteristics of the turbulence in the mixing region of a round jet, "
+        "J. Fluid Mech. 15, 1963 (convection)"
     )
     prior: ClassVar[dict[str, tuple[float, float]]] = {
         "coefficient": (0.0, 0.03),
@@ -123,7 +122,7 @@ class Downwash(Effect):
     spreading: Float[Array, "*batch"] = eqx.field(converter=number, default=0.0767)
     """Growth of that distance per distance from the other drone."""
     convection: Float[Array, "*batch"] = eqx.field(converter=number, default=0.6)
-    """Speed at which the wake moves on over the speed of the air on its axis: 0.6 in turbulent round jets."""
+    """Speed at which the wake moves on over the speed of the air on its axis; about 0.6 in turbulent round jets."""
 
     @classmethod
     def neutral(cls) -> Downwash:
@@ -136,10 +135,9 @@ class Downwash(Effect):
     def sense(self, memory: Memory, reading: Reading) -> Memory:
         if not reading.other:
             return memory
-        known = jnp.isfinite(reading.other[0][0])
         # Selected before use: NaN passes through any weight, and through the derivative. An unknown drone has no wake.
         return tuple(
-            Vec(*(jnp.where(known, x, 0.0).astype(m.dtype) for x, m in zip(new, old, strict=True)))
+            Vec(*(jnp.where(jnp.isfinite(new[0]), x, 0.0).astype(m.dtype) for x, m in zip(new, old, strict=True)))
             for new, old in zip(reading.other, memory, strict=True)
         )
 
@@ -175,7 +173,7 @@ class Downwash(Effect):
             place, wake = _later(other.path, -age), _later(other.wake, -age)
         return place, wake * strength
 
-    def air_speed(self, away: Vec, wake: Vec) -> Vec:
+    def air_velocity(self, away: Vec, wake: Vec) -> Vec:
         """Velocity of the air in a wake, world, m/s.
 
         Args:
@@ -199,7 +197,7 @@ class Downwash(Effect):
             hub = center + rotate(condition.quaternion, Vec(x, y, 0.0))
             air = Vec(0.0, 0.0, 0.0)
             for place, wake in wakes:
-                air = air + self.air_speed(hub - place, wake)
+                air = air + self.air_velocity(hub - place, wake)
             size = jnp.sqrt(air.dot(air) + 1e-12)
             fx, fy, fz = pushed = rotate_inverse(condition.quaternion, air * (0.25 * self.coefficient * size))
             force = force + pushed
