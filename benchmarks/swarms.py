@@ -167,11 +167,11 @@ from cfb_mjx.model.swarm import rollout_swarm
 
 drone = replace(Quadrotor.from_file("cfb-guards"), effects=(Downwash(coefficient=0.004),))
 pair = jax.tree.map(lambda x: jnp.stack([x, x]), drone)
-places = jnp.array([[0.0, 0.0, 1.5], [0.05, 0.0, 1.0]])       # the second half a metre below the first
+places = jnp.array([[0.0, 0.0, 1.5], [0.05, 0.0, 1.0]])  # the second half a metre below the first
 states = jax.vmap(drone.hover_state)(places)
-commands = jnp.tile(drone.hover_command(), (100, 2, 1))       # 0.4 s; (steps, drones, 4)
+commands = jnp.tile(drone.hover_command(), (100, 2, 1))  # 0.4 s; (steps, drones, 4)
 flown = rollout_swarm(pair, states, commands)
-print(flown.state.position[-1].round(2))                      # the lower one sinks and drifts below the other
+print(flown.state.position[-1].round(2))  # the lower one sinks and drifts below the other
 ```
 
 Use `jax.vmap` over swarms, and `jax.grad` as with `rollout`. Up to four drones are computed exactly: at every step each
