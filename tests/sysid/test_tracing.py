@@ -12,6 +12,7 @@ import pytest
 from scipy.stats import norm
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.logs import with_other
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS, Inertia, RateDamping, RotorDrag
@@ -335,7 +336,7 @@ def test_what_was_searched_for_can_be_given_up_again(closed):
     nothing = diagnosis.trace.search.nothing()
     hypothesis = Checkpoint(path, {"a": "b"}, json.loads(STATES[-1])).restore(nothing).hypothesis
     assert hypothesis.present == ("rotor_drag",)
-    looked_for = {name for name, kind in CATALOGUE.items() if kind.searched}
+    looked_for = {name for name, kind in CATALOGUE.items() if kind.searched and kind.needs is None}
     assert looked_for == {type(e).name for e in hypothesis.effects}
     assert hypothesis.terms == ()
     assert [c.effect for c in diagnosis.trace.search.own_columns(hypothesis)] == ["rotor_drag"]
@@ -390,12 +391,14 @@ def test_a_wind_that_is_found_is_a_force_and_does_not_count_twice():
 
 
 def test_what_no_search_looks_for_takes_part_where_it_is_named_or_declared(campaigns, base):
-    def names(*given):
-        return Search.start(campaigns["clean"].fit[:1], base.parameters(), 0.008, sensors, *given).names
+    def names(*given, logs=campaigns["clean"].fit[:1]):
+        return Search.start(logs, base.parameters(), 0.008, sensors, *given).names
 
     sensors = check_sensors(campaigns["clean"].fit, 0.008, 0.0)
     unsearched = {"position_moment", "rate_damping", "gust", "jet", "inertia_products", "vortex_ring", "wall_effect"}
-    assert set(CATALOGUE) - set(names()) == unsearched
+    assert set(CATALOGUE) - set(names()) == unsearched | {"downwash"}
+    beside = [with_other(log, log) for log in campaigns["clean"].fit[:1]]
+    assert set(CATALOGUE) - set(names(logs=beside)) == unsearched
     assert "position_moment" in names((), ["position_moment"])
     assert "position_moment" in names((CATALOGUE["position_moment"].neutral(),))
 

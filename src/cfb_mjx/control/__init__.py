@@ -3,7 +3,7 @@
 from cfb_mjx.control.closed_loop import ClosedLoop, rollout_closed_loop
 from cfb_mjx.control.controllers import Controller, MellingerController, PidController, find_controller
 from cfb_mjx.control.mellinger import Mellinger
-from cfb_mjx.control.neural import Network, NeuralController, brax_controller
+from cfb_mjx.control.neural import Network, NeuralController, brax_controller, foreign_controller
 from cfb_mjx.control.pid import FirmwarePid, PidState, PositionHold, Setpoint, init, resume, step
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
 
@@ -22,6 +22,7 @@ __all__ = [
     "Setpoint",
     "brax_controller",
     "find_controller",
+    "foreign_controller",
     "init",
     "load_policy",
     "resume",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from itertools import pairwise
 from typing import Any
 
@@ -16,14 +17,22 @@ from cfb_mjx.envs.observation import Layout, Memory, StateEstimate, observation,
 from cfb_mjx.errors import CfbError
 
 ACTIVATIONS: dict[str, Callable] = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
+LIMITS: dict[str, Callable] = {"tanh": jnp.tanh, "clip": lambda x: jnp.clip(x, -1.0, 1.0)}
+"""Functions that bring the last layer to -1..1."""
+WRITTEN = {"tanh": "tanh(output)", "clip": "clip(output, -1, 1)"}
+"""The same, as policy files and contracts write them."""
 
 
 class Network(eqx.Module):
-    """Weights (inputs, outputs) and biases, first layer first; the activation is applied between layers."""
+    """Weights (inputs, outputs) and biases, first layer first; the activation is applied between layers.
+
+    The limit is applied after the last layer, by the controller.
+    """
 
     weights: tuple[Float[Array, "_ _"], ...]
     biases: tuple[Float[Array, " _"], ...]
     activation: str = eqx.field(static=True, default="tanh")
+    limit: str = eqx.field(static=True, default="tanh")
 
     @classmethod
     def random(cls, key: PRNGKeyArray, sizes: tuple[int, ...], activation: str = "tanh", last: float = 1.0) -> Network:
@@ -68,7 +77,7 @@ class WrittenOut(Network):
 
 
 class NeuralController(eqx.Module):
-    """A network that turns observations into commands u = (1 + tanh(output)) / 2.
+    """A network that turns observations into commands u = (1 + tanh(output)) / 2, or with a clip for the tanh.
 
     `start` and `command` also accept many drones along the last axis of every array (`cfb_mjx.envs.observation`).
     """
@@ -96,14 +105,15 @@ class NeuralController(eqx.Module):
         return self.layout.control_dt_s
 
     def act(self, shown: Float[Array, " size *drones"]) -> Float[Array, " 4 *drones"]:
-        """Return the command in (0, 1) for an observation."""
+        """Return the command, 0 to 1, for an observation."""
         network = self.network if shown.ndim == 1 else self.network.columns
-        return 0.5 * (1 + jnp.tanh(network(shown)))
+        return 0.5 * (1 + LIMITS[self.network.limit](network(shown)))
 
     def written_out(self) -> NeuralController:
         """Return the same controller for use within one compiled function (`WrittenOut`)."""
         network = self.network
-        return NeuralController(WrittenOut(network.weights, network.biases, network.activation), self.layout)
+        written = WrittenOut(network.weights, network.biases, network.activation, network.limit)
+        return NeuralController(written, self.layout)
 
     def start(self, estimate: StateEstimate, command: Float[Array, " 4 *drones"] | float = 0.55) -> Memory:
         """Return the memory of a controller that has commanded ``command`` on ``estimate`` for long."""
@@ -134,18 +144,106 @@ def brax_controller(
         CfbError: the network is not fully connected, or its input size differs from the layout's.
     """
     statistics, policy = params[0], params[1]["params"]
-    layers = [policy.get(f"hidden_{i}") for i in range(len(policy))]
-    if activation not in ACTIVATIONS or None in layers:
-        raise CfbError("brax_controller: the policy must be fully connected, with activation tanh, relu or swish.")
-    weights, biases = ([np.asarray(layer[part]) for layer in layers] for part in ("kernel", "bias"))
-    if normalized:
-        mean, std = (np.asarray(x[obs_key] if isinstance(x, dict) else x) for x in (statistics.mean, statistics.std))
-        biases[0] = biases[0] - (mean / std) @ weights[0]
-        weights[0] = weights[0] / std[:, None]
-    if weights[0].shape[0] != layout.size:
-        raise CfbError(f"brax_controller: the policy takes {weights[0].shape[0]} inputs, the layout has {layout.size}.")
-    # The second half of the last layer is the standard deviation.
-    weights[-1], biases[-1] = weights[-1][:, :4], biases[-1][:4]
-    return NeuralController(
-        Network(tuple(map(jnp.asarray, weights)), tuple(map(jnp.asarray, biases)), activation), layout
+    mean, std = (x[obs_key] if isinstance(x, dict) else x for x in (statistics.mean, statistics.std))
+    return foreign_controller(
+        policy,
+        layout,
+        activation=activation,
+        limit="tanh",
+        mean=mean if normalized else None,
+        std=std if normalized else None,
+        what="brax_controller",
     )
+
+
+def foreign_controller(
+    params: Mapping[str, Any],
+    layout: Layout,
+    *,
+    activation: str,
+    limit: str,
+    mean: Any = None,
+    std: Any = None,
+    what: str = "foreign_controller",
+) -> NeuralController:
+    """Convert a fully connected policy of another library to a controller that acts deterministically.
+
+    The policy must have been trained on this library's observation (`cfb_mjx.envs.gym`, `cfb_mjx.envs.brax_env`), with
+    actions from -1 to 1. ``save_policy`` then writes it for ``cfb fly`` and ``cfb export``.
+
+        foreign_controller(model.policy.state_dict(), task.layout, activation="tanh", limit="clip")    # SB3's PPO
+        foreign_controller(model.actor.state_dict(), task.layout, activation="relu", limit="tanh")     # SB3's SAC
+        foreign_controller(variables["params"], layout, activation="swish", limit="tanh")              # Flax
+
+    Args:
+        params: ``state_dict()`` of a PyTorch module (layers in order of their definition) or parameters of a Flax
+            module (nested dictionaries; layers in the order of the numbers in their names). Layers of value networks
+            and standard deviations are left out.
+        layout: observation layout of the task.
+        activation: activation of the hidden layers: ``tanh``, ``relu`` or ``swish``.
+        limit: how the action is limited: ``clip`` (Stable-Baselines3's PPO) or ``tanh`` (SAC, Brax).
+        mean: mean by which observations were normalised, (inputs,); None: they were not.
+        std: standard deviation likewise, with what the library adds to it (``sqrt(var + epsilon)``). A clip of
+            normalised observations is not reproduced.
+        what: name of the caller, for messages.
+
+    Raises:
+        CfbError: an unknown activation or limit, no fully connected layers, or layers that do not fit each other, the
+            layout's input size, or four motors.
+    """
+    if activation not in ACTIVATIONS or limit not in LIMITS:
+        raise CfbError(
+            f"{what}: activation must be one of {', '.join(ACTIVATIONS)} and limit of {', '.join(LIMITS)}, found "
+            f"{activation!r} and {limit!r}."
+        )
+    if (mean is None) != (std is None):
+        raise CfbError(f"{what}: give both mean and std of the observations, or neither.")
+    weights, biases = _layers(params)
+    sizes = [w.shape for w in weights]
+    # The second half of the last layer may be the standard deviation.
+    fits = bool(sizes) and sizes[0][0] == layout.size and sizes[-1][1] in (4, 8)
+    if not fits or any(a[1] != b[0] for a, b in pairwise(sizes)) or [len(b) for b in biases] != [s[1] for s in sizes]:
+        found = ", ".join(f"{a} x {b}" for a, b in sizes) or "none"
+        raise CfbError(
+            f"{what}: the policy must be fully connected layers from {layout.size} inputs, the layout's, to 4 outputs, "
+            f"each fitting the next; found {found}. Give the parameters of the policy alone."
+        )
+    if mean is not None:
+        kind, mean, std = weights[0].dtype, np.asarray(mean, float), np.asarray(std, float)
+        biases[0] = (biases[0] - (mean / std) @ weights[0]).astype(kind)
+        weights[0] = (weights[0] / std[:, None]).astype(kind)
+    weights[-1], biases[-1] = weights[-1][:, :4], biases[-1][:4]
+    network = Network(tuple(map(jnp.asarray, weights)), tuple(map(jnp.asarray, biases)), activation, limit)
+    return NeuralController(network, layout)
+
+
+_NOT_OF_A_POLICY = re.compile(r"value|critic|log_std|(^|\.)(vf|qf|q_net)")
+
+
+def _layers(params: Mapping[str, Any]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Weights (inputs, outputs) and biases of the fully connected layers of a policy, first layer first."""
+    kinds = {"kernel": False, "weight": True}
+    found: dict[str, dict[str, np.ndarray]] = {}
+
+    def walk(tree: Mapping[str, Any], path: tuple[str, ...], natural: bool) -> None:
+        names = sorted(tree, key=_natural) if natural else tree
+        for name in names:
+            value, *parts = tree[name], *path, *str(name).split(".")
+            if isinstance(value, Mapping):
+                walk(value, tuple(parts), natural)
+            elif parts[-1] in (*kinds, "bias") and not _NOT_OF_A_POLICY.search(".".join(parts)):
+                found.setdefault(".".join(parts[:-1]), {})[parts[-1]] = np.asarray(value)
+
+    walk(params, (), any(isinstance(value, Mapping) for value in params.values()))
+    weights, biases = [], []
+    for layer in found.values():
+        for kind, transposed in kinds.items():
+            if kind in layer and layer[kind].ndim == 2:
+                weights.append(layer[kind].T if transposed else layer[kind])
+                biases.append(layer.get("bias", np.zeros(weights[-1].shape[1], weights[-1].dtype)))
+    return weights, biases
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sorts the numbers in names by value: layer_2 before layer_10."""
+    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.control.neural import ACTIVATIONS, Network, NeuralController
+from cfb_mjx.control.neural import ACTIVATIONS, WRITTEN, Network, NeuralController
 from cfb_mjx.documents import with_former
 from cfb_mjx.envs.observation import BEFORE_BENDS, Layout
 from cfb_mjx.errors import CfbError
@@ -67,7 +67,7 @@ def save_policy(policy: PolicyFile, path: str | Path) -> None:
         "task": policy.task,
         "layers": len(network.weights),
         "activation": network.activation,
-        "output": "u = (1 + tanh(output)) / 2",
+        "output": f"u = (1 + {WRITTEN[network.limit]}) / 2",
         "observation": vars(policy.controller.layout),
         "weights_sha256": policy.weights_sha256,
         "training": policy.training,
@@ -94,12 +94,13 @@ def load_policy(path: str | Path) -> PolicyFile:
             if about["format"] != FORMAT:
                 raise CfbError(f"{path}: the policy has another format ({about['format']!r}, not {FORMAT!r}).")
             shown, activation = about["observation"], about["activation"]
+            limit = next(name for name, text in WRITTEN.items() if f"(1 + {text}) / 2" in about["output"])
             settings = dict(with_former(shown, "position_scale_m", BEFORE_BENDS))
             settings["setpoint_scales"] = tuple(shown.get("setpoint_scales", ()))
             layout = Layout(**settings)
             weights = tuple(archive[f"weight_{i}"] for i in range(about["layers"]))
             biases = tuple(archive[f"bias_{i}"] for i in range(about["layers"]))
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+    except (OSError, ValueError, KeyError, TypeError, EOFError, StopIteration, zipfile.BadZipFile):
         raise CfbError(
             f"{path}: is not a policy of cfb_mjx, or is damaged; give a policy.npz written by cfb train."
         ) from None
@@ -107,5 +108,5 @@ def load_policy(path: str | Path) -> PolicyFile:
     fits = [w.shape for w in weights] == list(pairwise(sizes)) and sizes[-1] == 4
     if not fits or activation not in ACTIVATIONS or not all(np.all(np.isfinite(x)) for x in (*weights, *biases)):
         raise CfbError(f"{path}: the weights do not fit the observation, or are not finite; train it again.")
-    network = Network(tuple(map(jnp.asarray, weights)), tuple(map(jnp.asarray, biases)), activation)
+    network = Network(tuple(map(jnp.asarray, weights)), tuple(map(jnp.asarray, biases)), activation, limit)
     return PolicyFile(NeuralController(network, layout), about["task"], about["training"])

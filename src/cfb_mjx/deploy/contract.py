@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 from cfb_mjx import __version__
+from cfb_mjx.control.neural import WRITTEN
 from cfb_mjx.control.policy_file import PolicyFile
 from cfb_mjx.deploy.deployment import CATCH_S, Deployment
 from cfb_mjx.envs.observation import Layout
@@ -95,7 +96,7 @@ def _policy(policy: PolicyFile) -> dict[str, Any]:
         "weights_hashed": "little-endian float32, each layer's weights (inputs, outputs) and biases, first layer first",
         "layers": [layout.size, *(len(b) for b in network.biases)],
         "activation": network.activation,
-        "output": "u = (1 + tanh(output)) / 2",
+        "output": f"u = (1 + {WRITTEN[network.limit]}) / 2",
         "multiply_accumulates": sum(int(w.size) for w in network.weights),
         "observation": _observation(layout),
         "history": {

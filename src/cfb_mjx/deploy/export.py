@@ -220,6 +220,7 @@ def _network(name: str, policy: PolicyFile) -> str:
         "dt": literal(layout.control_dt_s),
         "setpoint_scales": scales,
         "activation": f"CFB_{network.activation.upper()}",
+        "limit": f"CFB_LIMIT_{network.limit.upper()}",
         "layers": len(layers),
         "layer": f"{name}_layers",
     }

@@ -103,6 +103,8 @@ class Training:
                 raise CfbError(f"{start}: the policy's observation or network differs from the configuration's.")
             if controller.network.activation != wanted.activation:
                 raise CfbError(f"{start}: this policy's activation is {controller.network.activation}.")
+            if controller.network.limit != "tanh":
+                raise CfbError(f"{start}: this policy clips its outputs; trainings go on from policies with a tanh.")
         return cls(config, described, policy, versions)
 
     def identity(self) -> dict[str, Any]:

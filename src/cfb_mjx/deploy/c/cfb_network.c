@@ -146,7 +146,8 @@ void cfb_network_command(const cfb_network_t *network, const cfb_memory_t *memor
     to = swap;
   }
   for (int motor = 0; motor < 4; motor++) {
-    const float u = 0.5f * (1.0f + hyperbolic_tangent(from[motor]));
+    const float x = network->limit == CFB_LIMIT_CLIP ? limited(from[motor], 1.0f) : hyperbolic_tangent(from[motor]);
+    const float u = 0.5f * (1.0f + x);
     command[motor] = u > 1.0f ? 1.0f : (u > 0.0f ? u : 0.0f);
   }
 }

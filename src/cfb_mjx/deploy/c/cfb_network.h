@@ -9,6 +9,8 @@
 #include "cfb_sizes.h"
 
 typedef enum { CFB_TANH, CFB_RELU, CFB_SWISH } cfb_activation_t;
+/* How the last layer is brought to -1..1. */
+typedef enum { CFB_LIMIT_TANH, CFB_LIMIT_CLIP } cfb_limit_t;
 
 typedef struct {
   int inputs, outputs;
@@ -25,6 +27,7 @@ typedef struct {
   const float *setpoint_scales;
   /* What is made of it. */
   cfb_activation_t activation;
+  cfb_limit_t limit;
   int layers;
   const cfb_layer_t *layer;
 } cfb_network_t;
