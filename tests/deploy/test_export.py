@@ -20,7 +20,7 @@ from cfb_mjx.control.manoeuvre import load_manoeuvre
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy, shipped_policies
 from cfb_mjx.deploy import compare, compile_policy, cortex, export_policy, fly_beside
-from cfb_mjx.deploy.check import begin, random_inputs
+from cfb_mjx.deploy.check import FIRMWARE_STACK, STACK, STEP_S, _costs, begin, random_inputs
 from cfb_mjx.deploy.deployment import Deployment, find_deployment
 from cfb_mjx.deploy.export import literal
 from cfb_mjx.envs import Layout
@@ -341,6 +341,19 @@ def test_it_fits_the_drones_processor(name, built):
     found = cortex.size(built(find_deployment(name))[0])
     assert 10_000 < found.flash < 64 * 1024
     assert found.ram + found.stack < 8 * 1024
+
+
+@pytest.mark.skipif(not cortex.has_compiler(), reason="arm-none-eabi-gcc is not installed")
+def test_a_network_that_is_too_large_for_the_drone_is_refused(built):
+    deployment = Deployment("wide", random_policy(1, Layout(), hidden=(256, 256)))
+    exported, compiled = built(deployment)
+    numbers, findings = _costs(exported, compiled)
+    # However wide, the numbers between two layers are not on the stack of the firmware's task.
+    assert numbers["stack_bytes"] <= STACK < FIRMWARE_STACK
+    assert numbers["step_s"] > STEP_S
+    bad = [finding.text for finding in findings if not finding.good]
+    assert any("of 64 kB of flash" in text for text in bad)
+    assert any(text.endswith("of 1 ms") for text in bad)
 
 
 @pytest.mark.skipif(not cortex.has_emulator(), reason="qemu-system-arm is not installed")

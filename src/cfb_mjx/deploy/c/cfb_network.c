@@ -131,7 +131,8 @@ static float product(const float *a, const float *b, int length) {
 
 void cfb_network_command(const cfb_network_t *network, const cfb_memory_t *memory, const cfb_estimate_t *estimate,
                          const float *setpoint, float command[4]) {
-  float one[CFB_WIDEST], other[CFB_WIDEST];
+  /* Not on the stack: the firmware's task has little of it. */
+  static float one[CFB_WIDEST], other[CFB_WIDEST];
   float *from = one, *to = other;
   observe(network, memory, estimate, setpoint, from);
   for (int i = 0; i < network->layers; i++) {

@@ -1,7 +1,7 @@
 /* A small fully connected network, and what it is shown: the observation with its history.
  *
  * Part of a policy exported by cfb_mjx. C11, single precision, no heap; nothing here changes but the memory it is
- * given. The meaning of every number is in contract.json.
+ * given, and numbers between two layers: one caller at a time. The meaning of every number is in contract.json.
  */
 #ifndef CFB_NETWORK_H
 #define CFB_NETWORK_H
