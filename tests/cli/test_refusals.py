@@ -10,6 +10,7 @@ import time
 import warnings
 from inspect import signature
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pyarrow.csv
@@ -260,7 +261,11 @@ def _messages(source: Path):
 def test_flags_in_messages_are_flags_of_the_commands():
     from cfb_mjx.commands import COMMANDS, load
 
-    options = {f"--{name.replace('_', '-')}" for command in COMMANDS for name in signature(load(command)).parameters}
+    commands = [load(command) for command in COMMANDS]
+    options = {f"--{name.replace('_', '-')}" for command in commands for name in signature(command).parameters}
+    hints = (hint for command in commands for hint in get_type_hints(command, include_extras=True).values())
+    marks = (mark for hint in hints for mark in getattr(hint, "__metadata__", ()))
+    options |= {alias for mark in marks for alias in getattr(mark, "aliases", None) or ()}
     options |= {
         "--help",
         "--version",
