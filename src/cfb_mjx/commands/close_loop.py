@@ -113,10 +113,11 @@ class CloseLoop(Command):
 
         base = load_model_file(self.model, self.set)
         folder = output_folder(self.output)
-        checkpoint = Checkpoint.open(folder / "search.json", list(self.fit), base, say)
+        checkpoint = Checkpoint.open(folder / "search.json", [*self.fit, *self.flown_with], base, say)
         outcome = close_loop(logs, judged, base, say, checkpoint)
         words, judged_on = ["close-loop", *self.words()], [path.name for path in self.held_out]
-        story = provenance(words, base.name, "fit_logs_sha256", self.fit, held_out=judged_on)
+        beside = {"flown_with": [path.name for path in self.flown_with]} if self.flown_with else {}
+        story = provenance(words, base.name, "fit_logs_sha256", self.fit, held_out=judged_on, **beside)
         corrected = outcome.model_file(f"{base.name}-closed", story)
         facts = environment()
         numbers: dict[str, Any] = {"case": folder.resolve().name, "summary": verdict(outcome)}
