@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cfb_mjx.reference_simulator import EFFECTS, Case, fly_campaigns
+from cfb_mjx.reference_simulator import EFFECTS, PAIRED, Case, fly_campaigns
 from cfb_mjx.sysid.tracing.jointly import ERRORS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,7 +28,7 @@ SEARCHED, ROUNDS = (1 / 256, 2.0), 7
 WEAKEST = {"motor_second_order": 0.1}
 """Least strength in the search; the step of the simulator is too long for a shorter second lag."""
 
-SINGLE = [name for name in EFFECTS if not name.startswith("outside")]
+SINGLE = [name for name in EFFECTS if not name.startswith(("outside", PAIRED))]
 SENSORS = [name for name in SINGLE if name.startswith("sensor")]
 PHYSICAL = [name for name in SINGLE if name not in SENSORS]
 OUTSIDE = [name for name in EFFECTS if name.startswith("outside")]

@@ -25,7 +25,7 @@ from cfb_mjx.logs import write_mcap
 from cfb_mjx.loop import flights, trials
 from cfb_mjx.loop.flights import fly_campaign
 from cfb_mjx.loop.trials import fly_trials
-from cfb_mjx.reference_simulator import EFFECTS, Case
+from cfb_mjx.reference_simulator import EFFECTS, PAIRED, Case
 from cfb_mjx.runtime import Progress, environment, say
 from cfb_mjx.train.config import load_config, with_changes
 from cfb_mjx.train.run import POLICY, Training, train
@@ -68,7 +68,8 @@ def cells_of(effects: Iterable[str], seeds: int, first: int = FIRST_SEED) -> lis
         CfbError: an unknown effect, or no effect.
     """
     effects = list(dict.fromkeys(effects))
-    known = [name for name in EFFECTS if not name.startswith(("outside", "sensor"))]
+    # The policies fly alone.
+    known = [name for name in EFFECTS if not name.startswith(("outside", "sensor", PAIRED))]
     if unknown := [name for name in effects if name not in known]:
         raise CfbError(f"--effects {unknown[0]}: there is no such effect; choose from {', '.join(known)}.")
     if not effects:

@@ -18,6 +18,8 @@ Effect = Callable[[np.random.Generator, Drone, float], Drawn]
 
 EFFECTS: dict[str, Effect] = {}
 OUTSIDE = "outside"
+PAIRED = "downwash"
+"""The effect that needs a second drone."""
 
 
 def effect(draw: Effect) -> Effect:
