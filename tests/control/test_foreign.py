@@ -101,6 +101,12 @@ def test_what_does_not_fit_is_named():
         convert(sb3(), mean=np.zeros(LAYOUT.size))
     with pytest.raises(CfbError, match="found none"):
         convert({"log_std": np.zeros(4)})
+    for more in ("mlp_extractor.policy_net.1.weight", "norm.scale"):  # a LayerNorm, which would be left out
+        with pytest.raises(CfbError, match=r"fully connected layers; .* of shape \(9,\) is not of one"):
+            convert(sb3() | {more: np.ones(9)})
+    eight = sb3() | {"action_net.weight": np.zeros((8, 9)), "action_net.bias": np.zeros(8)}
+    with pytest.raises(CfbError, match=r"to 4 outputs.*9 x 8"):
+        convert(eight)
     wrong = sb3()
     del wrong["mlp_extractor.policy_net.2.weight"]
     wrong["mlp_extractor.policy_net.0.weight"] = np.zeros((9, 3))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cfb_mjx import cli
-from cfb_mjx.errors import CfbError
+from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.logs import FlightLog, with_other, write_tabular
 
 
@@ -45,7 +45,8 @@ def test_the_other_drone_is_where_it_was():
 def test_rows_gaps_and_standing_rotors():
     log = flight()
     later = flight(1.0, 4.0, name="b")
-    found = with_other(log, later)
+    with pytest.warns(CfbWarning, match="b: covers 75% of a; elsewhere no other drone is assumed"):
+        found = with_other(log, later)
     assert np.isnan(found.other[log.time < 1.0]).all()
     assert np.isfinite(found.other[log.time > 1.01]).all()
     assert found.rows(slice(10)).other.shape == (10, 9)

@@ -145,15 +145,14 @@ def brax_controller(
     """
     statistics, policy = params[0], params[1]["params"]
     mean, std = (x[obs_key] if isinstance(x, dict) else x for x in (statistics.mean, statistics.std))
-    return foreign_controller(
-        policy,
-        layout,
-        activation=activation,
-        limit="tanh",
-        mean=mean if normalized else None,
-        std=std if normalized else None,
-        what="brax_controller",
-    )
+    # The second half of the last layer is the standard deviation.
+    last = max(policy, key=_natural)
+    policy = {**policy, last: {part: np.asarray(x)[..., : x.shape[-1] // 2] for part, x in policy[last].items()}}
+    given = {"mean": mean, "std": std} if normalized else {}
+    try:
+        return foreign_controller(policy, layout, activation=activation, limit="tanh", **given)
+    except CfbError as error:
+        raise CfbError(f"brax_controller: {error}") from None
 
 
 def foreign_controller(
@@ -164,7 +163,6 @@ def foreign_controller(
     limit: str,
     mean: Any = None,
     std: Any = None,
-    what: str = "foreign_controller",
 ) -> NeuralController:
     """Convert a fully connected policy of another library to a controller that acts deterministically.
 
@@ -185,34 +183,31 @@ def foreign_controller(
         mean: mean by which observations were normalised, (inputs,); None: they were not.
         std: standard deviation likewise, with what the library adds to it (``sqrt(var + epsilon)``). A clip of
             normalised observations is not reproduced.
-        what: name of the caller, for messages.
 
     Raises:
-        CfbError: an unknown activation or limit, no fully connected layers, or layers that do not fit each other, the
-            layout's input size, or four motors.
+        CfbError: an unknown activation or limit, layers that are not fully connected, or layers that do not fit each
+            other, the layout's input size, or four motors.
     """
     if activation not in ACTIVATIONS or limit not in LIMITS:
         raise CfbError(
-            f"{what}: activation must be one of {', '.join(ACTIVATIONS)} and limit of {', '.join(LIMITS)}, found "
+            f"activation must be one of {', '.join(ACTIVATIONS)} and limit of {', '.join(LIMITS)}, found "
             f"{activation!r} and {limit!r}."
         )
     if (mean is None) != (std is None):
-        raise CfbError(f"{what}: give both mean and std of the observations, or neither.")
+        raise CfbError("give both mean and std of the observations, or neither.")
     weights, biases = _layers(params)
     sizes = [w.shape for w in weights]
-    # The second half of the last layer may be the standard deviation.
-    fits = bool(sizes) and sizes[0][0] == layout.size and sizes[-1][1] in (4, 8)
+    fits = bool(sizes) and sizes[0][0] == layout.size and sizes[-1][1] == 4
     if not fits or any(a[1] != b[0] for a, b in pairwise(sizes)) or [len(b) for b in biases] != [s[1] for s in sizes]:
         found = ", ".join(f"{a} x {b}" for a, b in sizes) or "none"
         raise CfbError(
-            f"{what}: the policy must be fully connected layers from {layout.size} inputs, the layout's, to 4 outputs, "
+            f"the policy must be fully connected layers from {layout.size} inputs, the layout's, to 4 outputs, "
             f"each fitting the next; found {found}. Give the parameters of the policy alone."
         )
     if mean is not None:
         kind, mean, std = weights[0].dtype, np.asarray(mean, float), np.asarray(std, float)
         biases[0] = (biases[0] - (mean / std) @ weights[0]).astype(kind)
         weights[0] = (weights[0] / std[:, None]).astype(kind)
-    weights[-1], biases[-1] = weights[-1][:, :4], biases[-1][:4]
     network = Network(tuple(map(jnp.asarray, weights)), tuple(map(jnp.asarray, biases)), activation, limit)
     return NeuralController(network, layout)
 
@@ -231,14 +226,20 @@ def _layers(params: Mapping[str, Any]) -> tuple[list[np.ndarray], list[np.ndarra
             value, *parts = tree[name], *path, *str(name).split(".")
             if isinstance(value, Mapping):
                 walk(value, tuple(parts), natural)
-            elif parts[-1] in (*kinds, "bias") and not _NOT_OF_A_POLICY.search(".".join(parts)):
-                found.setdefault(".".join(parts[:-1]), {})[parts[-1]] = np.asarray(value)
+            elif not _NOT_OF_A_POLICY.search(".".join(parts)):
+                part = np.asarray(value)
+                if part.ndim != {"bias": 1, "kernel": 2, "weight": 2}.get(parts[-1]):
+                    raise CfbError(
+                        f"the policy must be fully connected layers; {'.'.join(parts)} of shape {part.shape} is not of "
+                        "one."
+                    )
+                found.setdefault(".".join(parts[:-1]), {})[parts[-1]] = part
 
     walk(params, (), any(isinstance(value, Mapping) for value in params.values()))
     weights, biases = [], []
     for layer in found.values():
         for kind, transposed in kinds.items():
-            if kind in layer and layer[kind].ndim == 2:
+            if kind in layer:
                 weights.append(layer[kind].T if transposed else layer[kind])
                 biases.append(layer.get("bias", np.zeros(weights[-1].shape[1], weights[-1].dtype)))
     return weights, biases

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
-from cfb_mjx.errors import CfbError
+from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.logs import rotation
 from cfb_mjx.logs.flight_log import FlightLog, quantise_time
 
 _LINEAR = ("position", "velocity", "body_rate", "specific_force", "battery_voltage", "other")
 _SMOOTHING = 0.05
 """Time over which the other drone's specific force is averaged, s: its wake does not follow vibrations."""
+_COVERED = 0.99
+"""Share of a flight that the other log covers without a word: a row before each gap is not."""
 _STANDS = 0.02
 """Mean command below which the other drone's rotors do not turn."""
 
@@ -80,13 +84,17 @@ def with_other(log: FlightLog, other: FlightLog) -> FlightLog:
 
     Args:
         log: the flight.
-        other: flight of the other drone. Both logs have one clock and one world frame.
+        other: flight of the other drone. Both logs have one clock and one world frame. If its log does not state the
+            age of its poses, they are taken to be of their rows' time.
 
     Returns:
         The log with `FlightLog.other`; NaN where the other log has no rows.
 
     Raises:
         CfbError: the other log covers less than half of the flight.
+
+    Warns:
+        CfbWarning: it does not cover all of the flight.
     """
     time, delay = other.time, other.observation_delay or 0.0
     before = np.clip(np.searchsorted(time, log.time, side="right") - 1, 0, len(time) - 1)
@@ -98,6 +106,9 @@ def with_other(log: FlightLog, other: FlightLog) -> FlightLog:
             f"other drone {time[0]:.1f} to {time[-1]:.1f} s); give the log of a drone that flew at the same time, with "
             "times of one clock."
         )
+    if there.mean() < _COVERED:
+        said = f"{other.name}: covers {there.mean():.0%} of {log.name}; elsewhere no other drone is assumed."
+        warnings.warn(said, CfbWarning, stacklevel=2)
     rows = max(1, round(_SMOOTHING / other.nominal_interval))
     mean = np.convolve(np.pad(other.specific_force[:, 2], rows // 2, mode="edge"), np.ones(rows) / rows, mode="valid")
     lift = np.where(other.command.mean(axis=1) > _STANDS, np.maximum(mean[: len(time)], 0.0), 0.0)

@@ -27,7 +27,7 @@ from cfb_mjx.engine.lanes import System
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import rotors
 from cfb_mjx.model.effects import Downwash
-from cfb_mjx.model.effects.downwash import AIR_DENSITY, FORECAST, Other
+from cfb_mjx.model.effects.downwash import FORECAST, MOMENTUM, Other
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.rollout import SYSTEM, fits_one_kernel, fly_rows
 from cfb_mjx.model.state import Components, State, stack, unstack
@@ -255,6 +255,6 @@ def _neighbours(prepared: Prepared, at: Components) -> tuple[Array, Array]:
     if count > WINDOW + 1:
         # At the distance r beside a vertical axis, wherever along it, a wake is no faster than 0.505 w / r.
         apart = x[order][WINDOW + 1 :] - x[order][: -WINDOW - 1]
-        strength = jnp.sqrt(wake.dot(wake).max() / (0.805 * jnp.pi * AIR_DENSITY))
+        strength = jnp.sqrt(wake.dot(wake).max() / MOMENTUM)
         left = jnp.maximum(left, 0.505 * strength / jnp.maximum(apart.min(), 1e-3))
     return jnp.take_along_axis(others, jnp.concatenate(near, axis=1), axis=1), left

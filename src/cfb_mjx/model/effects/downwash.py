@@ -35,6 +35,8 @@ from cfb_mjx.parameters.parameters import Limits, Parameters
 
 AIR_DENSITY = 1.2
 """kg/m^3."""
+MOMENTUM = 0.805 * math.pi * AIR_DENSITY
+"""Momentum flux of the jet over the square of w, kg/m^3."""
 LONGEST_S = 0.6
 """Greatest age of a wake, s. Older ones, more than about a metre below, are taken to be of this age."""
 ROUNDS = 3
@@ -155,7 +157,7 @@ class Downwash(Effect):
         Returns:
             Where the other drone was when this air left it, m, and the vector w along the wake, m^2/s; world.
         """
-        strength = jnp.sqrt(parameters.mass / (0.805 * jnp.pi * AIR_DENSITY))
+        strength = jnp.sqrt(parameters.mass / MOMENTUM)
         size = jnp.sqrt(other.wake[0].dot(other.wake[0]) + 1e-9)
         pace = self.convection * strength * size
         age: Any = 0.0

@@ -135,9 +135,9 @@ class Search:
         logs = [sensors.corrected(log) for log in logs]
         noise = sensor_noise(logs, FILTERED_GYRO if sensors.faults.gyro_lag else 1e-3)
         asked_for = {*named, *(type(effect).name for effect in declared)}
-        measured = {kind.needs for kind in CATALOGUE.values() if any(_has(log, kind.needs) for log in logs)}
-        searched = {name for name, kind in CATALOGUE.items() if kind.searched and kind.needs in measured}
-        looked_for = tuple(name for name in CATALOGUE if name in searched | asked_for)
+        looked_for = tuple(
+            name for name, kind in CATALOGUE.items() if name in asked_for or (kind.searched and _shown_by(logs, kind))
+        )
         return cls(parameters, logs, delay, noise, looked_for, declared, rules)
 
     @property
@@ -422,5 +422,6 @@ def _sample(blocks: Blocks) -> Blocks:
     return Blocks(picked.signals, picked.interval, picked.valid * first[:, None, None])
 
 
-def _has(log: FlightLog, needed: str | None) -> bool:
-    return needed is None or getattr(log, needed, None) is not None
+def _shown_by(logs: Sequence[FlightLog], kind: type[Effect]) -> bool:
+    """Whether a log has what an effect needs."""
+    return kind.needs is None or any(getattr(log, kind.needs) is not None for log in logs)
