@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = (
     *("tutorial", "my-drone", "train-and-deploy", "choosing", "adding-an-effect", "effects", "faq", "scaling"),
     "swarms",
+    "tracking",
 )
 BLOCK = re.compile(r"^```python\n(?P<code>.*?)^```\n(?:\n```text\n(?P<output>.*?)^```\n)?", re.S | re.M)
 

@@ -21,6 +21,7 @@ SWINGS = 0.04
 CURVE_ROWS = 6
 COLUMNS = {
     "hover_mm": "hover, nominal, mm",
+    "track_mm": "figure eight, nominal, mm",
     "random_mm": "randomised, median, mm",
     "command_std": "command std",
     "rate_error_radps": "rate error, rad/s",
@@ -41,7 +42,6 @@ def card(folder: Path) -> str:
     """Return the card of the policy in ``folder``, as Markdown."""
     config = yaml.safe_load((folder / "config.yaml").read_text())
     last = json.loads((folder / "training.json").read_text())
-    flips = config["task"] == "flip"
     parts = [yaml.safe_load(path.read_text()) for path in sorted(folder.glob("config*.yaml"))]
     lines = [f"# {folder.name}", ""]
     for part in parts:
@@ -49,7 +49,8 @@ def card(folder: Path) -> str:
     lines += ["## Training", "", *_training(folder, config, last), ""]
     lines += ["## Conditions of the training", "", *_conditions(config), ""]
     lines += ["## Learning curve", "", *_curve(folder), ""]
-    lines += ["## Scores", "", *(_flips(folder.name) if flips else _scores(folder.name))]
+    scores = {"flip": _flips, "track": _tracking}.get(config["task"], _scores)
+    lines += ["## Scores", "", *scores(folder.name)]
     return "\n".join(lines) + "\n"
 
 
@@ -83,8 +84,11 @@ def _conditions(config: dict) -> list[str]:
         f"{1e3 * noise['rate_radps']:g} mrad/s.",
     ]
     told = f"{1 + seen['past_estimates']} estimates, {seen['past_commands']} past commands"
+    ahead = ", ".join(f"{1e3 * x:g}" for x in seen.get("preview_s") or ())
+    told += f", where the target will be in {ahead} ms" if ahead else ""
     told += ", an integral of the position error" if seen.get("integral") else ""
-    return [*lines, f"- Observation: {told}. A command every {1e3 * seen['control_dt_s']:g} ms."]
+    given = {"motors": "the motors", "body_rates": "thrust and body rates"}[seen.get("action", "motors")]
+    return [*lines, f"- Observation: {told}. It commands {given}, every {1e3 * seen['control_dt_s']:g} ms."]
 
 
 def _curve(folder: Path) -> list[str]:
@@ -138,6 +142,33 @@ def _scores(name: str) -> list[str]:
         f"- Largest hover error on drones with effects outside the training: {errors[plant]:.0f} mm, `{plant}`."
     )
     return lines
+
+
+def _tracking(name: str) -> list[str]:
+    whole = json.loads((ROOT / "benchmarks" / "tracking.json").read_text())
+    of = whole["controllers"][name]
+    late = max(of["late"].items(), key=lambda item: item[1]["mean_mm"] or float("inf"))
+    plant = max(of["plants"], key=lambda plant: of["plants"][plant]["mean_mm"] or float("inf"))
+    wild = of["random"]["1 2.5"]
+    return [
+        f"`scripts/tracking.py`, {whole['environment']['date']}; full results in docs/tracking.md.",
+        "",
+        *(
+            f"- Figure eight of 2 m by 1 m in {lap} s on the nominal drone: {of['eights'][lap]['mean_mm']:.1f} mm, at "
+            f"most {of['eights'][lap]['largest_mm']:.0f} mm."
+            for lap in ("4", "2")
+        ),
+        f"- The same in 2.5 s on {whole['drones']} drones of the paper's randomisation: median "
+        f"{wild['median_mm']:.0f} mm; {wild['failed']:.1%} failed.",
+        "",
+        "## Limits",
+        "",
+        f"- {late[0][0].upper() + late[0][1:]}, 2 s: "
+        + ("all failed." if late[1]["mean_mm"] is None else f"{late[1]['mean_mm']:.0f} mm."),
+        f"- Largest error on drones with effects outside the training, 3 s: {of['plants'][plant]['mean_mm']:.0f} mm, "
+        f"`{plant}`.",
+        "- A path that asks for more thrust than the drone has is not followed: see `demand`.",
+    ]
 
 
 def _flips(name: str) -> list[str]:

@@ -64,6 +64,8 @@ LAYOUTS = {
     ),
     "positions as they are": (Layout(position_bend_m=0.0, position_scale_m=1.0, velocity_bend_mps=0.0), "tanh"),
     "integral alone": (Layout(past_estimates=1, past_commands=0, integral=True, integral_limit_ms=0.01), "relu"),
+    "a path ahead": (Layout(preview_s=(0.05, 0.3), action="body_rates"), "tanh"),
+    "a path ahead in world axes": (Layout(preview_s=(0.2,), body_position=False, action="velocity"), "relu"),
 }
 
 
@@ -174,7 +176,7 @@ def test_a_flip_goes_through_its_phases_and_holds_again(built):
     for i in range(600):
         roll = 0.2 * max(0, i - 60)
         q = (math.cos(roll / 2), math.sin(roll / 2), 0.0, 0.0) if roll < 11 else level
-        compiled.step((0, 0, 0), (0, 0, 2.5 if i > 50 else 0.0), q, (0, 0, 0))
+        compiled.step((0, 0, 1e-5 * (i % 2)), (0, 0, 2.5 if i > 50 else 0.0), q, (0, 0, 0))
         phases.append(compiled.phase)
     hold, climb, turn, catch = range(4)
     order = [p for i, p in enumerate(phases) if i == 0 or phases[i - 1] != p]
@@ -267,7 +269,16 @@ def firmware(exported, folder: Path) -> ctypes.CDLL:
 
 
 class Setpoint(ctypes.Structure):
-    _fields_ = [("position", ctypes.c_float * 3), ("mode", ctypes.c_int * 3)]
+    _fields_ = [
+        ("position", ctypes.c_float * 3),
+        ("mode", ctypes.c_int * 7),
+        ("velocity", ctypes.c_float * 3),
+        ("acceleration", ctypes.c_float * 3),
+        ("attitude", ctypes.c_float * 3),
+        ("attitude_rate", ctypes.c_float * 3),
+        ("thrust", ctypes.c_float),
+        ("velocity_body", ctypes.c_bool),
+    ]
 
 
 class FirmwareState(ctypes.Structure):
@@ -279,13 +290,22 @@ class Control(ctypes.Structure):
 
 
 def tick(
-    app, at: int, control, position=(0, 0, 1), velocity=(0, 0, 0), wxyz=(1, 0, 0, 0), gyro_deg=(0, 0, 0), absolute=1
+    app,
+    at: int,
+    control,
+    position=(0, 0, 1),
+    velocity=(0, 0, 0),
+    wxyz=(1, 0, 0, 0),
+    gyro_deg=(0, 0, 0),
+    absolute=1,
+    mode=2,
+    velocity_of_target=(0, 0, 0),
 ):
     state = FirmwareState((*wxyz[1:], wxyz[0]), position, velocity)
     gyro = (ctypes.c_float * 3)(*gyro_deg)
-    target = Setpoint((0.5, 0, 1), (absolute,) * 3)
+    target = Setpoint((0.5, 0, 1), (absolute,) * 3, velocity_of_target, (0.5, 0.0, -0.5))
     app.controllerOutOfTree(ctypes.byref(control), ctypes.byref(target), gyro, ctypes.byref(state), ctypes.c_uint32(at))
-    assert control.mode == 2
+    assert control.mode == mode
     return np.array(control.forces)
 
 
@@ -319,6 +339,103 @@ def test_the_app_stops_without_a_set_point_and_begins_anew_after_a_pause(built, 
     np.testing.assert_allclose(tick(app, 82, control), first, atol=1e-6)
     tick(app, 90, control)
     np.testing.assert_allclose(tick(app, 500, control), first, atol=1e-6)
+
+
+class Legacy(ctypes.Structure):
+    _fields_ = [("roll_pitch_yaw", ctypes.c_int16 * 3), ("thrust", ctypes.c_float), ("mode", ctypes.c_int)]
+
+
+def test_the_app_hands_thrust_and_rates_to_the_firmwares_rate_loop(built, tmp_path):
+    deployment = Deployment("rates", random_policy(8, Layout(action="body_rates")))
+    exported, compiled = built(deployment)
+    app = firmware(exported, tmp_path)
+    app.controllerOutOfTreeInit()
+    rate, seen = np.array([1.0, -2.0, 0.5]), ((0.1, -0.2, 1.1), (0.3, 0.2, -0.1), (0.96, 0.1, 0.2, 0.17))
+    compiled.reset()
+    thrust, *wanted = compiled.step(*seen, rate, (0.5, 0, 1))
+    assert 0 < thrust < 1
+    assert np.abs(wanted).max() > 1
+    control = Control()
+    tick(app, 100, control, *seen, np.degrees(rate), mode=0)
+    # The firmware's pitch is positive with the nose up, ours about the body's y axis.
+    signs = np.array([1, -1, 1])
+    asked = np.array((ctypes.c_float * 6).in_dll(app, "asked"))
+    np.testing.assert_allclose(asked[:3], np.degrees(rate) * signs, rtol=1e-5)
+    np.testing.assert_allclose(asked[3:], np.degrees(wanted) * signs, rtol=1e-5)
+    legacy = Legacy.from_buffer_copy(bytes(control)[:12] + bytes(8))
+    assert list(legacy.roll_pitch_yaw) == [100, 200, -300]
+    assert legacy.thrust == pytest.approx(65535 * thrust, rel=1e-5)
+
+
+@pytest.mark.parametrize("action", ["attitude", "velocity", "position"])
+def test_the_app_hands_set_points_to_the_firmwares_pid(action, built, tmp_path):
+    exported, compiled = built(Deployment(action, random_policy(9, Layout(action=action))))
+    app = firmware(exported, tmp_path)
+    app.controllerOutOfTreeInit()
+    tick(app, 100, Control(), mode=0)
+    compiled.reset()
+    command = compiled.step((0, 0, 1), (0, 0, 0), (1, 0, 0, 0), (0, 0, 0), (0.5, 0, 1))
+    found = Setpoint.in_dll(app, "followed")
+    modes = {"attitude": [0, 0, 0, 1, 1, 1, 0], "velocity": [2, 2, 2, 0, 0, 1, 0], "position": [1, 1, 1, 0, 0, 1, 0]}
+    assert list(found.mode) == modes[action]
+    assert found.attitude[2] == pytest.approx(np.degrees(command[3]), rel=1e-5)
+    if action == "attitude":
+        assert found.thrust == pytest.approx(65535 * command[0], rel=1e-5)
+        np.testing.assert_allclose(found.attitude[:2], np.degrees(command[1:3]) * [1, -1], rtol=1e-5)
+    if action == "velocity":
+        np.testing.assert_allclose(found.velocity, command[:3], rtol=1e-5)
+    if action == "position":
+        np.testing.assert_allclose(found.position, command[:3] + np.array([0.5, 0, 1]), rtol=1e-5)
+
+
+def test_the_app_looks_ahead_along_the_targets_velocity_and_acceleration(built, tmp_path):
+    layout = Layout(preview_s=(0.1, 0.4))
+    exported, compiled = built(Deployment("ahead", random_policy(10, layout)))
+    app = firmware(exported, tmp_path)
+    app.controllerOutOfTreeInit()
+    found = tick(app, 100, Control(), velocity_of_target=(1, -2, 0))
+    velocity, acceleration = np.array([1, -2, 0]), np.array([0.5, 0.0, -0.5])
+    ahead = [velocity * t + acceleration * t**2 / 2 for t in layout.preview_s]
+    row = np.concatenate([(0, 0, 1), (0, 0, 0), (1, 0, 0, 0), (0, 0, 0), (0.5, 0, 1), *ahead])
+    compiled.reset()
+    np.testing.assert_allclose(found, compiled.steps(row[None])[0], atol=1e-6)
+
+
+def test_a_frozen_estimate_stops_the_motors(built):
+    """An estimator that hangs repeats itself bit for bit; the policy used to fly on for ever."""
+    compiled = built(find_deployment("target"))[1]
+    compiled.reset()
+    good = ((0, 0, 0.1), (0, 0, 0), (1, 0, 0, 0), (0, 0.001, 0))
+    commands = [compiled.step(*good) for _ in range(13)]
+    assert min(u.min() for u in commands[:12]) > 0.2
+    assert commands[12].max() == 0
+    assert compiled.fault == 2
+    compiled.reset()
+    for i in range(50):
+        assert compiled.step((0, 0, 0.1), (0, 0, 0), (1, 0, 0, 0), (0, 0, 1e-6 * (i % 2))).min() > 0.2
+
+
+_FIRMWARE_FLAGS = """
+-mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -fno-math-errno -mfp16-format=ieee -g3 -Os -Werror
+-Wno-address-of-packed-member -Wall -Wmissing-braces -fno-strict-aliasing -std=gnu11 -ffunction-sections -fdata-sections
+-Wdouble-promotion
+"""
+"""Those of the firmware's Makefile."""
+
+
+@pytest.mark.skipif(not cortex.has_compiler(), reason="arm-none-eabi-gcc is not installed")
+@pytest.mark.parametrize("name", ["target", "double-flip", "rates", "velocity", "ahead"])
+def test_the_app_compiles_as_the_firmware_compiles_it(name, tmp_path):
+    layouts = {"rates": {"action": "body_rates"}, "velocity": {"action": "velocity"}, "ahead": {"preview_s": (0.1,)}}
+    chosen = layouts.get(name)
+    policy = None if chosen is None else random_policy(1, Layout(**chosen))
+    exported = export_policy(find_deployment(name) if policy is None else Deployment(name, policy), tmp_path / "c")
+    objects = re.findall(r"obj-y \+= (\w+)\.o", (exported.folder / "Kbuild").read_text())
+    assert "controller_out_of_tree" in objects
+    for stem in objects:
+        command = ["arm-none-eabi-gcc", *_FIRMWARE_FLAGS.split(), "-DFIRMWARE_ELSEWHERE", "-fcommon"]
+        command += [f"-I{Path(__file__).parent / 'firmware'}", f"-I{exported.folder}"]
+        subprocess.run([*command, "-c", f"{exported.folder / stem}.c", "-o", f"{tmp_path / stem}.o"], check=True)
 
 
 def test_the_app_flips_when_its_parameter_is_set(built, tmp_path):
@@ -475,7 +592,10 @@ def test_a_flip_asked_for_during_a_flip_is_not_begun(built):
     for i in range(600):
         roll = min(0.2 * max(0, i - 60), 4 * math.pi)
         compiled.step(
-            (0, 0, 0), (0, 0, 2.5 if i > 50 else 0.0), (math.cos(roll / 2), math.sin(roll / 2), 0, 0), (0, 0, 0)
+            (0, 0, 1e-5 * (i % 2)),
+            (0, 0, 2.5 if i > 50 else 0.0),
+            (math.cos(roll / 2), math.sin(roll / 2), 0, 0),
+            (0, 0, 0),
         )
         phases.append(compiled.phase)
         if i in (20, 55, 130):

@@ -150,7 +150,7 @@ def test_messages_in_the_remedies_are_those_of_the_code():
 def test_cards_of_policies_say_what_was_measured():
     """With other results under benchmarks, or another policy, `scripts/policy_cards.py` writes others."""
     cards = _script("policy_cards")
-    assert len(shipped_policies()) == 5
+    assert len(shipped_policies()) == 7
     for name, path in shipped_policies().items():
         assert path.with_name("card.md").read_text() == cards.card(path.parent), name
 

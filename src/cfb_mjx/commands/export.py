@@ -63,7 +63,7 @@ class Export(Command):
 
     Attributes:
         policy: a shipped policy, a policy file of `cfb train`, or the name of a flip.
-            Shipped policies: target, target-analytic, target-adaptive, flip, flip-analytic.
+            Shipped policies: target, target-analytic, target-adaptive, track, track-rates, flip, flip-analytic.
             Flips: double-flip, triple-flip ...
         output: folder to write to.
         knobs: settings of the flip, for a flip policy: a shipped manoeuvre or a YAML file of `cfb fly --keep`.

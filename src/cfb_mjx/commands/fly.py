@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from cfb_mjx.train.flying import Flight
 
 _UNITS = {"mm": "mm", "s": "s", "mps": "m/s", "m": "m", "radps": "rad/s"}
-_FLOWN = ("controller", "task", "model", "plants", "magnitude", "gyro", "knobs", "environment")
+_FLOWN = ("controller", "task", "model", "plants", "magnitude", "gyro", "knobs", "path", "environment")
 """Keys of the results that say what was flown."""
 _ROUNDS = 20
 
@@ -66,6 +66,7 @@ class Fly(Command):
     - hover: 6 s at the target; the first second is not counted.
     - step: a step of the target by 6 m to one side.
     - recover: the drone starts thrown at 3 m/s and tilted by 60 deg.
+    - track: follow a path from hover at its beginning; the first 4 s of the figure eight are not counted.
     - flip, double-flip, triple-flip: climb, turn about the x axis, and return to the start. `cfb fly double-flip` is
       short for `cfb fly flip --task double-flip`.
 
@@ -74,7 +75,7 @@ class Fly(Command):
     Attributes:
         controller: a shipped policy, a policy file of `cfb train`, the name of a flip, or pid or mellinger.
             pid and mellinger are the controllers of the firmware.
-        task: task to fly. Default: hover, or flip for a flip policy.
+        task: task to fly. Default: hover, flip for a flip policy, track for a policy that sees ahead.
         model: preset or model YAML of the drone, with its effects.
         plants: number of flights, at least 1, each on a drone drawn from the randomisation.
         magnitude: factor on the ranges of the randomisation; 0 flies the model itself.
@@ -99,6 +100,10 @@ class Fly(Command):
             The model itself then keeps within 1.8 m.
             within: most randomised drones that complete the flip within 1.8 m.
         keep: YAML file for the settings of the flip that were flown, for --knobs.
+        path: path of --task track: figure-eight (2 m by 1 m in 2 s), random (through random points of --seed), or a
+            trajectory file (.csv: durations and polynomials as in uav_trajectories, which the firmware also flies).
+            Default: figure-eight.
+        timescale: factor on all times of the path, as in the firmware: 2 is half as fast.
         devices: number of devices of this machine over which the flights are divided.
         gyro: delay of the gyro. late: as late as the pose, by the model's pose_delay, as in the paper.
             local: read on the drone, late by gyro_delay only.
@@ -106,7 +111,7 @@ class Fly(Command):
     """
 
     controller: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONTROLLER")]
-    task: Literal["hover", "step", "recover", "flip", "double-flip", "triple-flip"] | None = None
+    task: Literal["hover", "step", "recover", "track", "flip", "double-flip", "triple-flip"] | None = None
     model: Model = "cfb-guards"
     plants: int = 1
     magnitude: Annotated[float, Within(0)] = 0.0
@@ -124,6 +129,8 @@ class Fly(Command):
     holder: Annotated[str | None, tyro.conf.arg(metavar="CONTROLLER")] = None
     search: Literal["height", "margin", "within"] | None = None
     keep: File = None
+    path: Annotated[str | None, tyro.conf.arg(metavar="PATH")] = None
+    timescale: float = 1.0
     devices: Devices = 1
     gyro: Literal["late", "local"] | None = None
 
@@ -141,13 +148,14 @@ class Fly(Command):
         import jax
         import numpy as np
 
-        from cfb_mjx.control.controllers import find_controller, has_lumped_delay, is_flip_policy
+        from cfb_mjx.control.controllers import find_controller, has_lumped_delay, is_flip_policy, is_tracking_policy
         from cfb_mjx.devices import Devices
         from cfb_mjx.envs import Noise, TargetTask
         from cfb_mjx.envs.episode import QUIET, with_room
         from cfb_mjx.model import Quadrotor, require_possible
         from cfb_mjx.parameters import load_model_file, load_randomisation
         from cfb_mjx.train.flips import FLIPS
+        from cfb_mjx.train.flying import demanded, find_course
         from cfb_mjx.train.measuring import measured
 
         name, task = self.controller, self.task
@@ -166,7 +174,8 @@ class Fly(Command):
             lumped_delay=has_lumped_delay(name) if self.gyro is None else self.gyro == "late",
         )
         if task is None:
-            task = "flip" if is_flip_policy(controller) else "hover"
+            ahead = is_tracking_policy(controller) or self.path is not None
+            task = "flip" if is_flip_policy(controller) else "track" if ahead else "hover"
         flips = task in FLIPS
         if flips:
             wild = replace(course, randomisation=spread, magnitude=self.magnitude or 1.0)
@@ -177,10 +186,16 @@ class Fly(Command):
                 raise CfbError(f"{name}: is a flip policy and cannot fly --task {task}; fly flip or double-flip.")
             if any((self.knobs, self.set, self.holder, self.search, self.keep)):
                 raise CfbError(f"--knobs, --set, --holder, --search and --keep are for flips, not for --task {task}.")
+        if task != "track" and (self.path is not None or self.timescale != 1):
+            raise CfbError(f"--path and --timescale are for --task track, not for {task}.")
+        way = find_course(self.path or "figure-eight", self.seed, self.timescale) if task == "track" else None
         keys = jax.random.split(jax.random.PRNGKey(self.seed), self.plants)
-        fly = measured(task, controller, with_room(course, nominal), keys, Devices.take(self.devices))
+        fly = measured(task, controller, with_room(course, nominal), keys, Devices.take(self.devices), way)
         numbers = {"controller": name, "task": task, "model": self.model, "plants": self.plants}
         numbers |= {"magnitude": self.magnitude, "gyro": "late" if course.lumped_delay else "local"}
+        if way is not None:
+            numbers["path"] = {"name": self.path or "figure-eight", "timescale": self.timescale, **demanded(way)}
+            _require_feasible(numbers["path"], nominal)
         if manoeuvre is not None:
             numbers["knobs"] = {name: float(x) for name, x in manoeuvre.knobs._asdict().items() if np.isfinite(x)}
         found, flown = self._measured(fly, described, nominal)
@@ -194,7 +209,8 @@ class Fly(Command):
 
                 title = f"{name}, {task}, {self.model}"
                 # Not None: `_check` allows these files only for flights of one model.
-                write_flights(not_none(flown), controller.control_dt_s, nominal, title, flips, **self._shown)
+                kind = "flip" if flips else task
+                write_flights(not_none(flown), controller.control_dt_s, nominal, title, kind, **self._shown)
         return Flown(numbers, {"knobs": self.keep, "results": self.json, **self._shown}, self.search is not None)
 
     @property
@@ -287,11 +303,33 @@ class Fly(Command):
         return manoeuvre
 
 
+def _require_feasible(path: Mapping[str, Any], nominal: Quadrotor) -> None:
+    """Warn if a path asks for more thrust than the drone has."""
+    import warnings
+
+    from cfb_mjx.errors import CfbWarning
+    from cfb_mjx.model import balanced_thrust_to_weight
+
+    lifts = float(balanced_thrust_to_weight(nominal.changed_parameters()))
+    if path["thrust_to_weight"] > lifts:
+        warnings.warn(
+            f"--path {path['name']}: asks for {path['thrust_to_weight']:.2f} times the drone's weight, its rotors lift "
+            f"{lifts:.2f} times; fly it slower with --timescale.",
+            CfbWarning,
+            stacklevel=2,
+        )
+
+
 def _table(numbers: Mapping[str, Any]) -> list[str]:
     """The results on one model, a line for each number."""
     drones = "drone" if numbers["plants"] == 1 else "drones"
     gyro = "gyro as late as the pose" if numbers["gyro"] == "late" else "gyro on the drone"
     lines = [f"{numbers['controller']}, {numbers['task']}: {numbers['plants']} {drones}, {numbers['model']}, {gyro}"]
+    if path := numbers.get("path"):
+        lines.append(
+            f"  {path['name']}: up to {path['speed_mps']:.3g} m/s, {path['thrust_to_weight']:.3g} times the weight, "
+            f"{path['rate_radps']:.3g} rad/s"
+        )
     for key, value in numbers.items():
         if key in (*_FLOWN, "quantiles", "diverged"):
             continue

@@ -17,6 +17,7 @@ from cfb_mjx.files import VectorFormat, require_no_file, together, write_json
 NEWEST, EVENTS, FIGURE = "training.json", "events", "curve.png"
 _JUDGED = (
     ("hover_mm", "hover", " mm"),
+    ("track_mm", "figure eight", " mm"),
     ("random_mm", "on randomised drones", " mm"),
     ("command_std", "command std", ""),
     ("rate_error_radps", "rate error", " rad/s"),
@@ -54,7 +55,8 @@ class Train(Command):
     config.yaml and checkpoint.npz.
 
     Attributes:
-        task: task to learn: target (fly to a target and hold it) or flip (turn about the x axis at a given rate).
+        task: task to learn: target (fly to a target and hold it), flip (turn about the x axis at a given rate) or track
+            (follow a path).
         output: folder for the results.
         config: training YAML, or the name of a shipped one. Default: the configuration with the name of the task.
         model: preset or model YAML of the drone, with its effects. Default: that of the configuration.
@@ -78,7 +80,7 @@ class Train(Command):
 
     lists_in_yaml = True
 
-    task: Annotated[Literal["target", "flip"], tyro.conf.Positional]
+    task: Annotated[Literal["target", "flip", "track"], tyro.conf.Positional]
     output: OutputFolder
     config: Annotated[str | None, tyro.conf.arg(metavar="CONFIG")] = None
     model: Annotated[str | None, tyro.conf.arg(metavar="MODEL")] = None

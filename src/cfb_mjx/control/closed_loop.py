@@ -16,7 +16,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from cfb_mjx.control.controllers import Controller
+from cfb_mjx.control.controllers import Controller, require_motor_commands
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.engine.batching import LANES, PACKED_BYTES, axes, differentiated_as, examples, grouped, one_of_many
 from cfb_mjx.engine.cpu_kernel import one_kernel
@@ -86,7 +86,7 @@ def rollout_closed_loop(
         The kept states and commands, and the final memory.
 
     Raises:
-        CfbError: the control step is not a multiple of the model's.
+        CfbError: the control step is not a multiple of the model's, or the policy does not command the motors.
         ValueError: ``every`` does not divide ``commands``, or the policy needs set-points.
     """
     hold = model.steps_per_command(controller.control_dt_s)
@@ -94,6 +94,7 @@ def rollout_closed_loop(
         raise ValueError(f"{commands} commands cannot be kept every {every}")
     if isinstance(controller, NeuralController) and controller.layout.setpoint_scales:
         raise ValueError("a policy with set-points cannot be flown to a target alone")
+    require_motor_commands(controller, "rollout_closed_loop")
     given = (model, controller, state, jnp.asarray(target, model.parameters.mass.dtype), memory)
     leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, given))
     results: list[Any] = []

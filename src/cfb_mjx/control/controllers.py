@@ -9,10 +9,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.control import mellinger, pid
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
 from cfb_mjx.envs.observation import StateEstimate
 from cfb_mjx.errors import CfbError
+from cfb_mjx.firmware import mellinger, pid
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
 
@@ -85,6 +85,29 @@ def has_lumped_delay(controller: str | Path) -> bool:
 def is_flip_policy(controller: Controller) -> bool:
     """Whether a controller flies set-points of speed and rate, which a manoeuvre gives it, rather than to a target."""
     return bool(getattr(getattr(controller, "layout", None), "setpoint_scales", ()))
+
+
+def is_tracking_policy(controller: Controller) -> bool:
+    """Whether a controller sees ahead of a target that moves (`cfb_mjx.envs.Layout.preview_s`)."""
+    return bool(getattr(getattr(controller, "layout", None), "preview_s", ()))
+
+
+def require_motor_commands(controller: Controller, what: str) -> None:
+    """Refuse policies that command the firmware's loops.
+
+    Args:
+        controller: the controller.
+        what: what needs motor commands, for the message.
+
+    Raises:
+        CfbError: the controller is a policy with another action than motor commands.
+    """
+    action = getattr(getattr(controller, "layout", None), "action", "motors")
+    if action != "motors":
+        raise CfbError(
+            f"{what} needs a controller that commands the motors, not {action}; fly this policy with cfb fly, "
+            "cfb_mjx.train.flying.fly or an environment, which have the firmware's loops."
+        )
 
 
 def _measured(estimate: StateEstimate) -> State:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import yaml
 from jaxtyping import Array, Float, Int
 
+from cfb_mjx.control.controllers import require_motor_commands
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.documents import load_named, parse_yaml, refuse_unknown, shipped_names, told
 from cfb_mjx.envs.observation import Memory, StateEstimate, observation, remember
@@ -81,6 +82,8 @@ class Manoeuvre(eqx.Module):
     def __check_init__(self):
         if len(self.turner.layout.setpoint_scales) != 2 or self.holder.layout.setpoint_scales:
             raise CfbError("A flip needs a target policy, and a flip policy with set-points of speed and rate.")
+        require_motor_commands(self.holder, "a flip")
+        require_motor_commands(self.turner, "a flip")
         if self.holder.control_dt_s != self.turner.control_dt_s:
             raise CfbError(
                 f"The target policy commands every {self.holder.control_dt_s} s, the flip policy every "

@@ -96,7 +96,7 @@ def load_policy(path: str | Path) -> PolicyFile:
             shown, activation = about["observation"], about["activation"]
             limit = next(name for name, text in WRITTEN.items() if f"(1 + {text}) / 2" in about["output"])
             settings = dict(with_former(shown, "position_scale_m", BEFORE_BENDS))
-            settings["setpoint_scales"] = tuple(shown.get("setpoint_scales", ()))
+            settings |= {key: tuple(shown.get(key, ())) for key in ("setpoint_scales", "preview_s")}
             layout = Layout(**settings)
             weights = tuple(archive[f"weight_{i}"] for i in range(about["layers"]))
             biases = tuple(archive[f"bias_{i}"] for i in range(about["layers"]))

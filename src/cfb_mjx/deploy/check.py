@@ -54,14 +54,14 @@ def compare(
         steps: steps per sequence, more than the number of commands in a policy's history.
         seed: seed of the estimates.
     """
-    inputs = random_inputs(np.random.default_rng(seed), sequences, steps)
+    inputs = random_inputs(np.random.default_rng(seed), sequences, steps, compiled.previews)
     expected = np.asarray(
-        _commands(deployment.controller, jnp.float32(deployment.hover_command()), jnp.asarray(inputs))
+        _commands(deployment.controller, jnp.asarray(deployment.settled(), jnp.float32), jnp.asarray(inputs))
     )
     found = np.empty_like(expected)
     for i in range(sequences):
         begin(deployment, compiled)
-        found[i] = compiled.steps(inputs[i])
+        found[i] = deployment.outputs(compiled.steps(inputs[i]))
     difference = np.abs(found.astype(float) - expected)
     return Parity(sequences, steps, float(difference.max()), float(difference.mean()))
 
@@ -74,8 +74,8 @@ def begin(deployment: Deployment, compiled: CompiledPolicy) -> None:
         compiled.set_flip(float(knobs.speed_mps), float(knobs.rate_radps))
 
 
-def random_inputs(generator: np.random.Generator, sequences: int, steps: int) -> np.ndarray:
-    """Random estimates, (sequences, steps, 16), float32: near and far, slow and fast, any attitude."""
+def random_inputs(generator: np.random.Generator, sequences: int, steps: int, previews: int = 0) -> np.ndarray:
+    """Random estimates, (sequences, steps, 16 + 3 previews), float32: near and far, slow and fast, any attitude."""
     # Half of the sequences hover about their targets, the others are anywhere.
     wide = np.where(np.arange(sequences) % 2, 1.0, 0.05)[:, None, None]
     shape = sequences, steps
@@ -86,19 +86,23 @@ def random_inputs(generator: np.random.Generator, sequences: int, steps: int) ->
     angle = np.linalg.norm(rotation, axis=-1, keepdims=True)
     quaternion = np.concatenate([np.cos(angle / 2), rotation / angle * np.sin(angle / 2)], axis=-1)
     body_rate = 12 * wide * generator.standard_normal((*shape, 3))
-    return np.concatenate([position, velocity, quaternion, body_rate, target], axis=-1).astype(np.float32)
+    parts = [position, velocity, quaternion, body_rate, target]
+    if previews:
+        parts.append(wide * generator.standard_normal((*shape, 3 * previews)))
+    return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
 @eqx.filter_jit
 def _commands(controller, hover, inputs):
     def one(rows):
         def estimate(row):
-            return StateEstimate(row[:3] - row[13:], row[3:6], row[6:10], row[10:13])
+            return StateEstimate(row[:3] - row[13:16], row[3:6], row[6:10], row[10:13])
 
         def step(memory, row):
-            return controller.command(memory, estimate(row))
+            given = (row[16:],) if rows.shape[1] > 16 else ()
+            return controller.command(memory, estimate(row), *given)
 
-        first = controller.start(estimate(rows[0]), jnp.full(4, hover))
+        first = controller.start(estimate(rows[0]), hover)
         return jax.lax.scan(step, first, rows)[1]
 
     return jax.vmap(one)(inputs)
@@ -150,7 +154,7 @@ def fly_beside(
         plant = replace(plant, dt=dt)
     task = TargetTask(layout=deployment.holder.controller.layout, lumped_delay=deployment.holder.lumped_delay)
     task, start = with_room(task, plant), plant.hover_state(offset)
-    hover = jnp.full(4, deployment.hover_command(), jnp.float32)
+    hover = jnp.asarray(deployment.settled(), jnp.float32)
     steps = round(seconds / dt)
     position, command = np.empty((2, steps, 3)), np.empty((2, steps, 4), np.float32)
 
@@ -160,7 +164,7 @@ def fly_beside(
         for i in range(steps):
             if which == 0:
                 seen = episode.estimate
-                u = compiled.step(seen.position, seen.velocity, seen.quaternion, seen.body_rate)
+                u = deployment.outputs(compiled.step(seen.position, seen.velocity, seen.quaternion, seen.body_rate))
             else:
                 memory, u = _commanded(controller, memory, episode.estimate)
             command[which, i] = u
@@ -268,10 +272,10 @@ def _costs(exported: Exported, compiled: CompiledPolicy) -> tuple[dict[str, Any]
     else:
         findings.append(Finding("Cortex-M4 sizes: not measured, arm-none-eabi-gcc is not installed"))
     if cortex.has_emulator():
-        rows = random_inputs(np.random.default_rng(1), 16, 12).reshape(-1, 16)
+        rows = random_inputs(np.random.default_rng(1), 16, 12, compiled.previews).reshape(192, -1)
         run = cortex.emulate(exported, rows)
         begin(deployment, compiled)
-        apart = float(np.abs(compiled.steps(rows) - run.commands).max())
+        apart = float(np.abs(deployment.outputs(compiled.steps(rows)) - deployment.outputs(run.commands)).max())
         said = f"commands on an emulated STM32F405: within {apart:.1e} of this machine's C"
         findings.append(Finding(said, apart <= _EMULATED_TOLERANCE))
         instructions, how = float(run.instructions.max()), "counted on an emulated STM32F405"

@@ -22,8 +22,8 @@ FLAGS = ("-std=c11", "-O2", "-Wall", "-Wextra", "-Werror")
 class CompiledPolicy:
     """The compiled C policy. The C library holds one global state; `reset` begins anew."""
 
-    def __init__(self, library: ctypes.CDLL, flips: bool):
-        self._library, self.flips = library, flips
+    def __init__(self, library: ctypes.CDLL, flips: bool, previews: int = 0):
+        self._library, self.flips, self.previews = library, flips, previews
         library.cfb_policy_dt.restype = ctypes.c_float
         if flips:
             library.cfb_policy_set_flip.argtypes = [ctypes.c_float, ctypes.c_float]
@@ -61,7 +61,8 @@ class CompiledPolicy:
         """Do many steps in a row.
 
         Args:
-            inputs: (steps, 16): position, velocity, quaternion, body rate, target.
+            inputs: (steps, 16): position, velocity, quaternion, body rate, target; for a policy that sees ahead also
+                three numbers for every preview.
 
         Returns:
             Commands, (steps, 4), float32.
@@ -70,7 +71,9 @@ class CompiledPolicy:
         commands = np.empty((len(rows), 4), np.float32)
         step, at, into = self._library.cfb_policy_step, rows.ctypes.data, commands.ctypes.data
         for i in range(len(rows)):
-            row = at + 64 * i
+            row = at + rows.strides[0] * i
+            if self.previews and rows.shape[1] > 16:
+                self._library.cfb_policy_set_preview(ctypes.c_void_p(row + 64))
             step(row, row + 12, row + 24, row + 40, row + 52, into + 16 * i)
         return commands
 
@@ -91,7 +94,8 @@ def compile_policy(exported: Exported, extra: Sequence[str] = ()) -> CompiledPol
         sources = [str(path) for path in exported.sources]
         run_compiler([compiler, *FLAGS, *extra, "-shared", "-fPIC", "-o", str(library), *sources, "-lm"])
         # Once loaded, the library stays in memory after its file is deleted.
-        return CompiledPolicy(ctypes.CDLL(str(library)), exported.deployment.flips)
+        previews = len(exported.deployment.holder.controller.layout.preview_s)
+        return CompiledPolicy(ctypes.CDLL(str(library)), exported.deployment.flips, previews)
 
 
 def run_compiler(command: list[str]) -> str:

@@ -10,11 +10,14 @@ from cfb_mjx.control.neural import WRITTEN
 from cfb_mjx.control.policy_file import PolicyFile
 from cfb_mjx.deploy.deployment import CATCH_S, Deployment
 from cfb_mjx.envs.observation import Layout
+from cfb_mjx.firmware.actions import ACTIONS
 from cfb_mjx.optional import not_none
 
 FORMAT = "cfb_mjx contract 1"
 BLIND_STEPS = 5
 """Number of steps without an estimate after which the motors are stopped."""
+FROZEN_STEPS = 12
+"""Number of steps after which a moving estimate that is still the same, bit for bit, stops the motors."""
 LARGEST = 1e6
 """Largest valid input."""
 
@@ -29,26 +32,23 @@ def contract(deployment: Deployment) -> dict[str, Any]:
         "cfb_mjx": __version__,
         "step_s": layout.control_dt_s,
         "inputs": _inputs(),
-        "output": {
-            "name": "motor_command",
-            "length": 4,
-            "order": ["M1 front right", "M2 back right", "M3 back left", "M4 front left"],
-            "range": [0.0, 1.0],
-            "meaning": "share of the battery's voltage (duty) at the motor; 65535 of the firmware is 1",
-            "battery_compensation": "off",
-        },
+        "output": _output(layout),
         "heading": "held at zero: the body's x axis along the world's",
         "estimate_delay_s": deployment.pose_delay(),
         "first_step": {
-            "meaning": "history is filled with the first estimate and the command that hovers",
+            "meaning": "history is filled with the first estimate and the outputs of a hover",
+            "outputs": deployment.settled().tolist(),
             "hover_command": deployment.hover_command(),
         },
         "safety": {
             "largest_input": LARGEST,
             "blind_steps": BLIND_STEPS,
             "blind": "an input that is not finite or too large, or a quaternion of norm zero: the last command again",
-            "stopped": "after blind_steps of them, or without a last command: all motors 0 until cfb_policy_reset()",
-            "saturation": "commands are within 0 and 1 whatever the input",
+            "stopped": "after blind_steps of them, or without a last command: stopped until cfb_policy_reset()",
+            "frozen_steps": FROZEN_STEPS,
+            "frozen": "an estimate that moves and is the same, bit for bit, after frozen_steps steps: stopped likewise",
+            "when_stopped": "the command is 0; motors off",
+            "saturation": "commands are within their ranges whatever the input",
         },
         "policies": {name: _policy(policy) for name, policy in deployment.policies.items()},
         "trained_on": trained,
@@ -85,6 +85,27 @@ def _inputs() -> list[dict[str, Any]]:
         },
         {"name": "target", "length": 3, "unit": "m", "frame": world},
     ]
+
+
+def _output(layout: Layout) -> dict[str, Any]:
+    if layout.action == "motors":
+        return {
+            "name": "command",
+            "action": "motors",
+            "length": 4,
+            "order": ["M1 front right", "M2 back right", "M3 back left", "M4 front left"],
+            "range": [0.0, 1.0],
+            "meaning": "share of the battery's voltage (duty) at the motor; 65535 of the firmware is 1",
+            "battery_compensation": "off",
+        }
+    return {
+        "name": "command",
+        "action": layout.action,
+        "length": 4,
+        "of": [{"name": x.name, "unit": x.unit, "range": [x.low, x.high]} for x in ACTIONS[layout.action].outputs],
+        "meaning": "set-points of the firmware's own loops: outputs u from 0 to 1 are low + (high - low) u",
+        "battery_compensation": "off",
+    }
 
 
 def _policy(policy: PolicyFile) -> dict[str, Any]:
@@ -155,6 +176,10 @@ def _observation(layout: Layout) -> list[dict[str, Any]]:
                 "limit": f"inputs within {layout.integral_input_limit_m} m, sum within {layout.integral_limit_ms} m s",
             }
         )
+    axes = "body" if layout.body_position else "world"
+    for ahead in layout.preview_s:
+        name = f"target {ahead:g} s from now - target, {axes} axes"
+        segments.append({"name": name, "length": 3, "unit": "m", "divided_by": layout.preview_scale_m})
     names = ("v_target, m/s", "rate_target, rad/s")
     for name, scale in zip(names, layout.setpoint_scales, strict=False):
         segments.append({"name": name, "length": 1, "divided_by": scale})

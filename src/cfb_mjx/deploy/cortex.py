@@ -27,7 +27,7 @@ CLOCK_HZ = 168e6
 CYCLES_PER_INSTRUCTION = 2.0
 """More than the Cortex-M4 needs for such code: most instructions take one cycle, consecutive loads fewer than two each,
 a division 14, a taken branch up to 4, and the STM32's cache hides most of the waiting for flash."""
-INSTRUCTIONS_PER_MAC, INSTRUCTIONS_PER_ACTIVATION = 8.0, 80.0
+INSTRUCTIONS_PER_MAC, INSTRUCTIONS_PER_ACTIVATION, INSTRUCTIONS_PER_STEP = 8.0, 80.0, 500.0
 """For the estimate: slightly more than QEMU counts for the shipped policies."""
 _TARGET = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard")
 _GCC, _SIZE, _QEMU = "arm-none-eabi-gcc", "arm-none-eabi-size", "qemu-system-arm"
@@ -71,7 +71,8 @@ def multiply_accumulates(deployment: Deployment) -> int:
 def estimated_instructions(deployment: Deployment) -> float:
     """Instructions per step, estimated without running it."""
     activations = max(sum(len(b) for b in p.controller.network.biases) for p in deployment.policies.values())
-    return INSTRUCTIONS_PER_MAC * multiply_accumulates(deployment) + INSTRUCTIONS_PER_ACTIVATION * activations
+    network = INSTRUCTIONS_PER_MAC * multiply_accumulates(deployment) + INSTRUCTIONS_PER_ACTIVATION * activations
+    return network + INSTRUCTIONS_PER_STEP
 
 
 def size(exported: Exported) -> Size:
@@ -99,7 +100,7 @@ def emulate(exported: Exported, inputs: np.ndarray) -> Emulated:
 
     Args:
         exported: the exported policy.
-        inputs: (steps, 16): position, velocity, quaternion, body rate, target.
+        inputs: (steps, 16): position, velocity, quaternion, body rate, target; then the previews of a path, if any.
 
     Raises:
         CfbError: compiler or emulator is not installed, or the program does not end.
@@ -154,8 +155,8 @@ def _inputs(deployment: Deployment, inputs: np.ndarray) -> str:
     rows = ",\n".join("  {" + ", ".join(literal(x) for x in row) + "}" for row in np.asarray(inputs, np.float32))
     knobs = not_none(deployment.manoeuvre).knobs if deployment.flips else None
     return (
-        f"#define STEPS {len(inputs)}\n#define FLIPS {int(deployment.flips)}\n"
+        f"#define STEPS {len(inputs)}\n#define FLIPS {int(deployment.flips)}\n#define INPUTS {inputs.shape[1]}\n"
         f"#define FLIP_SPEED {literal(knobs.speed_mps if knobs else 0)}\n"
         f"#define FLIP_RATE {literal(knobs.rate_radps if knobs else 0)}\n"
-        f"static const float inputs[STEPS][16] = {{\n{rows}\n}};\n"
+        f"static const float inputs[STEPS][INPUTS] = {{\n{rows}\n}};\n"
     )

@@ -12,9 +12,10 @@ import numpy as np
 
 from cfb_mjx import __version__
 from cfb_mjx.control.policy_file import PolicyFile
-from cfb_mjx.deploy.contract import BLIND_STEPS, LARGEST, contract
+from cfb_mjx.deploy.contract import BLIND_STEPS, FROZEN_STEPS, LARGEST, contract
 from cfb_mjx.deploy.deployment import CATCH_S, Deployment
 from cfb_mjx.files import output_folder, plain, remove, together, write_texts
+from cfb_mjx.firmware.actions import ACTIONS
 from cfb_mjx.optional import not_none
 
 FIXED = ("cfb_network.h", "cfb_network.c", "cfb_pilot.h", "cfb_policy.h", "cfb_policy.c", "controller_out_of_tree.c")
@@ -75,11 +76,11 @@ def _template(name: str) -> str:
 
 
 def _filled(text: str, deployment: Deployment) -> str:
-    """Fill the names into a template, and remove the parts for flips if there is no flip."""
-    kept, dropping = [], False
+    """Fill the names into a template, and keep its parts for what this deployment can do (`_abilities`)."""
+    kept, dropping, able = [], False, _abilities(deployment)
     for line in text.splitlines():
-        if line in ("//@flip", "//@end"):
-            dropping = line == "//@flip" and not deployment.flips
+        if line.startswith("//@"):
+            dropping = line != "//@end" and line[3:] not in able
         elif not dropping:
             kept.append(line)
     text = "\n".join(kept) + "\n"
@@ -88,17 +89,68 @@ def _filled(text: str, deployment: Deployment) -> str:
     return text
 
 
+def _abilities(deployment: Deployment) -> set[str]:
+    """Parts of the templates that are kept."""
+    layout = deployment.holder.controller.layout
+    return {
+        "flip" if deployment.flips else "no flip",
+        "previews" if layout.preview_s else "hold",
+        "motors" if layout.action == "motors" else "loop",
+        layout.action,
+        "through_pid" if layout.action in ("attitude", "velocity", "position") else "direct",
+    }
+
+
+_C_OUTPUTS = {
+    "motors": "of M1..M4, each in [0, 1], proportional to the voltage (duty) at the motor.",
+    "body_rates": (
+        "mean command of the motors, [0, 1], and body rates about x, y and z, rad/s, for the firmware's rate loop,\n"
+        " * with which it was trained."
+    ),
+    "attitude": "mean command of the motors, [0, 1], and roll, pitch and yaw, rad, right-handed about body x, y and z.",
+    "velocity": "velocity, world, m/s, and yaw, rad.",
+    "position": "position relative to the target, world, m, and yaw, rad.",
+}
+
+
+_COMMANDS = {
+    "motors": "The policy commands the motors itself, with the firmware's controllers bypassed.",
+    "body_rates": "The policy commands thrust and body rates; the firmware's rate loop follows them at 500 Hz.",
+    "attitude": "The policy commands thrust and attitude; the firmware's PID follows them at 500 Hz.",
+    "velocity": "The policy commands velocities; the firmware's PID follows them.",
+    "position": "The policy commands positions about the target; the firmware's PID follows them.",
+}
+
+
+_LOGGED = {
+    "motors": "The log group `cfb` has the commands, 0 to 1, and the fault.",
+    "loop": (
+        "The log group `cfb` has the set-points (`set1` to `set4`) and the fault; log the firmware's `motor.m1` to "
+        "`motor.m4` too."
+    ),
+}
+
+
 def _marks(deployment: Deployment) -> dict[str, str]:
     delay = deployment.pose_delay()
-    step_ms = 1e3 * deployment.holder.controller.control_dt_s
+    layout = deployment.holder.controller.layout
+    step_ms = 1e3 * layout.control_dt_s
+    does = "tracks a target that moves" if layout.preview_s else "flies the drone to a target and holds it there"
     marks = {
         "TITLE": f"{deployment.name}, a policy of a Crazyflie Brushless",
-        "WHAT": f"A network that flies the drone to a target and holds it there, every {step_ms:g} ms.",
+        "WHAT": f"A network that {does}, every {step_ms:g} ms.",
         "VERSION": __version__,
         "HASH": " and ".join(p.weights_sha256[:12] for p in deployment.policies.values()),
         "PILOT_DOES": "what flies: the network",
         "DELAY_MS": "an unknown number of" if delay is None else f"{1e3 * delay:g}",
         "BLIND_STEPS": f"{BLIND_STEPS}",
+        "FROZEN_STEPS": f"{FROZEN_STEPS}",
+        "FROZEN_MS": f"{FROZEN_STEPS * step_ms:g}",
+        "OUTPUTS": f" * {_C_OUTPUTS[layout.action]}",
+        "COMMANDS": _COMMANDS[layout.action],
+        "LOGGED": _LOGGED["motors" if layout.action == "motors" else "loop"],
+        "PREVIEWS": f"{len(layout.preview_s)}",
+        "PREVIEWS_S": ", ".join(f"{ahead:g}" for ahead in layout.preview_s),
         "LARGEST_BITS": f"{np.float32(LARGEST).view(np.uint32):#x}",
         "BLIND_MS": f"{BLIND_STEPS * step_ms:g}",
         "FLIP": "",
@@ -142,7 +194,7 @@ def _sizes(deployment: Deployment) -> str:
     outputs = [len(b) for p in deployment.policies.values() for b in p.controller.network.biases]
     estimates = max(1, *(layout.past_estimates for layout in layouts))
     commands = max(1, *(layout.past_commands for layout in layouts))
-    setpoints = max(len(layout.setpoint_scales) for layout in layouts)
+    setpoints = max(layout.shown for layout in layouts)
     frame = max(layout.frame for layout in layouts)
     numbers = {
         "CFB_FRAME": frame,
@@ -162,8 +214,16 @@ def _guarded(mark: str, head: str, body: str) -> str:
 def _header(deployment: Deployment) -> str:
     values = {
         "CFB_DT_S": literal(deployment.holder.controller.control_dt_s),
-        "CFB_HOVER_COMMAND": literal(deployment.hover_command()),
+        "CFB_HOVER_OUTPUTS": "{" + ", ".join(map(literal, deployment.settled())) + "}",
     }
+    layout = deployment.holder.controller.layout
+    outputs = ACTIONS[layout.action].outputs
+    values |= {
+        f"CFB_{end.upper()}": "{" + ", ".join(literal(getattr(each, end)) for each in outputs) + "}"
+        for end in ("low", "high")
+    }
+    if layout.preview_s:
+        values["CFB_PREVIEW_TIMES"] = "{" + ", ".join(literal(ahead) for ahead in layout.preview_s) + "}"
     if deployment.flips:
         knobs, ranges = not_none(deployment.manoeuvre).knobs, deployment.setpoint_ranges
         values |= {f"CFB_{name.upper()}": literal(getattr(knobs, name)) for name in knobs._fields[:3]}
@@ -208,6 +268,7 @@ def _network(name: str, policy: PolicyFile) -> str:
         "past_estimates": layout.past_estimates,
         "estimate_stride": layout.estimate_stride,
         "past_commands": layout.past_commands,
+        "previews": len(layout.preview_s),
         "setpoints": len(layout.setpoint_scales),
         "position_limit": literal(layout.position_limit_m),
         "position_bend": literal(layout.position_bend_m),
@@ -217,6 +278,7 @@ def _network(name: str, policy: PolicyFile) -> str:
         "rate_scale": literal(layout.rate_scale_radps),
         "integral_input_limit": literal(layout.integral_input_limit_m),
         "integral_limit": literal(layout.integral_limit_ms),
+        "preview_scale": literal(layout.preview_scale_m),
         "dt": literal(layout.control_dt_s),
         "setpoint_scales": scales,
         "activation": f"CFB_{network.activation.upper()}",

@@ -3,8 +3,20 @@
 from cfb_mjx.envs.episode import Episode, Noise, Starts, Task, observe, privileged, reset, step, with_room
 from cfb_mjx.envs.flip import FlipReward, FlipStarts, FlipTask, Setpoints
 from cfb_mjx.envs.observation import Layout, Memory, StateEstimate
+from cfb_mjx.envs.path import (
+    Harmonics,
+    Path,
+    Polynomials,
+    demand,
+    figure_eight,
+    random_spline,
+    read_path,
+    slowed,
+    through,
+)
 from cfb_mjx.envs.reward import PAPER_REWARD, TargetReward
 from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.envs.track import Paths, TrackTask
 
 __all__ = [
     "PAPER_REWARD",
@@ -12,18 +24,29 @@ __all__ = [
     "FlipReward",
     "FlipStarts",
     "FlipTask",
+    "Harmonics",
     "Layout",
     "Memory",
     "Noise",
+    "Path",
+    "Paths",
+    "Polynomials",
     "Setpoints",
     "Starts",
     "StateEstimate",
     "TargetReward",
     "TargetTask",
     "Task",
+    "TrackTask",
+    "demand",
+    "figure_eight",
     "observe",
     "privileged",
+    "random_spline",
+    "read_path",
     "reset",
+    "slowed",
     "step",
+    "through",
     "with_room",
 ]

@@ -22,12 +22,16 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from cfb_mjx.envs import observation as seen
 from cfb_mjx.envs.observation import Layout, Memory, StateEstimate
 from cfb_mjx.errors import CfbError
+from cfb_mjx.firmware.actions import ACTIONS, Action, InnerLoop, start
+from cfb_mjx.firmware.actions import command as follow
+from cfb_mjx.firmware.pid import DT, FirmwarePid
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.randomised import differences, require_possible, sample_drone
 from cfb_mjx.model.rotors import hover_rotor_speed, steady_command
 from cfb_mjx.model.state import AnyArray, Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec, exponential, multiply
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters, Randomisation
 
 
@@ -79,7 +83,11 @@ class Task:
         return round(self.episode_s / self.layout.control_dt_s)
 
     def hold(self, model: Quadrotor) -> int:
-        """Number of simulation steps per command; raises as `Quadrotor.steps_per_command`."""
+        """Number of simulation steps per command; raises as `Quadrotor.steps_per_command`.
+
+        With a loop of the firmware beneath the policy, the drone is stepped with that loop, every 2 ms.
+        """
+        model = replace(model, dt=DT) if self.action.has_loop else model
         return model.steps_per_command(self.layout.control_dt_s)
 
     @property
@@ -87,9 +95,30 @@ class Task:
         """Reward of the best possible step."""
         raise NotImplementedError
 
+    @property
+    def action(self) -> Action:
+        """What the policy's outputs mean."""
+        return ACTIONS[self.layout.action]
+
     def draw_setpoint(self, key: PRNGKeyArray) -> Float[Array, " setpoints"]:
-        """Draw the set-point of an episode; ``layout.setpoint_scales`` has one scale per number."""
+        """Draw the set-point of an episode, or whatever else determines what is to be done in it."""
         return jnp.zeros(0)
+
+    def next_setpoint(self, setpoint: Float[Array, " setpoints"], state: State) -> Float[Array, " setpoints"]:
+        """Set-point of the next command, after a command has led to ``state``; by default it stays."""
+        return setpoint
+
+    def target(self, setpoint: Float[Array, " setpoints"], origin: Float[Array, "3"]) -> Float[Array, "3"]:
+        """Target, world, m; by default the ``origin`` of the episode."""
+        return origin
+
+    def target_velocity(self, setpoint: Float[Array, " setpoints"]) -> Float[Array, "3"]:
+        """Velocity of the target, world, m/s; by default zero."""
+        return jnp.zeros(3, setpoint.dtype)
+
+    def shown(self, setpoint: Float[Array, " setpoints"]) -> Float[Array, " shown"]:
+        """What the policy sees of the set-point: ``layout.shown`` numbers; by default the set-point."""
+        return setpoint
 
     def draw_start(
         self, model: Quadrotor, target: Float[Array, "3"], setpoint: Float[Array, " setpoints"], key: PRNGKeyArray
@@ -231,6 +260,8 @@ class Episode(eqx.Module):
     model: Quadrotor
     """The drone of this episode."""
     state: State
+    origin: Float[Array, "3"]
+    """The target as it was given to `reset`; paths begin here."""
     target: Float[Array, "3"]
     setpoint: Float[Array, " setpoints"]
     """Set-point beside the target; empty for tasks without one."""
@@ -241,6 +272,10 @@ class Episode(eqx.Module):
     """What the controller sees now."""
     count: Int[Array, ""]
     key: PRNGKeyArray
+    motors: Float[Array, "4"]
+    """Command of the motors in the last step, 0 to 1; beneath a loop of the firmware its mean."""
+    loop: InnerLoop | None
+    """The firmware's loop between policy and motors; None without one."""
 
 
 class Outcome(NamedTuple):
@@ -271,7 +306,7 @@ def reset(
         nominal: drone about which the drone of this episode is drawn.
         key: determines the drone, the start and all noise.
         state: initial state; drawn by default.
-        target: position to which estimates are relative, world, m.
+        target: position to which estimates are relative, world, m; for a moving target the origin of its path.
         magnitude: magnitude of the randomisation; default: the task's. May be traced.
         setpoint: set-point beside the target; drawn by default.
 
@@ -283,6 +318,8 @@ def reset(
             delays that can be drawn, or these are unknown because the model is traced.
     """
     room = _room_s(task, nominal, magnitude)
+    if task.action.has_loop:
+        nominal = replace(nominal, dt=DT)
     streams = Streams.of(key)
     model = nominal
     if task.randomisation is not None:
@@ -291,15 +328,28 @@ def reset(
         require_possible(nominal, task.randomisation, factor)
         factor = factor * mildness(task, streams.mildness)
         model = sample_drone(streams.drone, nominal, task.randomisation, factor)
-    target = jnp.asarray(target, model.parameters.mass.dtype)
+    origin = jnp.asarray(target, model.parameters.mass.dtype)
     drawn = task.draw_setpoint(streams.setpoint) if setpoint is None else setpoint
-    setpoint = jnp.asarray(drawn, target.dtype)
+    setpoint = jnp.asarray(drawn, origin.dtype)
+    target = task.target(setpoint, origin)
     state = task.draw_start(model, target, setpoint, streams.start) if state is None else state
     state = begin(model, state)
     past = DelayLine.filled(_pose(state), model.dt, room)
     estimate = _estimate(task, model, past, target, streams.first_estimate)
-    memory = seen.start(task.layout, estimate, settled_command(model, state))
-    return Episode(model, state, target, setpoint, past, memory, estimate, jnp.asarray(0), streams.noise)
+    motors = settled_command(model, state)
+    memory = seen.start(task.layout, estimate, settled_output(task, motors))
+    # The firmware was set for the nominal drone, not for the one that is flown.
+    loop = start(task.action, FirmwarePid.hovering(nominal.changed_parameters()), state)
+    count = jnp.asarray(0)
+    return Episode(model, state, origin, target, setpoint, past, memory, estimate, count, streams.noise, motors, loop)
+
+
+def settled_output(task: Task, motors: Float[Array, "4"]) -> Float[Array, "4"]:
+    """Outputs of a policy that has long commanded what the motors do now, with any set-point of its loop at rest."""
+    if not task.action.has_loop:
+        return motors
+    rest = jnp.full(4, 0.5, motors.dtype)
+    return rest.at[0].set(jnp.mean(motors)) if task.layout.action in ("body_rates", "attitude") else rest
 
 
 def mildness(task: Task, key: PRNGKeyArray) -> Float[Array, ""] | float:
@@ -324,7 +374,7 @@ def choose(condition: Array, yes: Any, no: Any) -> Any:
 
 def observe(task: Task, episode: Episode) -> Float[Array, " size"]:
     """Observation of the controller's network."""
-    return seen.observation(task.layout, episode.memory, episode.estimate, episode.setpoint)
+    return seen.observation(task.layout, episode.memory, episode.estimate, task.shown(episode.setpoint))
 
 
 def privileged(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array, " n"]:
@@ -338,8 +388,9 @@ def privileged(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array,
     errors = task.errors(state, episode.target, episode.setpoint)
     parts = [true, errors, jnp.sqrt(errors), state.rotor_speed / parameters.reference_rotor_speed]
     parts.append(episode.memory.integral / task.layout.integral_limit_ms)
-    if task.layout.setpoint_scales:
-        parts.append(episode.setpoint / jnp.asarray(task.layout.setpoint_scales))
+    if task.layout.shown:
+        scales = (task.layout.preview_scale_m,) * (3 * len(task.layout.preview_s)) + task.layout.setpoint_scales
+        parts.append(task.shown(episode.setpoint) / jnp.asarray(scales))
     if task.randomisation is not None:
         parts.append(differences(nominal, episode.model, task.randomisation))
     return jnp.concatenate(parts)
@@ -355,7 +406,8 @@ def step(
     Args:
         task: the task.
         episode: the episode so far.
-        command: commands of M1..M4; clipped to [0, 1].
+        command: outputs of the policy, commands of M1..M4 unless ``task.layout.action`` says otherwise; clipped to
+            [0, 1].
         prepared: `prepare(episode.model)`, if it has been computed already.
 
     Returns:
@@ -370,15 +422,25 @@ def step(
     kicks = scale * jax.random.normal(of_state, (hold, 6), command.dtype)
     row, center = Vec.unstack(command), prepared.parameters.center_of_gravity
 
-    def fly(at: Components, kick: Vec) -> tuple[Components, Components]:
-        at = advance(prepared, at, row)
+    def fly(carry: tuple[Components, tuple[InnerLoop, Array] | None], kick: Vec):
+        at, beneath = carry
+        motors = row
+        if beneath is not None:
+            # As arrays that XLA must not take apart again; see below.
+            measured = jax.lax.optimization_barrier(stack(replace(at, memory=()), center))
+            beneath = follow(task.action, beneath[0], measured, command, episode.target)
+            motors = Vec.unstack(jax.lax.optimization_barrier(beneath[1]))
+        at = advance(prepared, at, motors)
         velocity, body_rate = at.velocity + Vec(*kick[:3]), at.body_rate + Vec(*kick[3:])
         at = Components(at.position, velocity, at.quaternion, body_rate, at.rotor_speed, at.memory)
-        return at, at
+        return (at, beneath), (at, None if beneath is None else beneath[1])
 
     # A loop, even of one step, and arrays stacked only after it: otherwise XLA fuses the dynamics into every such array
     # and, on CPU without multi-output fusion, computes them once per number, twenty times slower.
-    moved, passed = jax.lax.scan(fly, unstack(episode.state, center), Vec.unstack(kicks))
+    beneath = None if episode.loop is None else (episode.loop, command)
+    begun = unstack(episode.state, center), beneath
+    (moved, beneath), (passed, commanded) = jax.lax.scan(fly, begun, Vec.unstack(kicks))
+    loop, motors = (None, command) if beneath is None else (beneath[0], jnp.mean(not_none(commanded), axis=0))
     state, poses = stack(moved, center), _pose(stack(passed, center))
     finite = _finite(state)
     state = choose(finite, state, episode.state)
@@ -386,10 +448,15 @@ def step(
     command = jnp.where(finite, command, 0.0)
     past = episode.past.push_all(poses)
     memory = seen.remember(task.layout, episode.memory, episode.estimate, command)
-    estimate = _estimate(task, model, past, episode.target, of_estimate)
+    setpoint = task.next_setpoint(episode.setpoint, state)
+    target = task.target(setpoint, episode.origin)
+    estimate = _estimate(task, model, past, target, of_estimate)
     count = episode.count + 1
-    after = Episode(model, state, episode.target, episode.setpoint, past, memory, estimate, count, episode.key)
-    reward = task.judge(state, episode.target, episode.setpoint, command, model.parameters)
+    motors, loop = jnp.where(finite, motors, 0.0), choose(finite, loop, episode.loop)
+    after = Episode(
+        model, state, episode.origin, target, setpoint, past, memory, estimate, count, episode.key, motors, loop
+    )
+    reward = task.judge(state, target, setpoint, command, model.parameters)
     reward = jnp.where(finite, reward, task.diverged_reward)
     return after, Outcome(reward, task.failed(state) | ~finite, count >= task.episode_steps, ~finite)
 

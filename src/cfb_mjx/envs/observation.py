@@ -1,7 +1,8 @@
 """Observation of a neural controller: newest estimate, past estimates, past commands, and set-points.
 
 The same contract holds for training, simulation and the exported C: `Layout` defines the contents, their order and
-scale. Order: newest frame, past frames (newest first), past commands (newest first), integral, set-points. A frame is
+scale. Order: newest frame, past frames (newest first), past commands (newest first), integral, previews of a path,
+set-points. A frame is
 the position relative to the target, velocity (world or body axes), the nine entries of the rotation matrix body to
 world by rows (the same for q and -q), and the body rate.
 
@@ -58,6 +59,18 @@ class Layout:
     """Whether the velocity is in body axes, not the world's."""
     setpoint_scales: tuple[float, ...] = ()
     """Divisor of each set-point."""
+    preview_s: tuple[float, ...] = ()
+    """For paths: how far ahead the policy sees its moving target, s. For each, it observes the target's displacement
+    from now until then, in the axes of the position."""
+    preview_scale_m: float = 0.5
+    action: str = "motors"
+    """Meaning of the four outputs, a name in `cfb_mjx.firmware.ACTIONS`: motor commands, or set-points of the
+    firmware's own loops."""
+
+    @property
+    def shown(self) -> int:
+        """Number of values that are observed beside the estimates: displacements of the target, then set-points."""
+        return 3 * len(self.preview_s) + len(self.setpoint_scales)
 
     @property
     def frame(self) -> int:
@@ -68,7 +81,7 @@ class Layout:
     def size(self) -> int:
         """Length of the observation."""
         past = self.frame * (1 + self.past_estimates) + 4 * self.past_commands
-        return past + 3 * self.integral + len(self.setpoint_scales)
+        return past + 3 * self.integral + self.shown
 
 
 BEFORE_BENDS = {"position_bend_m": 0.0, "velocity_bend_mps": 0.0, "body_position": False, "body_velocity": False}
@@ -162,16 +175,24 @@ def observation(
         layout: layout of the observation.
         memory: memory of the controller.
         estimate: newest estimate.
-        setpoint: one number for each of ``layout.setpoint_scales``.
+        setpoint: displacements of the target in world axes, m, three for each of ``layout.preview_s``, and one number
+            for each of ``layout.setpoint_scales``. None: the target stands still; a policy with set-points needs them.
     """
     shown = memory.frames[layout.estimate_stride - 1 :: layout.estimate_stride]
     drones = estimate.position.shape[1:]
     parts = [frame(layout, estimate), shown.reshape(-1, *drones), memory.commands.reshape(-1, *drones)]
     if layout.integral:
         parts.append(memory.integral / layout.integral_limit_ms)
+    ahead = 3 * len(layout.preview_s)
+    if ahead:
+        given = jnp.zeros((ahead, *drones), estimate.velocity.dtype) if setpoint is None else setpoint[:ahead]
+        moved = given.reshape(-1, 3, *drones)
+        if layout.body_position:
+            moved = jnp.einsum("ki...,ij...->kj...", moved, rotation_matrix(estimate.quaternion))
+        parts.append(moved.reshape(-1, *drones) / layout.preview_scale_m)
     if layout.setpoint_scales:
         scales = jnp.asarray(layout.setpoint_scales, estimate.velocity.dtype)
-        parts.append(not_none(setpoint) / scales.reshape(-1, *(1 for _ in drones)))
+        parts.append(not_none(setpoint)[ahead:] / scales.reshape(-1, *(1 for _ in drones)))
     return jnp.concatenate(parts)
 
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from cfb_mjx.control.controllers import require_motor_commands
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.envs.observation import StateEstimate
 from cfb_mjx.errors import CfbError
@@ -38,6 +39,7 @@ def controller_of(controllers: Sequence[NeuralController]) -> OtherController:
         CfbError: the policies differ in more than their weights, or their control step is not a multiple of a tick.
     """
     first = controllers[0]
+    require_motor_commands(first, "the reference simulator")
     if any(jax.tree.structure(one) != jax.tree.structure(first) for one in controllers):
         raise CfbError("policies that fly side by side must have the same observation and layers.")
     every = first.control_dt_s / TICK

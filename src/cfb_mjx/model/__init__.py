@@ -20,6 +20,7 @@ from cfb_mjx.model.state import State
 
 if TYPE_CHECKING:
     from cfb_mjx.model.mjx_body import MjxBody
+    from cfb_mjx.model.scene import Scene, SceneState
 
 __all__ = [
     "CATALOGUE",
@@ -31,6 +32,8 @@ __all__ = [
     "ParasiticDrag",
     "Quadrotor",
     "RigidBody",
+    "Scene",
+    "SceneState",
     "State",
     "Wrench",
     "balanced_thrust_to_weight",
@@ -57,4 +60,8 @@ def __getattr__(name: str):
         from cfb_mjx.model.mjx_body import MjxBody
 
         return MjxBody
+    if name in ("Scene", "SceneState"):
+        from cfb_mjx.model import scene
+
+        return getattr(scene, name)
     raise AttributeError(f"module 'cfb_mjx.model' has no attribute {name!r}")

@@ -15,6 +15,8 @@ from jaxtyping import Array, Float
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
 from cfb_mjx.model.effects.base import Wrench
+from cfb_mjx.model.mjcf import BODY_NAME, compiled, specification, warn_of_untouched
+from cfb_mjx.model.scene_engines import on_mjx
 from cfb_mjx.model.state import Components
 from cfb_mjx.model.vector import Vec, rotate
 from cfb_mjx.parameters.parameters import Parameters
@@ -23,7 +25,6 @@ from cfb_mjx.quiet import quietly
 with quietly():
     from mujoco import mjx
 
-BODY_NAME = "cfb"
 _NOT_NEEDED = (
     mujoco.mjtDisableBit.mjDSBL_EQUALITY
     | mujoco.mjtDisableBit.mjDSBL_FRICTIONLOSS
@@ -54,7 +55,10 @@ class MjxBody:
         mjcf: path of another MJCF; a copy of ``assets/cfb.xml`` may be given any static geometry.
 
     Raises:
-        CfbError: the MJCF cannot be compiled, lacks the free joint, or has other moving bodies.
+        CfbError: the MJCF cannot be compiled, lacks the free joint, or has other moving bodies (`Scene` has those).
+
+    Warns:
+        CfbWarning: the drone cannot touch some of its geoms.
     """
 
     name = "mjx"
@@ -147,26 +151,37 @@ def _mass_diagonal(model: mjx.Model, data: mjx.Data) -> jax.Array:
 @functools.lru_cache(maxsize=8)
 def _compile(mjcf: str | None, floor: bool) -> mujoco.MjModel:
     path = str(shipped("assets", "cfb.xml")) if mjcf is None else mjcf
-    try:
-        specification = mujoco.MjSpec.from_file(path)
-        specification.option.disableflags |= int(_NOT_NEEDED)
-        if not floor:
-            specification.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
-            # Geoms cost kinematics even if they cannot touch.
-            for geom in list(specification.geoms):
-                specification.delete(geom)
-        for site in list(specification.sites):
-            specification.delete(site)
-        model = specification.compile()
-    except ValueError as error:
-        raise CfbError(f"{path}: MuJoCo cannot compile this MJCF ({' '.join(str(error).split())}).") from None
+    spec = specification(path)
+    spec.option.disableflags |= int(_NOT_NEEDED)
+    if not floor:
+        spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONTACT)
+    elif mjcf is not None and spec.body(BODY_NAME) is not None:
+        warn_of_untouched(path, compiled(path, spec))
+    geoms = list(spec.geoms)
+    for geom in geoms:
+        # Geoms cost kinematics even if they cannot touch; those with a mass may be all the mass that a body has.
+        if not floor or (geom.mass == 0 and not any(_touch(geom, other) for other in geoms)):
+            spec.delete(geom)
+    for site in list(spec.sites):
+        spec.delete(site)
+    model = compiled(path, spec)
     joints = model.njnt == 1 and model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE
     if not joints or model.body(model.jnt_bodyid[0]).name != BODY_NAME:
-        raise CfbError(f"{path}: must have exactly one joint, the free joint of a body named '{BODY_NAME}'.")
+        raise CfbError(
+            f"{path}: must have exactly one joint, the free joint of a body named '{BODY_NAME}'; use Scene for a world "
+            "in which other bodies move."
+        )
     body = _body_index(model)
     if np.any(model.body_weldid[np.arange(model.nbody) != body] == body):
         raise CfbError(f"{path}: body '{BODY_NAME}' has child bodies; put their geoms on '{BODY_NAME}' itself.")
     return model
+
+
+def _touch(one, other) -> bool:
+    """Whether two geoms of a specification, one of them the drone's, can touch."""
+    bodies = {one.parent.name, other.parent.name}
+    kinds = one.contype & other.conaffinity or other.contype & one.conaffinity
+    return BODY_NAME in bodies and len(bodies) > 1 and bool(kinds)
 
 
 def _body_index(model: mujoco.MjModel) -> int:
@@ -177,6 +192,6 @@ def _body_index(model: mujoco.MjModel) -> int:
 def _on_device(mjcf: str | None, floor: bool, x64: bool):
     # Host copies: a device array that is cached during one trace must not leak into another.
     with jax.ensure_compile_time_eval():
-        model = mjx.put_model(_compile(mjcf, floor), impl="jax")
+        model = on_mjx(str(mjcf), _compile(mjcf, floor))
         data = mjx.make_data(model)
     return jax.tree.map(np.asarray, (model, data))

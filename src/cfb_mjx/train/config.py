@@ -11,7 +11,9 @@ from cfb_mjx.documents import load_named, parse_yaml, require_seed, told, with_f
 from cfb_mjx.envs import FlipReward, FlipStarts, FlipTask, Layout, Noise, Setpoints, Starts, TargetReward, TargetTask
 from cfb_mjx.envs.flip import FLIP_LAYOUT
 from cfb_mjx.envs.observation import BEFORE_BENDS
+from cfb_mjx.envs.track import TRACK_LAYOUT, TRACK_STARTS, Paths, TrackTask
 from cfb_mjx.errors import CfbError
+from cfb_mjx.firmware.actions import ACTIONS
 from cfb_mjx.parameters.randomisation import load_randomisation
 from cfb_mjx.train.cost import FlipCost, SmoothCost
 from cfb_mjx.train.strict import build, plain
@@ -142,7 +144,7 @@ class TrainingConfig:
     """Configuration of a training. The defaults are those of ``configs/target.yaml``."""
 
     format: Literal["cfb_mjx training 1"] = FORMAT
-    task: Literal["target", "flip"] = "target"
+    task: Literal["target", "flip", "track"] = "target"
     """The task; flips have `FlipTrainingConfig`, so rewards and starts in a file are read as a target's here."""
     description: str = ""
     model: str = "cfb-guards"
@@ -166,7 +168,7 @@ class TrainingConfig:
 
     def build_task(self) -> TargetTask | FlipTask:
         """Return the task to train on."""
-        # `FlipTrainingConfig` overrides this.
+        # The configurations of other tasks override this.
         assert isinstance(self.reward, TargetReward)
         assert isinstance(self.starts, Starts)
         return TargetTask(reward=self.reward, starts=self.starts, **self._common())
@@ -210,9 +212,26 @@ class FlipTrainingConfig(TrainingConfig):
         return FlipTask(reward=self.reward, starts=self.starts, setpoints=self.setpoints, **self._common())
 
 
-_KINDS = {"target": TrainingConfig, "flip": FlipTrainingConfig}
+@dataclass(frozen=True)
+class TrackTrainingConfig(TrainingConfig):
+    """Configuration of a training to track paths. The defaults are those of ``configs/track.yaml``."""
+
+    task: Literal["track"] = "track"
+    observation: Layout = TRACK_LAYOUT
+    starts: Starts = field(default_factory=partial(replace, TRACK_STARTS))
+    noise: Noise = field(default_factory=Noise)
+    paths: Paths = field(default_factory=Paths)
+
+    def build_task(self) -> TrackTask:
+        """Return the task to train on."""
+        assert isinstance(self.reward, TargetReward)
+        assert isinstance(self.starts, Starts)
+        return TrackTask(reward=self.reward, starts=self.starts, paths=self.paths, **self._common())
+
+
+_KINDS = {"target": TrainingConfig, "flip": FlipTrainingConfig, "track": TrackTrainingConfig}
 _SHOWN = ("observation", "position_scale_m", BEFORE_BENDS)
-_TOGETHER = {"target": (_SHOWN, ("reward", "position", {"near": 0.0})), "flip": (_SHOWN,)}
+_TOGETHER = {"target": (_SHOWN, ("reward", "position", {"near": 0.0})), "flip": (_SHOWN,), "track": ()}
 """Per task: group, a key of it that older configurations contain, and newer keys of the group with the values that
 reproduce the old behaviour."""
 
@@ -364,7 +383,7 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
         if _at(config, key) < least:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be at least {least}.")
     require_seed(config.seed, f"{where}: seed =")
-    for key in _POSITIVE + _POSITIVE_OF[config.task]:
+    for key in _POSITIVE + _POSITIVE_OF["flip" if config.task == "flip" else "target"]:
         if not _at(config, key) > 0:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be positive.")
     if config.task == "flip":
@@ -376,6 +395,13 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
             raise CfbError(f"{where}: reward.axis_direction must be three numbers.")
     if len(config.observation.setpoint_scales) != (2 if config.task == "flip" else 0):
         raise CfbError(f"{where}: observation.setpoint_scales needs one number for each set-point of {config.task}.")
+    if (
+        bool(config.observation.preview_s) != (config.task == "track")
+        or min(config.observation.preview_s, default=1) <= 0
+    ):
+        raise CfbError(f"{where}: observation.preview_s needs positive times for track, and is for track alone.")
+    if config.observation.action not in ACTIONS:
+        raise CfbError(f"{where}: observation.action must be one of {', '.join(ACTIONS)}.")
     near = "starts.entering" if config.task == "flip" else "starts.near"
     for key in ("ppo.last_rate", "ppo.last_entropy", near, "randomisation.graded", "ppo.discount", "ppo.gae_lambda"):
         if not 0 <= _at(config, key) <= 1:

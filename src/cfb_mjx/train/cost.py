@@ -41,7 +41,10 @@ class SmoothCost:
         command: Float[Array, "4"],
         last: Float[Array, "4"],
     ) -> Float[Array, ""]:
-        """Cost of a control step that ended in ``state`` after ``command``; ``last`` is the command before it."""
+        """Cost of a control step that ended in ``state`` after ``command``; ``last`` is the command before it.
+
+        For a moving target the velocity of ``state`` is relative to the target's.
+        """
         attitude = rotation_matrix(state.quaternion)
         return (
             self.position * rounded(state.position - target, self.position_width_m)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -16,13 +17,18 @@ from cfb_mjx.devices import Devices
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.train.flips import FLIPS, flips
-from cfb_mjx.train.flying import TESTS, Flight
+from cfb_mjx.train.flying import TESTS, Course, Flight
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 def measured(
-    test: str, controller: Controller, task: TargetTask, keys: PRNGKeyArray, over: Devices
+    test: str,
+    controller: Controller,
+    task: TargetTask,
+    keys: PRNGKeyArray,
+    over: Devices,
+    course: Course | None = None,
 ) -> Callable[[Quadrotor], tuple[dict[str, Any], Flight]]:
     """Return a function that flies a test on a drone.
 
@@ -32,11 +38,14 @@ def measured(
         task: determines the drones and the noise; with room for its delays (`cfb_mjx.envs.episode.with_room`).
         keys: one key per flight.
         over: devices that share the flights.
+        course: what to track, for the test ``track``; default: a figure eight.
 
     Returns:
         A function of the nominal drone that returns the `summary` and the flights, axes (drones, steps).
     """
-    flown_by = _flown_by(test)
+    flown_by: Callable[..., tuple[Any, Flight]] = flips if test in FLIPS else TESTS[test]
+    if course is not None:
+        flown_by = partial(flown_by, path=course.path, seconds=course.seconds, settled_s=course.settled_s)
     divided = over.divided(lambda controller, drone, keys: flown_by(controller, task, drone, keys), (None, None, 0), 0)
 
     def fly(drone: Quadrotor) -> tuple[dict[str, Any], Flight]:
@@ -50,10 +59,6 @@ def measured(
         return summary(test, {k: np.asarray(v) for k, v in numbers._asdict().items()}, completed, diverged), flown
 
     return fly
-
-
-def _flown_by(test: str) -> Callable[..., tuple[Any, Flight]]:
-    return flips if test in FLIPS else TESTS[test]
 
 
 def summary(
@@ -80,6 +85,9 @@ def summary(
     elif test == "step":
         values = {key: numbers[key] for key in ("arrival_s", "peak_speed_mps", "overshoot_m")}
         good = ~failed & np.isfinite(numbers["arrival_s"])
+    elif test == "track":
+        lengths = {f"{key}_mm": 1e3 * numbers[f"{key}_m"] for key in ("mean_distance", "largest_distance")}
+        values, good = lengths | {"peak_speed_mps": numbers["peak_speed_mps"]}, ~failed
     elif test == "recover":
         values = {key: numbers[key] for key in ("lost_height_m", "final_distance_m")}
         good = numbers["recovered"] & ~diverged

@@ -21,6 +21,7 @@ from jaxtyping import PRNGKeyArray
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
 from cfb_mjx.devices import Devices
+from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import output_folder, together, write_text
 from cfb_mjx.hosts import as_first, first, from_first
@@ -34,13 +35,13 @@ from cfb_mjx.train.algorithm import Algorithm
 from cfb_mjx.train.checkpoint import load_state, read_about, save_checkpoint
 from cfb_mjx.train.config import TrainingConfig
 from cfb_mjx.train.flips import turning
-from cfb_mjx.train.flying import hover, nominal_task
+from cfb_mjx.train.flying import hover, nominal_task, track
 
 CHECKPOINT, POLICY, CURVE, CONFIG = "checkpoint.npz", "policy.npz", "curve.csv", "config.yaml"
 BEST, UPDATES = "best.npz", "updates.csv"
 _JUDGED_ON, _JUDGED_ON_RANDOM = 64, 256
 """Hover flights per point of the learning curve, with the task's noise: on the nominal drone, and on random drones."""
-_BEST_BY = ("random_mm", "hover_mm", "rate_error_radps")
+_BEST_BY = ("random_mm", "hover_mm", "track_mm", "rate_error_radps")
 """Columns of the curve that select the best policy (lowest value): the first of these that the curve has."""
 
 Row = dict[str, float]
@@ -349,6 +350,12 @@ def _judged(controller: NeuralController, training: Training, task, nominal: Qua
     if training.config.task == "flip":
         measured = turning(controller, nominal_task(task), nominal, keys)
         return {name: float(jnp.mean(value)) for name, value in measured._asdict().items()}
+    if training.config.task == "track":
+        measured, _ = track(controller, TargetTask(noise=task.noise, lumped_delay=task.lumped_delay), nominal, keys)
+        return {
+            "track_mm": 1e3 * float(jnp.mean(measured.mean_distance_m)),
+            "track_failed": float(jnp.mean(measured.failed)),
+        }
     measured, _ = hover(controller, nominal_task(task), nominal, keys)
     row = {
         "hover_mm": 1e3 * float(jnp.mean(measured.mean_distance_m)),

@@ -61,6 +61,49 @@ def flight_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
         save(figure, path)
 
 
+def track_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
+    """Draw the tracking of a path: from above, and its errors and commands over time.
+
+    Args:
+        flown: a `cfb_mjx.train.flying.Flight` from `cfb_mjx.train.flying.track`, axes (drones, steps).
+        dt: time between two commands, s.
+        path: figure to write.
+        title: title of the figure.
+    """
+    path = check_path(path)
+    position, target = np.asarray(flown.position)[:_SHOWN], np.asarray(flown.watched)[0]
+    time, count = dt * (1 + np.arange(len(target))), len(flown.position)
+    fade = 1.0 if count == 1 else 0.3
+    with context():
+        figure = new_figure(8.4, 4.2)
+        grid = figure.add_gridspec(3, 2, width_ratios=(1.15, 1))
+        above = figure.add_subplot(grid[:, 0])
+        for i, way in enumerate(position):
+            above.plot(way[:, 0], way[:, 1], color=_BLUE, linewidth=0.8, alpha=fade, label=None if i else "flown")
+        above.plot(target[:, 0], target[:, 1], color=_RED, linewidth=0.9, linestyle="--", label="path")
+        above.set_aspect("equal", adjustable="datalim")
+        above.set_xlabel("x, m")
+        above.set_ylabel("y, m")
+        above.legend(loc="best")
+        rows = (
+            ("error, mm", 1e3 * np.linalg.norm(position - target, axis=-1)),
+            ("speed, m/s", np.linalg.norm(np.asarray(flown.velocity)[:_SHOWN], axis=-1)),
+            ("command, M1", np.asarray(flown.command)[:_SHOWN, :, 0]),
+        )
+        first = None
+        for i, (label, values) in enumerate(rows):
+            axis = first = figure.add_subplot(grid[i, 1], sharex=first)
+            axis.plot(time, values.T, color=_BLUE, linewidth=0.9, alpha=fade)
+            axis.set_ylabel(label)
+            axis.set_xlim(0, time[-1])
+            axis.set_xlabel("time, s" if i == 2 else "")
+            axis.tick_params(labelbottom=i == 2)
+        more = "" if count <= _SHOWN else f" ({_SHOWN} of {count} flights)"
+        figure.suptitle(title + more, fontsize=10)
+        figure.subplots_adjust(left=0.08, right=0.98, bottom=0.12, top=0.91, hspace=0.15, wspace=0.25)
+        save(figure, path)
+
+
 _BLUE, _RED, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#e8e8e8"
 
 
@@ -164,7 +207,7 @@ DRONES = 40
 _MOTORS = ("M1", "M2", "M3", "M4")
 
 
-def write_flight_recording(path: str | Path, flown, dt: float, thrust=None) -> None:
+def write_flight_recording(path: str | Path, flown, dt: float, thrust=None, target=None) -> None:
     """Write a recording that `rerun` opens.
 
     Every drone has its pose and path under ``world/<number>``; the set-point is ``world/set-point``. Commands, body
@@ -175,6 +218,7 @@ def write_flight_recording(path: str | Path, flown, dt: float, thrust=None) -> N
         flown: a `cfb_mjx.train.flying.Flight` with axes (drones, steps).
         dt: time between two commands, s.
         thrust: (drones, steps, 4) N, drawn as arrows on the first drone; None: no arrows.
+        target: (steps, 3) m, a target that moves; None: the origin.
 
     Raises:
         CfbError: rerun is not installed or the file cannot be written.
@@ -192,7 +236,8 @@ def write_flight_recording(path: str | Path, flown, dt: float, thrust=None) -> N
     seen = np.stack([well.min(axis=0), well.max(axis=0)]) if len(well) else None
     with recording("cfb_fly", [Tab("flight", "world", plots, seen)], path) as recorder:
         recorder.world("world")
-        recorder.point("world/set-point", time[:1], np.zeros((1, 3)), COLOURS["commands_in"])
+        times, places = (time[:1], np.zeros((1, 3))) if target is None else (time, target)
+        recorder.point("world/set-point", times, places, COLOURS["commands_in"])
         for i in range(min(DRONES, len(position))):
             there = np.isfinite(position[i]).all(axis=1)
             recorder.line(f"world/{i}/way", position[i][there])
@@ -216,7 +261,7 @@ def write_flights(
     dt: float,
     nominal: Quadrotor,
     title: str = "",
-    flips: bool = False,
+    kind: str = "hover",
     figure: Path | None = None,
     recording: Path | None = None,
     video: Path | None = None,
@@ -229,7 +274,7 @@ def write_flights(
         dt: time between two commands, s.
         nominal: model whose thrust curve gives the thrust arrows.
         title: title of the figure.
-        flips: whether the flights are flips.
+        kind: what was flown: ``flip`` and ``track`` have figures of their own.
         figure: file of the figure; None writes none.
         recording: file of the rerun recording; None writes none.
         video: file of a film of the first flight; None writes none.
@@ -240,13 +285,14 @@ def write_flights(
     """
     parameters = nominal.changed_parameters()
     if figure is not None:
-        (flip_figure if flips else flight_figure)(flown, dt, figure, title)
+        draw = {"flip": flip_figure, "track": track_figure}.get(kind, flight_figure)
+        draw(flown, dt, figure, title)
     if recording is not None:
         thrust = np.asarray(rotors.thrust(parameters, flown.rotor_speed[:1]))
-        write_flight_recording(recording, flown, dt, thrust)
+        write_flight_recording(recording, flown, dt, thrust, np.asarray(flown.watched)[0] if kind == "track" else None)
     if video is not None:
         thrust = np.asarray(rotors.thrust(parameters, flown.rotor_speed[0]))
-        write_film(video, _first(flown, dt, thrust, FLOOR_M if flips else HEIGHT_M))
+        write_film(video, _first(flown, dt, thrust, FLOOR_M if kind == "flip" else HEIGHT_M))
     if log is not None:
         write_mcap(flight_log(flown, dt, log.stem, float(parameters.gravity)), log)
 

@@ -11,6 +11,7 @@ from cfb_mjx.view.style import COLOURS, check_path, context, new_figure, save
 
 _PANELS = (
     ("hover_mm", "mean hover error, mm", True),
+    ("track_mm", "mean error on a figure eight, mm", True),
     ("command_std", "command std", False),
     ("rate_error_radps", "rate error, rad/s", True),
     ("axis_error", "axis error", False),

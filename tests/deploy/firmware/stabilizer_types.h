@@ -4,10 +4,13 @@
 #include <stdint.h>
 
 #define RATE_MAIN_LOOP 1000
+#define ATTITUDE_RATE 500
+#define RATE_DO_EXECUTE(rate, step) (((step) % (RATE_MAIN_LOOP / (rate))) == 0)
 #define M2T(milliseconds) (milliseconds)
 
 typedef uint32_t stabilizerStep_t;
 typedef struct { float x, y, z; } vector_t;
+typedef struct { float roll, pitch, yaw; } attitude_t; /* deg, pitch positive with the nose up */
 
 typedef struct {
   struct { float x, y, z, w; } attitudeQuaternion;
@@ -19,12 +22,22 @@ typedef struct { vector_t gyro; /* deg/s */ } sensorData_t;
 typedef enum { modeDisable = 0, modeAbs, modeVelocity } stab_mode_t;
 typedef struct {
   vector_t position;
-  struct { stab_mode_t x, y, z; } mode;
+  struct { stab_mode_t x, y, z, roll, pitch, yaw, quat; } mode;
+  vector_t velocity, acceleration;
+  attitude_t attitude, attitudeRate;
+  float thrust;
+  bool velocity_body;
 } setpoint_t;
 
 typedef enum { controlModeLegacy = 0, controlModeForceTorque = 1, controlModeForce = 2 } control_mode_t;
 typedef struct {
-  float normalizedForces[4];
+  union {
+    struct {
+      int16_t roll, pitch, yaw;
+      float thrust;
+    };
+    float normalizedForces[4]; /* 0 to 1 */
+  };
   control_mode_t controlMode;
 } control_t;
 

@@ -69,15 +69,22 @@ static void in_axes(const float *vector, const float *turn, int body, float *see
     seen[i] = body ? turn[i] * vector[0] + turn[3 + i] * vector[1] + turn[6 + i] * vector[2] : vector[i];
 }
 
+static void rotation(const float *quaternion, float *turn) {
+  const float w = quaternion[0], x = quaternion[1], y = quaternion[2], z = quaternion[3];
+  turn[0] = 1.0f - 2.0f * (y * y + z * z);
+  turn[1] = 2.0f * (x * y - w * z);
+  turn[2] = 2.0f * (x * z + w * y);
+  turn[3] = 2.0f * (x * y + w * z);
+  turn[4] = 1.0f - 2.0f * (x * x + z * z);
+  turn[5] = 2.0f * (y * z - w * x);
+  turn[6] = 2.0f * (x * z - w * y);
+  turn[7] = 2.0f * (y * z + w * x);
+  turn[8] = 1.0f - 2.0f * (x * x + y * y);
+}
+
 static void write_frame(const cfb_network_t *network, const cfb_estimate_t *estimate, float *frame) {
-  float p[3], v[3];
-  const float w = estimate->quaternion[0], x = estimate->quaternion[1], y = estimate->quaternion[2],
-              z = estimate->quaternion[3];
-  const float turn[9] = {
-      1.0f - 2.0f * (y * y + z * z), 2.0f * (x * y - w * z),        2.0f * (x * z + w * y),
-      2.0f * (x * y + w * z),        1.0f - 2.0f * (x * x + z * z), 2.0f * (y * z - w * x),
-      2.0f * (x * z - w * y),        2.0f * (y * z + w * x),        1.0f - 2.0f * (x * x + y * y),
-  };
+  float p[3], v[3], turn[9];
+  rotation(estimate->quaternion, turn);
   in_axes(estimate->position, turn, network->body_position, p);
   in_axes(estimate->velocity, turn, network->body_velocity, v);
   if (network->position) {
@@ -92,18 +99,20 @@ static void write_frame(const cfb_network_t *network, const cfb_estimate_t *esti
 }
 
 void cfb_network_start(const cfb_network_t *network, cfb_memory_t *memory, const cfb_estimate_t *estimate,
-                       float command) {
+                       const float command[4]) {
   memset(memory, 0, sizeof *memory);
   for (int i = 0; i < network->past_estimates * network->estimate_stride; i++)
     write_frame(network, estimate, memory->frames[i]);
   for (int i = 0; i < network->past_commands; i++)
-    for (int motor = 0; motor < 4; motor++) memory->commands[i][motor] = 2.0f * command - 1.0f;
+    for (int motor = 0; motor < 4; motor++) memory->commands[i][motor] = 2.0f * command[motor] - 1.0f;
 }
 
-/* Newest frame, past frames, past commands, integral, set-points. */
+/* Newest frame, past frames, past commands, integral, previews, set-points. */
 static void observe(const cfb_network_t *network, const cfb_memory_t *memory, const cfb_estimate_t *estimate,
                     const float *setpoint, float *shown) {
   const int length = frame_length(network);
+  float turn[9], ahead[3];
+  if (network->previews) rotation(estimate->quaternion, turn);
   write_frame(network, estimate, shown);
   shown += length;
   for (int i = 1; i <= network->past_estimates; i++, shown += length)
@@ -112,6 +121,10 @@ static void observe(const cfb_network_t *network, const cfb_memory_t *memory, co
     memcpy(shown, memory->commands[i], 4 * sizeof *shown);
   if (network->integral)
     for (int i = 0; i < 3; i++) *shown++ = memory->integral[i] / network->integral_limit;
+  for (int i = 0; i < network->previews; i++, setpoint += 3) {
+    in_axes(setpoint, turn, network->body_position, ahead);
+    for (int axis = 0; axis < 3; axis++) *shown++ = ahead[axis] / network->preview_scale;
+  }
   for (int i = 0; i < network->setpoints; i++) *shown++ = setpoint[i] / network->setpoint_scales[i];
 }
 

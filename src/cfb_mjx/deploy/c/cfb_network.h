@@ -21,9 +21,9 @@ typedef struct {
 typedef struct {
   /* What is shown. */
   int position, body_position, body_velocity, integral; /* yes or no */
-  int past_estimates, estimate_stride, past_commands, setpoints;
+  int past_estimates, estimate_stride, past_commands, previews, setpoints;
   float position_limit, position_bend, position_scale, velocity_bend, velocity_scale, rate_scale;
-  float integral_input_limit, integral_limit, dt;
+  float integral_input_limit, integral_limit, preview_scale, dt;
   const float *setpoint_scales;
   /* What is made of it. */
   cfb_activation_t activation;
@@ -45,11 +45,12 @@ typedef struct {
   float integral[3];                         /* of the relative position, m s */
 } cfb_memory_t;
 
-/* As if this had been estimated, and this been commanded, for long. */
+/* As if this had been estimated, and these outputs been commanded, for long. */
 void cfb_network_start(const cfb_network_t *network, cfb_memory_t *memory, const cfb_estimate_t *estimate,
-                       float command);
+                       const float command[4]);
 
-/* The command of M1..M4, each in [0, 1]. setpoint may be NULL where the network has none. */
+/* The four outputs, each in [0, 1]. setpoint: displacements of the target, three numbers for each preview, and then
+ * the set-points; it may be NULL where the network has neither. */
 void cfb_network_command(const cfb_network_t *network, const cfb_memory_t *memory, const cfb_estimate_t *estimate,
                          const float *setpoint, float command[4]);
 

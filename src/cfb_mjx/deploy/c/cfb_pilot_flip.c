@@ -13,6 +13,7 @@
 
 #define PI 3.14159265f
 
+static const float hover[4] = CFB_HOVER_OUTPUTS;
 static cfb_memory_t climb, turn, hold;
 static cfb_phase_t phase;
 static int asked;         /* a flip begins with the next step */
@@ -39,9 +40,9 @@ void cfb_pilot_reset(void) {
 
 void cfb_pilot_start(const cfb_estimate_t *estimate) {
   const cfb_estimate_t above = raised(estimate);
-  cfb_network_start(&cfb_holder, &climb, &above, CFB_HOVER_COMMAND);
-  cfb_network_start(&cfb_turner, &turn, estimate, CFB_HOVER_COMMAND);
-  cfb_network_start(&cfb_holder, &hold, estimate, CFB_HOVER_COMMAND);
+  cfb_network_start(&cfb_holder, &climb, &above, hover);
+  cfb_network_start(&cfb_turner, &turn, estimate, hover);
+  cfb_network_start(&cfb_holder, &hold, estimate, hover);
   roll = roll_angle(estimate->quaternion);
   turned = 0.0f;
   count = 0;

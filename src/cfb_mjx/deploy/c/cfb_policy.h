@@ -1,4 +1,4 @@
-/* A trained policy of a Crazyflie Brushless: state estimate in, motor commands out.
+/* A trained policy of a Crazyflie Brushless: state estimate in, commands out.
  *
  * Exported by cfb_mjx; what every number means is in contract.json, how to fly it in README.md. C11, single precision,
  * static memory only; not reentrant. Do not compile it with -ffast-math.
@@ -16,29 +16,42 @@ void cfb_policy_reset(void);
 /* One step; call it every cfb_policy_dt() seconds.
  *
  * position, target: world, m. velocity: world, m/s. quaternion_wxyz: body to world; its norm does not matter.
- * body_rate: body axes (x forward, y left, z up), rad/s. motor_command: of M1..M4, each in [0, 1], proportional to the
- * voltage (duty) at the motor.
+ * body_rate: body axes (x forward, y left, z up), rad/s. command:
+@OUTPUTS@
  *
  * A step on an estimate that cannot be (not finite, or beyond 1e6; a quaternion of norm zero) does not enter the
  * history: it repeats the last command. After CFB_POLICY_BLIND_STEPS of them in a row, or when there is no last
- * command, the motors are stopped, and stay so until cfb_policy_reset().
+ * command, the motors are to be stopped (CFB_STOPPED; the command is 0 then), until cfb_policy_reset(). The same holds
+ * for an estimate that is frozen: it says that the drone moves, and is the same, bit for bit, after
+ * CFB_POLICY_FROZEN_STEPS more steps.
  */
 void cfb_policy_step(const float position[3], const float velocity[3], const float quaternion_wxyz[4],
-                     const float body_rate[3], const float target[3], float motor_command[4]);
+                     const float body_rate[3], const float target[3], float command[4]);
 
 /* Time between two steps, s. */
 float cfb_policy_dt(void);
 
 #define CFB_POLICY_BLIND_STEPS @BLIND_STEPS@
+#define CFB_POLICY_FROZEN_STEPS @FROZEN_STEPS@
 
 typedef enum {
   CFB_FINE,    /* the last step was a normal one */
   CFB_BLIND,   /* it repeated the command before, for want of an estimate */
-  CFB_STOPPED, /* the motors are stopped until cfb_policy_reset() */
+  CFB_STOPPED, /* the motors are to be stopped until cfb_policy_reset() */
 } cfb_fault_t;
 
 cfb_fault_t cfb_policy_fault(void);
 
+//@previews
+/* What the policy sees of the path ahead: where the target will be @PREVIEWS_S@ s from now, relative to where it is
+ * now, world, m. Set it before every step; without it the target is taken to stand still.
+ */
+#define CFB_POLICY_PREVIEWS @PREVIEWS@
+void cfb_policy_set_preview(const float ahead[3 * CFB_POLICY_PREVIEWS]);
+/* Time until the target is at preview number i, from 0, s. */
+float cfb_policy_preview_time(int i);
+
+//@end
 //@flip
 #define CFB_POLICY_FLIPS 1
 

@@ -4,7 +4,7 @@
 #include <stdint.h>
 
 #include "cfb_policy.h"
-#include "inputs.h" /* generated: STEPS, FLIP_SPEED, FLIP_RATE, FLIPS, inputs[STEPS][16] */
+#include "inputs.h" /* generated: STEPS, FLIP_SPEED, FLIP_RATE, FLIPS, inputs[STEPS][INPUTS] */
 
 #define SYSTICK_CONTROL (*(volatile uint32_t *)0xE000E010u)
 #define SYSTICK_RELOAD (*(volatile uint32_t *)0xE000E014u)
@@ -86,6 +86,9 @@ int main(void) {
     float u[4];
     const float *const row = inputs[i];
     then = now();
+#if INPUTS > 16
+    cfb_policy_set_preview(row + 16);
+#endif
     cfb_policy_step(row, row + 3, row + 6, row + 10, row + 13, u);
     const uint32_t ticks = since(then);
     for (int motor = 0; motor < 4; motor++) {

@@ -148,14 +148,17 @@ class PidState(eqx.Module):
 
 
 class Setpoint(eqx.Module):
-    """Set-point: a position to hold, or an attitude with a given collective. Build it with `hover` or `tilted`."""
+    """Set-point: a position, a velocity, or an attitude with a given collective. Build it with its class methods."""
 
     position: Float[Array, "3"]
     yaw: Float[Array, ""]
     roll_pitch: Float[Array, "2"]
     thrust: Float[Array, ""]
     hold_position: Float[Array, ""]
-    """1: hold position and yaw; 0: hold roll, pitch, yaw and thrust."""
+    """1: hold position (or velocity) and yaw; 0: hold roll, pitch, yaw and thrust."""
+    velocity: Float[Array, "3"] = eqx.field(default_factory=lambda: jnp.zeros(3))
+    hold_velocity: Float[Array, ""] = eqx.field(default_factory=lambda: jnp.asarray(0.0))
+    """1, with ``hold_position``: hold ``velocity`` instead of the position."""
 
     @classmethod
     def hover(cls, position: Float[Array, "3"], yaw: Float[Array, ""] | float = 0.0) -> Setpoint:
@@ -164,7 +167,20 @@ class Setpoint(eqx.Module):
         return cls(position, jnp.asarray(yaw, position.dtype), jnp.zeros(2), jnp.asarray(0.0), jnp.asarray(1.0))
 
     @classmethod
-    def tilted(cls, roll=0.0, pitch=0.0, yaw=0.0, thrust=0.5) -> Setpoint:
+    def moving(cls, velocity: Float[Array, "3"], yaw: Float[Array, ""] | float = 0.0) -> Setpoint:
+        """Hold ``velocity`` [m/s, world] and ``yaw`` [rad]."""
+        velocity = jnp.asarray(velocity, jnp.result_type(float))
+        yaw, one = jnp.asarray(yaw, velocity.dtype), jnp.asarray(1.0)
+        return cls(jnp.zeros(3), yaw, jnp.zeros(2), jnp.asarray(0.0), one, velocity, one)
+
+    @classmethod
+    def tilted(
+        cls,
+        roll: Float[Array, ""] | float = 0.0,
+        pitch: Float[Array, ""] | float = 0.0,
+        yaw: Float[Array, ""] | float = 0.0,
+        thrust: Float[Array, ""] | float = 0.5,
+    ) -> Setpoint:
         """Hold an attitude [rad, about body x, y, z] with a mean command ``thrust`` in [0, 1]."""
         angles = jnp.stack([jnp.asarray(x, jnp.result_type(float)) for x in (roll, pitch, yaw)])
         return cls(jnp.zeros(3), angles[2], angles[:2], jnp.asarray(thrust, angles.dtype), jnp.asarray(0.0))
@@ -219,6 +235,10 @@ def step(
     position_memory, wanted_velocity = update(
         controller.position, state.position, wanted_position - position, position, slow
     )
+    # As in the firmware, the position loop rests while a velocity is held.
+    moving = setpoint.hold_velocity > 0
+    position_memory = jax.tree.map(lambda new, old: jnp.where(moving, old, new), position_memory, state.position)
+    wanted_velocity = jnp.where(moving, _heading_frame(setpoint.velocity, yaw), wanted_velocity)
     velocity_memory, output = update(controller.velocity, state.velocity, wanted_velocity - velocity, velocity, slow)
     limit = controller.tilt_limit_deg
     # Forward is nose down and left is left side down, both negative in the firmware's signs.
@@ -238,12 +258,40 @@ def step(
     attitude_memory, wanted_rate_deg = update(
         controller.attitude, state.attitude, wanted_deg - angles_deg, angles_deg, DT, yaw_wraps
     )
-    rate_memory, torque = update(controller.rate, state.rate, wanted_rate_deg - rates_deg, rates_deg, DT)
+    rate_memory, command = rate_step(controller, state.rate, rates_deg, wanted_rate_deg, collective)
 
     new = PidState(
         state.tick + 1, position_memory, velocity_memory, attitude_memory, rate_memory, roll_pitch_deg, thrust
     )
-    return new, mix(collective, torque, controller.idle)
+    return new, command
+
+
+def rate_step(
+    controller: FirmwarePid,
+    memory: Memory,
+    rates_deg: Float[Array, "3"],
+    wanted_deg: Float[Array, "3"],
+    thrust: Float[Array, ""],
+) -> tuple[Memory, Float[Array, "4"]]:
+    """One step of the rate loop alone, `DT` seconds.
+
+    Args:
+        controller: gains and limits.
+        memory: memory of the rate loop.
+        rates_deg: measured roll, pitch and yaw rates, deg/s, pitch positive with the nose up (`firmware_rates`).
+        wanted_deg: wanted rates, likewise.
+        thrust: collective thrust, counts.
+
+    Returns:
+        The new memory and the command (4,) in [0, 1] of M1..M4.
+    """
+    memory, torque = update(controller.rate, memory, wanted_deg - rates_deg, rates_deg, DT)
+    return memory, mix(thrust, torque, controller.idle)
+
+
+def firmware_rates(body_rate: Float[AnyArray, "3"]) -> Float[Array, "3"]:
+    """Body rates [rad/s, about x, y, z] as the firmware's loops take them: deg/s, pitch positive with the nose up."""
+    return jnp.degrees(body_rate) * np.array(_LEGACY)
 
 
 def mix(thrust: Float[Array, ""], torque: Float[Array, "3"], idle: Float[Array, ""] | float = 0.0) -> Float[Array, "4"]:
@@ -269,7 +317,7 @@ def _signals(measurement: State):
         _heading_frame(measurement.position, yaw),
         _heading_frame(measurement.velocity, yaw),
         jnp.degrees(angles) * np.array(_LEGACY),
-        jnp.degrees(measurement.body_rate) * np.array(_LEGACY),
+        firmware_rates(measurement.body_rate),
     )
 
 

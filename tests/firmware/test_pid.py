@@ -12,7 +12,7 @@ from firmware_pid import Drone, Firmware, flight
 from scipy.spatial.transform import Rotation
 
 from cfb_mjx.control import FirmwarePid, Setpoint, init, resume, step
-from cfb_mjx.control.pid import COUNTS, DT, mix
+from cfb_mjx.firmware.pid import COUNTS, DT, mix
 from cfb_mjx.model import DelayLine, Quadrotor, State
 from cfb_mjx.model.quadrotor import step as fly_step
 from cfb_mjx.parameters import load_model_file

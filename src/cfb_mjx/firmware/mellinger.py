@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.control.pid import COUNTS, DT, mix
+from cfb_mjx.firmware.pid import COUNTS, DT, mix
 from cfb_mjx.model.rotors import hover_command
 from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.model.vector import Vec
@@ -104,7 +104,7 @@ def step(
     velocity: Float[Array, "3"] | float = 0.0,
     acceleration: Float[Array, "3"] | float = 0.0,
 ) -> tuple[MellingerState, Float[Array, "4"]]:
-    """One step of `cfb_mjx.control.pid.DT` seconds.
+    """One step of `cfb_mjx.firmware.pid.DT` seconds.
 
     Args:
         controller: gains and limits.

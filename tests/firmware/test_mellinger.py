@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from cfb_mjx.control.mellinger import Mellinger, MellingerState, attitude_error, init, step
-from cfb_mjx.control.pid import DT
+from cfb_mjx.firmware.mellinger import Mellinger, MellingerState, attitude_error, init, step
+from cfb_mjx.firmware.pid import DT
 from cfb_mjx.model import DelayLine, Quadrotor, State
 from cfb_mjx.model.quadrotor import step as fly_step
 from cfb_mjx.parameters import load_model_file

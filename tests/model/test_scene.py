@@ -1,0 +1,215 @@
+"""Scenes: a user's MJCF with the drone, in MJX and in MuJoCo's C."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from cfb_mjx.errors import CfbError, CfbWarning
+from cfb_mjx.files import shipped
+from cfb_mjx.model import MjxBody, Quadrotor, Scene, rollout
+from cfb_mjx.model.randomised import sample_drone
+from cfb_mjx.parameters import load_randomisation
+
+WORLD = """
+<mujoco>
+  <worldbody>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    <geom name="bar" type="box" pos="0.5 0 1" size="0.02 0.3 0.02"/>
+    <body name="ball" pos="3 0 1"><freejoint/><geom type="sphere" size="0.05" mass="0.02"/></body>
+    <body name="platform" mocap="true" pos="-2 0 0.2"><geom type="box" size="0.3 0.3 0.02"/></body>
+  </worldbody>
+</mujoco>
+"""
+LOADED = """
+<mujoco>
+  <worldbody>
+    <body name="cfb" pos="0 0 1"><site name="hook" pos="0 0 -0.01"/></body>
+    <body name="load" pos="0 0 0.79"><freejoint/>
+      <geom type="sphere" size="0.01" mass="0.006" contype="0" conaffinity="0" group="3"/><site name="eye"/></body>
+  </worldbody>
+  <tendon><spatial name="cable" limited="true" range="0 0.2"><site site="hook"/><site site="eye"/></spatial></tendon>
+</mujoco>
+"""
+ENGINES = ("mjx", "c")
+BY_THEMSELVES = not os.environ.get("PLAIN_XLA")
+"""jaxlib 0.10 aborts while it compiles contacts with the option of `cfb_mjx.runtime.XLA_CPU_FLAGS`."""
+mjx = pytest.mark.skipif(BY_THEMSELVES, reason="runs in a process of its own: see the first test")
+QUICK = {"xla_backend_optimization_level": 0}
+
+
+@pytest.mark.skipif(not BY_THEMSELVES, reason="is this process")
+def test_scenes_in_a_process_of_their_own():
+    plain = {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"} | {"PLAIN_XLA": "1"}
+    command = [sys.executable, "-m", "pytest", "-n0", "-rs", __file__]
+    done = subprocess.run(command, env=plain, capture_output=True, text=True, check=False)
+    assert "1 skipped" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def write(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes")
+
+    def write(text: str, name: str) -> str:
+        (folder / name).write_text(text)
+        return str(folder / name)
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def drone():
+    return Quadrotor.from_file("cfb-guards", dt=0.002, integrator="euler")
+
+
+@pytest.fixture(scope="module")
+def worlds(write, drone):
+    """The world in both engines, and a compiled rollout of each."""
+    path = write(WORLD, "world.xml")
+    found = {engine: Scene(path, engine) for engine in ENGINES}
+    fly = {e: jax.jit(scene.rollout, compiler_options=QUICK) for e, scene in found.items()}
+    return found, fly
+
+
+def _commands(drone: Quadrotor, steps: int = 400) -> jax.Array:
+    return jnp.tile(drone.hover_command(), (steps, 1))
+
+
+@mjx
+@pytest.mark.parametrize("engine", ENGINES)
+def test_far_from_everything_it_flies_as_without_a_scene(worlds, drone, engine):
+    scenes, fly = worlds
+    commands = _commands(drone) * jnp.array([1.02, 1.0, 1.01, 0.99])
+    start = drone.hover_state((0.0, 5.0, 1.0))
+    flown = fly[engine](drone, scenes[engine].begin(drone, start), commands).drone
+    alone = rollout(drone, start, commands)
+    for name in ("position", "velocity", "quaternion", "body_rate", "rotor_speed"):
+        np.testing.assert_allclose(getattr(flown, name), getattr(alone, name), rtol=1e-9, atol=1e-9)
+
+
+@mjx
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_bar_stops_the_drone_and_bodies_fall(worlds, drone, engine):
+    scenes, fly = worlds
+    start = replace(drone.hover_state((0.2, 0.0, 1.0)), velocity=jnp.array([1.0, 0.0, 0.0]))
+    flown = fly[engine](drone, scenes[engine].begin(drone, start), _commands(drone))
+    x = np.asarray(flown.drone.position[:, 0])
+    # Its outline reaches 0.067 m ahead of its centre, the bar begins at 0.48 m.
+    assert 0.40 < x.max() < 0.425
+    assert np.abs(flown.constraint).max() > 0.1
+    ball = np.asarray(flown.positions[:, 2])
+    np.testing.assert_allclose(ball[99], 1 - 9.81 * 0.2**2 / 2, atol=0.003)
+
+
+@mjx
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_platform_carries_the_drone(worlds, drone, engine):
+    scenes, fly = worlds
+    state = scenes[engine].begin(drone, drone.hover_state((-2.0, 0.0, 0.2345)))
+    state = replace(state, drone=replace(state.drone, rotor_speed=jnp.zeros(4)))
+    off = jnp.zeros((400, 4))
+    landed = jax.tree.map(lambda x: x[-1], fly[engine](drone, state, off))
+    height = float(landed.drone.position[2]) - 0.22
+    assert 0.010 < height < 0.015
+    for lift in (0.0004, 0.0008, 0.0012):
+        up = replace(landed, mocap_positions=jnp.array([[-2.0, 0.0, 0.2 + 3 * lift]]))
+        landed = jax.tree.map(lambda x: x[-1], fly[engine](drone, up, off))
+    assert float(landed.drone.position[2]) == pytest.approx(0.2236 + height, abs=5e-4)
+
+
+@mjx
+def test_both_engines_fly_randomised_drones_alike(worlds, drone):
+    scenes, _ = worlds
+    ranges = load_randomisation("paper")
+    drones = jax.vmap(lambda key: sample_drone(key, drone, ranges, 1.0))(jax.random.split(jax.random.PRNGKey(1), 3))
+    start = replace(drone.hover_state((0.3, 0.0, 1.0)), velocity=jnp.array([1.0, 0.0, 0.0]))
+    commands = _commands(drone, 150)
+    found = []
+    for engine in ENGINES:
+        scene = scenes[engine]
+
+        def fly(drone, scene=scene):
+            return scene.rollout(drone, scene.begin(drone, start), commands)
+
+        found.append(jax.jit(jax.vmap(fly), compiler_options=QUICK)(drones).drone)
+    assert np.ptp(found[0].position[:, -1], axis=0).max() > 0.01
+    before = 50
+    np.testing.assert_allclose(found[0].position[:, :before], found[1].position[:, :before], rtol=1e-9, atol=1e-9)
+    # The two find other points of contact between a capsule and an edge; both stop the drone at the same place.
+    reached = [np.asarray(each.position[..., 0]).max(axis=1) for each in found]
+    np.testing.assert_allclose(*reached, atol=0.01)
+
+
+@mjx
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_cable_carries_a_load(write, drone, engine):
+    scene = Scene(write(LOADED, "loaded.xml"), engine)
+    state = scene.begin(drone, drone.hover_state((0.0, 0.0, 1.0)))
+    commands = _commands(drone, 500)
+    flown = jax.jit(scene.rollout, compiler_options=QUICK)(drone, state, commands)
+    # With the thrust of a hover without load, both fall together as (m + M) a = m g.
+    total, load = 0.05, 0.006
+    fallen = load / total * 9.81
+    hook, eye = np.asarray(flown.drone.position) - [0, 0, 0.01], np.asarray(flown.positions[:, :3])
+    assert np.linalg.norm(hook - eye, axis=1).max() < 0.205
+    np.testing.assert_allclose(flown.drone.velocity[-1, 2], -fallen * 1.0, rtol=0.02)
+    # The cable pulls with what the load weighs in the falling frame.
+    np.testing.assert_allclose(np.mean(flown.constraint[200:, 2]), -load * (9.81 - fallen), rtol=0.02)
+
+
+@mjx
+def test_a_box_in_a_copy_of_our_file_stops_the_drone(write, guards):
+    """A copy with a box used to be flown through, because the file's default had no contact."""
+    box = '<geom name="box" type="box" pos="0 0 0.5" size="0.2 0.2 0.02"/>\n    <body name="cfb"'
+    text = shipped("assets", "cfb.xml").read_text(encoding="utf-8").replace('<body name="cfb"', box)
+    model = Quadrotor(guards, body=MjxBody(mjcf=write(text, "box.xml")))
+    start = model.hover_state((0.0, 0.0, 0.7))
+    flown = jax.jit(rollout, compiler_options=QUICK)(model, start, jnp.zeros((150, 4)))
+    assert 0.52 < float(flown.position[-1, 2]) < 0.54
+
+
+def test_what_is_flown_through_is_said(write):
+    text = WORLD.replace('name="bar"', 'name="bar" contype="0" conaffinity="0"')
+    with pytest.warns(CfbWarning, match="flies through geom 'bar'"):
+        Scene(write(text, "through.xml"))
+
+
+@mjx
+def test_the_c_engine_says_that_it_has_no_derivatives(worlds, drone):
+    scene = worlds[0]["c"]
+    state = scene.begin(drone, drone.hover_state((0.0, 5.0, 1.0)))
+    with pytest.raises(CfbError, match="no derivatives"):
+        jax.grad(lambda u: scene.step(drone, state, u).drone.velocity[2])(drone.hover_command())
+
+
+@mjx
+def test_derivatives_through_contact_match_finite_differences(worlds, drone):
+    scene = worlds[0]["mjx"]
+    start = replace(drone.hover_state((0.41, 0.0, 1.0)), velocity=jnp.array([1.0, 0.0, 0.0]))
+    state, u = scene.begin(drone, start), drone.hover_command()
+
+    @jax.jit
+    def speed(u):
+        return scene.rollout(drone, state, jnp.tile(u, (10, 1))).drone.velocity[-1, 0]
+
+    direction = jnp.array([0.1, -0.1, -0.1, 0.1])
+    slope = jax.jvp(speed, (u,), (direction,))[1]
+    h = 1e-5
+    # The solver stops at a tolerance, which limits both.
+    np.testing.assert_allclose(slope, (speed(u + h * direction) - speed(u - h * direction)) / (2 * h), rtol=0.03)
+
+
+def test_worlds_that_cannot_be_are_refused(write):
+    with pytest.raises(CfbError, match="cannot compile"):
+        Scene(write(WORLD.replace('type="box"', 'type="cube"'), "cube.xml"))
+    hinged = WORLD.replace("<worldbody>", '<worldbody><body name="cfb"><joint/><geom size="0.1"/></body>')
+    with pytest.raises(CfbError, match="free joint"):
+        Scene(write(hinged, "hinged.xml"))
