@@ -75,11 +75,11 @@ def _add_drone(spec: mujoco.MjSpec, body: mujoco.MjsBody | None) -> None:
     Geom by geom, because attaching the file would bring its options and its floor.
     """
     drone = not_none(specification(shipped("assets", "cfb.xml")).body(BODY_NAME))
-    body = not_none(spec.worldbody.add_body(name=BODY_NAME, pos=drone.pos) if body is None else body)
-    body.mass, body.inertia, body.explicitinertial = drone.mass, drone.inertia, True
-    body.add_freejoint(name=BODY_NAME)
+    own = not_none(spec.worldbody.add_body(name=BODY_NAME, pos=drone.pos) if body is None else body)
+    own.mass, own.inertia, own.explicitinertial = drone.mass, drone.inertia, True
+    own.add_freejoint(name=BODY_NAME)
     for geom in drone.geoms:
-        body.add_geom(mass=0, group=geom.group, rgba=geom.rgba, **{name: getattr(geom, name) for name in _COPIED})
+        own.add_geom(mass=0, group=geom.group, rgba=geom.rgba, **{name: getattr(geom, name) for name in _COPIED})
 
 
 def warn_of_untouched(path: str | Path, model: mujoco.MjModel) -> None:
