@@ -16,6 +16,7 @@ from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.files import shipped
 from cfb_mjx.model import MjxBody, Quadrotor, Scene, rollout
 from cfb_mjx.model.randomised import sample_drone
+from cfb_mjx.model.scene_camera import geom_names, look
 from cfb_mjx.parameters import load_randomisation
 
 WORLD = """
@@ -36,6 +37,18 @@ LOADED = """
       <geom type="sphere" size="0.01" mass="0.006" contype="0" conaffinity="0" group="3"/><site name="eye"/></body>
   </worldbody>
   <tendon><spatial name="cable" limited="true" range="0 0.2"><site site="hook"/><site site="eye"/></spatial></tendon>
+</mujoco>
+"""
+SEEN = """
+<mujoco>
+  <worldbody>
+    <camera name="above" pos="0 0 5" xyaxes="1 0 0 0 1 0"/>
+    <geom name="floor" type="plane" size="0 0 1"/>
+    <geom name="wall" type="box" pos="3 0 5" size="1 4 5"/>
+    <geom name="ball" type="sphere" pos="1 0.2 1" size="0.1"/>
+    <body name="cfb"><camera name="front" pos="0.03 0 0" xyaxes="0 -1 0 0 0 1" fovy="60"/></body>
+    <body name="other" pos="5 5 0.2"><freejoint/><geom type="sphere" size="0.05" mass="0.02"/></body>
+  </worldbody>
 </mujoco>
 """
 ENGINES = ("mjx", "c")
@@ -163,6 +176,44 @@ def test_a_cable_carries_a_load(write, drone, engine):
     np.testing.assert_allclose(flown.drone.velocity[-1, 2], -fallen * 1.0, rtol=0.02)
     # The cable pulls with what the load weighs in the falling frame.
     np.testing.assert_allclose(np.mean(flown.constraint[200:, 2]), -load * (9.81 - fallen), rtol=0.02)
+
+
+@mjx
+def test_a_camera_sees_depth_and_what_it_is(write, drone):
+    path = write(SEEN, "seen.xml")
+    start = drone.hover_state((0.0, 0.0, 1.0))
+    seen = {}
+    for engine in ENGINES:
+        scene = Scene(path, engine)
+        state = scene.begin(drone, start)
+        seen[engine] = jax.jit(lambda state, s=scene: look(s, drone, state, "front", 33, 25))(state)
+        names = geom_names(scene)
+    depth, geom = (np.asarray(x) for x in seen["mjx"])
+    np.testing.assert_allclose(depth, seen["c"].depth, rtol=1e-9)
+    np.testing.assert_array_equal(geom, seen["c"].geom)
+    # Straight ahead the wall, 2 m from the drone and 0.03 m less from the camera; depth, not distance, to its edge.
+    assert names[geom[12, 16]] == "wall"
+    np.testing.assert_allclose(depth[[12, 0, 0], [16, 16, 0]], 1.97)
+    # The ball, 0.2 m to the left at 0.97 m: eleven degrees, of the 2.4 that a pixel has in the middle.
+    columns = np.unique(np.nonzero(geom == names.index("ball"))[1])
+    pixel = 2 * np.tan(np.radians(30)) / 25
+    assert abs(columns.mean() - (16 - 0.2 / 0.97 / pixel)) < 0.6
+    assert depth[12, round(columns.mean())] == pytest.approx(0.87, abs=0.01)
+    # In the last row the floor, 1 m below: its depth is 1 over the tangent of the angle.
+    assert names[geom[24, 16]] == "floor"
+    assert depth[24, 16] == pytest.approx(1 / (12 * pixel))
+
+
+@mjx
+def test_many_drones_look_at_once(write, drone):
+    for engine in ENGINES:
+        scene = Scene(write(SEEN, "seen.xml"), engine)
+        states = [scene.begin(drone, drone.hover_state((x, 0.0, 1.0))) for x in (0.0, 0.5, 0.7)]
+        states = jax.tree.map(lambda *x: jnp.stack(x), *states)
+        seen = jax.jit(jax.vmap(lambda state, s=scene: look(s, drone, state, "front", 3, 3)))(states)
+        np.testing.assert_allclose(seen.depth[:, 1, 1], [1.97, 1.47, 1.27], rtol=1e-6)
+        with pytest.raises(CfbError, match="has no camera 'back'; its cameras: above, front"):
+            look(scene, drone, states, "back")
 
 
 @mjx

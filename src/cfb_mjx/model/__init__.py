@@ -20,6 +20,7 @@ from cfb_mjx.model.state import State
 
 if TYPE_CHECKING:
     from cfb_mjx.model.mjx_body import MjxBody
+    from cfb_mjx.model.mujoco_body import MujocoBody
     from cfb_mjx.model.scene import Scene, SceneState
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "DelayLine",
     "Effect",
     "MjxBody",
+    "MujocoBody",
     "ParasiticDrag",
     "Quadrotor",
     "RigidBody",
@@ -60,6 +62,10 @@ def __getattr__(name: str):
         from cfb_mjx.model.mjx_body import MjxBody
 
         return MjxBody
+    if name == "MujocoBody":
+        from cfb_mjx.model.mujoco_body import MujocoBody
+
+        return MujocoBody
     if name in ("Scene", "SceneState"):
         from cfb_mjx.model import scene
 

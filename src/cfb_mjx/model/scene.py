@@ -154,23 +154,8 @@ class Scene:
             loads = rotors.loads_at(prepared.rotors, path.start, path.rate_start)
         felt = conditions(prepared, at, path.start)
         wrench = loaded(drone, parameters, loads, felt)
-        kind = state.positions.dtype
-        own = jnp.concatenate([rotate(at.quaternion, wrench.force).stack(), wrench.torque.stack()])
-        now = state.drone
-        inputs = Inputs(
-            self._whole(self._positions, jnp.concatenate([now.position, now.quaternion]), state.positions),
-            self._whole(self._velocities, jnp.concatenate([now.velocity, now.body_rate]), state.velocities),
-            state.activations,
-            state.controls,
-            state.mocap_positions,
-            state.mocap_quaternions,
-            self._whole(self._velocities, own, jnp.zeros_like(state.velocities)),
-            jnp.asarray(prepared.dt, kind),
-            Vec.unstack(parameters.inertia).stack(),
-            center.stack(),
-            jnp.stack([parameters.mass, parameters.gravity]),
-        )
-        moved = ENGINES[self.engine](self.mjcf, inputs)
+        force = jnp.concatenate([rotate(at.quaternion, wrench.force).stack(), wrench.torque.stack()])
+        moved = ENGINES[self.engine](self.mjcf, self.inputs(prepared, state, force))
         pose, twist = moved.positions[self._positions[0]], moved.velocities[self._velocities[0]]
         rotors_at, rest = path.end.stack(), ()
         after = State(pose[:3], twist[:3], pose[3:], twist[3:], rotors_at, rest)
@@ -187,8 +172,33 @@ class Scene:
             state.controls,
             state.mocap_positions,
             state.mocap_quaternions,
-            state.time + jnp.asarray(prepared.dt, kind),
+            state.time + jnp.asarray(prepared.dt, state.positions.dtype),
             moved.constraint[self._velocities[0]],
+        )
+
+    def inputs(self, prepared: Prepared, state: SceneState, force: Float[Array, "6"] | None = None) -> Inputs:
+        """What an engine needs of a state.
+
+        Args:
+            prepared: the drone.
+            state: one state.
+            force: force [N, world] and torque [N m, body] of rotors and effects about the rotors' centre; None: none.
+        """
+        parameters, now = prepared.parameters, state.drone
+        kind = jnp.asarray(state.positions).dtype
+        force = jnp.zeros(6, kind) if force is None else force
+        return Inputs(
+            self._whole(self._positions, jnp.concatenate([now.position, now.quaternion]), state.positions),
+            self._whole(self._velocities, jnp.concatenate([now.velocity, now.body_rate]), state.velocities),
+            state.activations,
+            state.controls,
+            state.mocap_positions,
+            state.mocap_quaternions,
+            self._whole(self._velocities, force, jnp.zeros_like(state.velocities)),
+            jnp.asarray(prepared.dt, kind),
+            Vec.unstack(parameters.inertia).stack(),
+            Vec.unstack(parameters.center_of_gravity).stack(),
+            jnp.stack([parameters.mass, parameters.gravity]),
         )
 
     def _whole(self, places: tuple[np.ndarray, np.ndarray], own: Array, others: AnyArray) -> Array:
