@@ -2,7 +2,8 @@
 
 from cfb_mjx.control.closed_loop import ClosedLoop, rollout_closed_loop
 from cfb_mjx.control.controllers import Controller, MellingerController, PidController, find_controller
-from cfb_mjx.control.neural import Network, NeuralController, brax_controller, foreign_controller
+from cfb_mjx.control.foreign import brax_controller, foreign_controller
+from cfb_mjx.control.neural import Gru, Network, NeuralController
 from cfb_mjx.control.policy_file import PolicyFile, load_policy, save_policy
 from cfb_mjx.firmware.mellinger import Mellinger
 from cfb_mjx.firmware.pid import FirmwarePid, PidState, PositionHold, Setpoint, init, resume, step
@@ -11,6 +12,7 @@ __all__ = [
     "ClosedLoop",
     "Controller",
     "FirmwarePid",
+    "Gru",
     "Mellinger",
     "MellingerController",
     "Network",

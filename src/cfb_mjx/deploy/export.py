@@ -94,6 +94,7 @@ def _abilities(deployment: Deployment) -> set[str]:
     layout = deployment.holder.controller.layout
     return {
         "flip" if deployment.flips else "no flip",
+        "gru" if deployment.holder.controller.recurrent else "no gru",
         "previews" if layout.preview_s else "hold",
         "motors" if layout.action == "motors" else "loop",
         layout.action,
@@ -191,7 +192,8 @@ def literal(x) -> str:
 
 def _sizes(deployment: Deployment) -> str:
     layouts = [p.controller.layout for p in deployment.policies.values()]
-    outputs = [len(b) for p in deployment.policies.values() for b in p.controller.network.biases]
+    networks = [p.controller.network for p in deployment.policies.values()]
+    outputs = [given for network in networks for _, given in network.sizes]
     estimates = max(1, *(layout.past_estimates for layout in layouts))
     commands = max(1, *(layout.past_commands for layout in layouts))
     setpoints = max(layout.shown for layout in layouts)
@@ -203,6 +205,8 @@ def _sizes(deployment: Deployment) -> str:
         # Sized for all networks together: a compiler that analyses the loops must not find out-of-bounds writes.
         "CFB_WIDEST": max(frame * (1 + estimates) + 4 * commands + 3 + setpoints, *outputs),
     }
+    kept = [network.gru.size for network in networks if network.gru is not None]
+    numbers |= {"CFB_HIDDEN": max(kept)} if kept else {}
     lines = "\n".join(f"#define {name} {value}" for name, value in numbers.items())
     return _guarded("CFB_SIZES_H", f"/* Generated for {deployment.name}: what its networks need. */", lines)
 
@@ -286,6 +290,12 @@ def _network(name: str, policy: PolicyFile) -> str:
         "layers": len(layers),
         "layer": f"{name}_layers",
     }
+    if (gru := network.gru) is not None:
+        inputs, size = network.sizes[network.before]
+        arrays = [f"{name}_gru_{part}" for part in ("input_weight", "input_bias", "hidden_weight", "hidden_bias")]
+        values = (gru.input_weight.T, gru.input_bias, gru.hidden_weight.T, gru.hidden_bias)
+        parts += [_array(array, np.asarray(x, np.float32)) for array, x in zip(arrays, values, strict=True)]
+        fields |= {"before": network.before, "gru": f"{{{inputs}, {size}, {', '.join(arrays)}}}"}
     parts.append(f"static const cfb_layer_t {name}_layers[] = {{\n" + "\n".join(layers) + "\n};")
     body = "\n".join(f"    .{key} = {value}," for key, value in fields.items())
     parts.append(f"const cfb_network_t cfb_{name} = {{\n{body}\n}};\n")

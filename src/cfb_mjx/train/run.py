@@ -99,6 +99,8 @@ class Training:
         policy = None if start is None else load_policy(start)
         if policy is not None:
             controller, wanted = policy.controller, config.network
+            if controller.recurrent:
+                raise CfbError(f"{start}: this policy has a GRU; trainings go on from fully connected policies.")
             hidden = tuple(len(b) for b in controller.network.biases[:-1])
             if controller.layout != config.observation or hidden != wanted.hidden:
                 raise CfbError(f"{start}: the policy's observation or network differs from the configuration's.")
