@@ -18,6 +18,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.files import read_bytes, replacing
 
 FORMAT = "cfb_mjx policy 1"
+SUFFIXES = (".npz", ".onnx")
 GRU = (
     "r = sigmoid(x Wr + br + h Ur + dr), z = sigmoid(x Wz + bz + h Uz + dz), c = tanh(x Wc + bc + r (h Uc + dc)), "
     "h = (1 - z) c + z h, from h = 0; input_weight [Wr, Wz, Wc], hidden_weight [Ur, Uz, Uc], biases likewise"
@@ -91,7 +92,7 @@ def save_policy(policy: PolicyFile, path: str | Path) -> None:
 
 
 def load_policy(path: str | Path) -> PolicyFile:
-    """Read a policy written by `save_policy`.
+    """Read a policy written by `save_policy`, or by `write_onnx`.
 
     Args:
         path: file, or the name of a shipped policy.
@@ -101,6 +102,8 @@ def load_policy(path: str | Path) -> PolicyFile:
     """
     path = shipped_policies().get(str(path), path)
     read_bytes(path, 1)
+    if Path(path).suffix == ".onnx":
+        return _load_onnx(path)
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as archive:
             about = json.loads(archive["about"].tobytes())
@@ -121,6 +124,25 @@ def load_policy(path: str | Path) -> PolicyFile:
     if not network.fits(layout.size) or not all(bool(jnp.all(jnp.isfinite(x))) for x in network.parts):
         raise CfbError(f"{path}: the weights do not fit the observation, or are not finite; train it again.")
     return PolicyFile(NeuralController(network, layout), about["task"], about["training"])
+
+
+def _load_onnx(path: str | Path) -> PolicyFile:
+    from cfb_mjx.control.onnx_file import read_with_about
+
+    controller, about = read_with_about(path)
+    if about.get("format") != FORMAT:
+        raise CfbError(f"{path}: the policy has another format ({about.get('format')!r}, not {FORMAT!r}).")
+    try:
+        policy = PolicyFile(controller, about["task"], about["training"])
+        same = policy.weights_sha256 == about["weights_sha256"]
+    except KeyError as error:
+        raise CfbError(f"{path}: what it says about the policy lacks {error}; write it again.") from None
+    if not same:
+        raise CfbError(
+            f"{path}: the weights are not those that it was written with; write it again, or read them with "
+            "cfb_mjx.control.read_onnx."
+        )
+    return policy
 
 
 def about_gru(network: Network) -> dict[str, Any]:
