@@ -44,7 +44,7 @@ def policy(activation="tanh", limit="tanh", hidden=(9, 8), unit: int | None = No
         pairs[before] = unit, pairs[before][1]
     weights, biases = zip(*((jnp.asarray(2 * drawn(a, b)), jnp.asarray(drawn(b))) for a, b in pairs), strict=True)
     network = Network(weights, biases, activation, limit, gru, 0 if gru is None else before)
-    return PolicyFile(NeuralController(network, LAYOUT), "target", {"config": {"seed": 3}})
+    return PolicyFile(NeuralController(network, LAYOUT), "target", {"config": {"seed": 3}}, "# Drawn\n")
 
 
 def computed(path, shown=SHOWN, hidden: int = 0) -> np.ndarray:
@@ -90,7 +90,7 @@ def test_a_runtime_commands_what_the_policy_commands_and_the_file_is_the_policy(
     assert expected.std() > 0.05
     np.testing.assert_allclose(computed(path, hidden=hidden), expected, atol=1e-6)
     read = load_policy(path)
-    assert (read.task, read.training, read.controller.layout) == (mine.task, mine.training, LAYOUT)
+    assert (read.task, read.training, read.card, read.controller.layout) == ("target", mine.training, mine.card, LAYOUT)
     assert read.weights_sha256 == mine.weights_sha256, "bit for bit"
     assert jax.tree.structure(read.controller) == jax.tree.structure(mine.controller)
     np.testing.assert_array_equal(commanded(read.controller), expected)

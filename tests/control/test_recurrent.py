@@ -280,6 +280,21 @@ def test_a_state_that_moves_on_is_seen_by_the_check(tmp_path):
 
 
 @COMPILER
+def test_bad_estimates_do_not_move_the_state_and_a_reset_empties_it(tmp_path):
+    controller = foreign_controller(pytorch(), LAYOUT, activation="tanh", limit="tanh")
+    compiled = compile_policy(export_policy(Deployment("gru", PolicyFile(controller, "target")), tmp_path))
+    rows = random_inputs(np.random.default_rng(6), 1, 8)[0]
+    compiled.reset()
+    whole = compiled.steps(rows)
+    compiled.reset()
+    first = compiled.steps(rows[:4])
+    compiled.steps(np.full((2, 16), np.nan))
+    assert compiled.fault == 1
+    np.testing.assert_array_equal(np.concatenate([first, compiled.steps(rows[4:])]), whole)
+    assert np.abs(compiled.steps(rows[:1]) - whole[:1]).max() > 1e-3
+
+
+@COMPILER
 def test_the_command_checks_it_in_closed_loop_and_on_the_emulated_processor(tmp_path, capfd):
     save_policy(PolicyFile(steady(), "target"), tmp_path / "gru.npz")
     assert main(["export", str(tmp_path / "gru.npz"), "-o", str(tmp_path / "c"), "--check"]) == 0, capfd.readouterr()

@@ -21,7 +21,8 @@ FORMAT = "cfb_mjx policy 1"
 SUFFIXES = (".npz", ".onnx")
 GRU = (
     "r = sigmoid(x Wr + br + h Ur + dr), z = sigmoid(x Wz + bz + h Uz + dz), c = tanh(x Wc + bc + r (h Uc + dc)), "
-    "h = (1 - z) c + z h, from h = 0; input_weight [Wr, Wz, Wc], hidden_weight [Ur, Uz, Uc], biases likewise"
+    "h = (1 - z) c + z h, from h = 0; input_weight [Wr, Wz, Wc], hidden_weight [Ur, Uz, Uc], biases likewise; hashed "
+    "in its place among the layers as input_weight, input_bias, hidden_weight, hidden_bias"
 )
 """A recurrent unit, as policy files and contracts write it."""
 _GRU_ARRAYS = ("input_weight", "input_bias", "hidden_weight", "hidden_bias")
@@ -32,12 +33,14 @@ class PolicyFile:
     """A trained policy with its origin.
 
     ``training`` holds the configuration, the model YAML of the training, seed and versions. It holds no dates or times,
-    so that the same training on the same machine gives the same file.
+    so that the same training on the same machine gives the same file. ``card`` is Markdown for people: how it was
+    trained, and what it scored.
     """
 
     controller: NeuralController
     task: str
     training: dict[str, Any] = field(default_factory=dict)
+    card: str = ""
 
     @property
     def lumped_delay(self) -> bool:
@@ -66,7 +69,8 @@ class PolicyFile:
             "weights_sha256": self.weights_sha256,
             "training": self.training,
         }
-        return found | (about_gru(network) if self.controller.recurrent else {})
+        found |= about_gru(network) if self.controller.recurrent else {}
+        return found | ({"card": self.card} if self.card else {})
 
 
 def shipped_policies() -> dict[str, Path]:
@@ -123,7 +127,7 @@ def load_policy(path: str | Path) -> PolicyFile:
         ) from None
     if not network.fits(layout.size) or not all(bool(jnp.all(jnp.isfinite(x))) for x in network.parts):
         raise CfbError(f"{path}: the weights do not fit the observation, or are not finite; train it again.")
-    return PolicyFile(NeuralController(network, layout), about["task"], about["training"])
+    return PolicyFile(NeuralController(network, layout), about["task"], about["training"], str(about.get("card", "")))
 
 
 def _load_onnx(path: str | Path) -> PolicyFile:
@@ -133,7 +137,7 @@ def _load_onnx(path: str | Path) -> PolicyFile:
     if about.get("format") != FORMAT:
         raise CfbError(f"{path}: the policy has another format ({about.get('format')!r}, not {FORMAT!r}).")
     try:
-        policy = PolicyFile(controller, about["task"], about["training"])
+        policy = PolicyFile(controller, about["task"], about["training"], str(about.get("card", "")))
         same = policy.weights_sha256 == about["weights_sha256"]
     except KeyError as error:
         raise CfbError(f"{path}: what it says about the policy lacks {error}; write it again.") from None

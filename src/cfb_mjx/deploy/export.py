@@ -26,6 +26,8 @@ PILOTS = {True: "cfb_pilot_flip.c", False: "cfb_pilot_hold.c"}
 """Both are exported under one name, so that no file of an earlier export remains beside a later one."""
 RESULTS = "check.json"
 """File that ``cfb export --check`` writes."""
+CARD = "card.md"
+"""File with the cards of the policies that have one."""
 _NEVER = 1e9
 """Stands for a time, speed or angle that is never reached."""
 
@@ -54,9 +56,11 @@ def export_policy(deployment: Deployment, folder: str | Path) -> Exported:
     """
     folder = output_folder(folder)
     with together():
-        write_texts(folder, sources(deployment))
-        # The results belong to the export that was overwritten.
-        remove(folder / RESULTS)
+        texts = sources(deployment)
+        write_texts(folder, texts)
+        # These belong to the export that was overwritten.
+        for name in {RESULTS, CARD} - {*texts}:
+            remove(folder / name)
     return Exported(folder, deployment)
 
 
@@ -67,8 +71,14 @@ def sources(deployment: Deployment) -> dict[str, str]:
     texts["cfb_sizes.h"] = _sizes(deployment)
     texts["cfb_data.h"] = _header(deployment)
     texts["cfb_data.c"] = _data(deployment)
+    if cards := _cards(deployment):
+        texts[CARD] = cards
     texts["contract.json"] = json.dumps(plain(contract(deployment)), indent=1) + "\n"
     return texts
+
+
+def _cards(deployment: Deployment) -> str:
+    return "\n".join(policy.card for policy in deployment.policies.values() if policy.card)
 
 
 def _template(name: str) -> str:
@@ -96,6 +106,7 @@ def _abilities(deployment: Deployment) -> set[str]:
         "flip" if deployment.flips else "no flip",
         "gru" if deployment.holder.controller.recurrent else "no gru",
         "previews" if layout.preview_s else "hold",
+        "card" if _cards(deployment) else "no card",
         "motors" if layout.action == "motors" else "loop",
         layout.action,
         "through_pid" if layout.action in ("attitude", "velocity", "position") else "direct",
