@@ -165,6 +165,19 @@ def test_what_torch_writes_for_stable_baselines_is_read(tmp_path):
     assert load_policy(tmp_path / "kept.npz").controller.network.limit == "tanh"
 
 
+def test_weights_in_a_file_of_their_own_are_read_or_missed(tmp_path):
+    """As newer versions of torch write them."""
+    path, beside = tmp_path / "ppo.onnx", tmp_path / "ppo.onnx.data"
+    onnx.save(ppo(), path, save_as_external_data=True, size_threshold=0, location=beside.name)
+    assert beside.stat().st_size > 1000
+    onnx.save(ppo(), tmp_path / "whole.onnx")
+    whole, parts = (read_onnx(tmp_path / name, LAYOUT, limit="clip") for name in ("whole.onnx", "ppo.onnx"))
+    np.testing.assert_array_equal(commanded(whole), commanded(parts))
+    beside.unlink()
+    with pytest.raises(CfbError, match=r"ppo\.onnx: .*weights.*beside"):
+        read_onnx(path, LAYOUT, limit="clip")
+
+
 def test_scales_before_between_and_after_layers_become_part_of_them(tmp_path):
     nodes = [
         ("Sub", ["x", "mean"], "centred", {}),

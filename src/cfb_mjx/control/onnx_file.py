@@ -151,11 +151,14 @@ def read_with_about(
     path: str | Path, layout: Layout | None = None, *, limit: str | None = None, mean: Any = None, std: Any = None
 ) -> tuple[NeuralController, dict[str, Any]]:
     """Read a policy and what this library wrote about it, empty for other models; arguments as for `read_onnx`."""
-    onnx, content = _onnx(), read_bytes(path)
+    onnx = _onnx()
+    read_bytes(path, 1)
     # protobuf and onnx raise many kinds of errors for damaged files.
-    damaged = f"{path}: is not an ONNX model, or is damaged; export it again."
+    damaged = (
+        f"{path}: is no ONNX model, is damaged, or its weights are in a file that is not beside it; copy it again."
+    )
     try:
-        model = onnx.load_model_from_string(content)
+        model = onnx.load(str(path))
         about = json.loads(next((p.value for p in model.metadata_props if p.key == PROPERTY), "{}"))
         shown = Layout.from_document(about["observation"]) if about else None
     except Exception:
