@@ -63,6 +63,7 @@ STM32F405: C11, single precision, static memory, and no function of the C librar
 ```sh
 cfb export target -o target-c --check              # a shipped policy; or policy.npz of cfb train
 cfb export double-flip -o flip-c --check           # holds a target, flips on demand
+cfb export target -o target-c --onnx target.onnx   # also for runtimes of ONNX
 ```
 
 The output folder holds
@@ -71,6 +72,7 @@ The output folder holds
 - an app for the firmware with its `Makefile`,
 - `contract.json`: units, frames, rates, history and scale of every number, the hash of the weights, and the model and
   randomisation of the training,
+- `card.md`, if the policy has a card: how it was trained and what it scores,
 - a `README.md` on building, flashing and first flights.
 
 ## What it costs, and how near to JAX it is

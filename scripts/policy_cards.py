@@ -3,17 +3,19 @@
     python scripts/policy_cards.py
 
 The cards are written from the files next to each policy and from the results of scripts/measure_controllers.py and
-scripts/flips.py, so run it after these.
+scripts/flips.py, so run it after these. A card is beside the policy, and in its file.
 """
 
 import argparse
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import yaml
 
-from cfb_mjx.control.policy_file import shipped_policies
+from cfb_mjx.control.policy_file import load_policy, save_policy, shipped_policies
+from cfb_mjx.train.card import ALGORITHMS, conditions
 
 ROOT = Path(__file__).resolve().parents[1]
 SWINGS = 0.04
@@ -34,7 +36,10 @@ def main() -> None:
     from cfb_mjx.files import write_text
 
     for path in shipped_policies().values():
-        write_text(path.with_name("card.md"), card(path.parent))
+        text, policy = card(path.parent), load_policy(path)
+        write_text(path.with_name("card.md"), text)
+        if policy.card != text:
+            save_policy(replace(policy, card=text), path)
         print(path.with_name("card.md").relative_to(ROOT))
 
 
@@ -47,7 +52,7 @@ def card(folder: Path) -> str:
     for part in parts:
         lines += [" ".join(part["description"].split()), ""]
     lines += ["## Training", "", *_training(folder, config, last), ""]
-    lines += ["## Conditions of the training", "", *_conditions(config), ""]
+    lines += ["## Conditions of the training", "", *conditions(config), ""]
     lines += ["## Learning curve", "", *_curve(folder), ""]
     scores = {"flip": _flips, "track": _tracking}.get(config["task"], _scores)
     lines += ["## Scores", "", *scores(folder.name)]
@@ -56,7 +61,7 @@ def card(folder: Path) -> str:
 
 def _training(folder: Path, config: dict, last: dict) -> list[str]:
     facts, end = last["environment"], last["last"]
-    how = {"ppo": "PPO", "analytic": "Back-propagation through the model"}[config["algorithm"]]
+    how = ALGORITHMS[config["algorithm"]]
     lines = [
         f"- {how}, seed {config['seed']}: {end['commands'] / 1e6:.0f} M commands in {end['seconds'] / 60:.0f} min, "
         f"{facts['date']}, {facts['processor']}, Python {facts['python']}, jax {facts['jax']}, cfb_mjx "
@@ -70,25 +75,6 @@ def _training(folder: Path, config: dict, last: dict) -> list[str]:
         "- Commands: see `README.md` in the folder above. All settings: `config.yaml`, also stored in `policy.npz`."
     )
     return lines
-
-
-def _conditions(config: dict) -> list[str]:
-    random, noise, seen = config["randomisation"], config["noise"], config["observation"]
-    milder = f"; a share of {random['graded']:g} of the episodes has milder drones" if random.get("graded") else ""
-    late = f" plus up to {1e3 * noise['pose_jitter_s']:g} ms" if noise.get("pose_jitter_s") else ""
-    whose = "for pose and gyro" if config.get("lumped_delay", True) else "for the pose; the gyro is read on the drone"
-    lines = [
-        f"- Model `{config['model']}`, randomisation `{random['ranges']}` x {random['magnitude']:g}{milder}.",
-        f"- Delay of the estimates: the model's `pose_delay`{late}, {whose}. Noise: {1e3 * noise['position_m']:g} mm, "
-        f"{1e3 * noise['velocity_mps']:g} mm/s, {1e3 * noise['attitude_rad']:g} mrad, "
-        f"{1e3 * noise['rate_radps']:g} mrad/s.",
-    ]
-    told = f"{1 + seen['past_estimates']} estimates, {seen['past_commands']} past commands"
-    ahead = ", ".join(f"{1e3 * x:g}" for x in seen.get("preview_s") or ())
-    told += f", where the target will be in {ahead} ms" if ahead else ""
-    told += ", an integral of the position error" if seen.get("integral") else ""
-    given = {"motors": "the motors", "body_rates": "thrust and body rates"}[seen.get("action", "motors")]
-    return [*lines, f"- Observation: {told}. It commands {given}, every {1e3 * seen['control_dt_s']:g} ms."]
 
 
 def _curve(folder: Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 import io
 import json
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +50,10 @@ def test_a_policy_survives_its_file(tmp_path):
     again = load_policy(tmp_path / "p.npz")
     assert again.task == "target"
     assert again.training == policy.training
+    assert again.card == ""
+    save_policy(replace(policy, card="# Mine\n"), tmp_path / "p.npz")
+    assert load_policy(tmp_path / "p.npz").card == "# Mine\n"
+    assert load_policy(tmp_path / "p.npz").weights_sha256 == policy.weights_sha256
     assert again.controller.layout == LAYOUT
     assert again.weights_sha256 == policy.weights_sha256
     shown = jnp.linspace(-1, 1, LAYOUT.size)

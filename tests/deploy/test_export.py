@@ -517,6 +517,20 @@ def test_nothing_of_an_earlier_export_is_left(tmp_path):
     assert "cfb_policy_set_flip" not in "".join(path.read_text() for path in again.folder.glob("*.[ch]"))
 
 
+def test_the_cards_of_the_policies_are_beside_the_c(tmp_path):
+    exported = export_policy(find_deployment("double-flip"), tmp_path)
+    card = (exported.folder / "card.md").read_text()
+    assert all(path.with_name("card.md").read_text() in card for path in _held("flip", "target-analytic"))
+    assert "`card.md`" in (exported.folder / "README.md").read_text()
+    export_policy(Deployment("mine", random_policy(1, Layout())), tmp_path)
+    assert not (tmp_path / "card.md").exists(), "one without a card leaves none of another policy"
+    assert "card.md" not in (tmp_path / "README.md").read_text()
+
+
+def _held(*names):
+    return [shipped_policies()[name] for name in names]
+
+
 def test_an_own_policy_file_is_exported(tmp_path):
     policy = random_policy(1, Layout())
     save_policy(policy, tmp_path / "mine.npz")

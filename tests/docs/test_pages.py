@@ -15,7 +15,7 @@ import pytest
 from cfb_mjx.cli import main
 from cfb_mjx.commands import COMMANDS, line
 from cfb_mjx.commands.command import Command, Written
-from cfb_mjx.control.policy_file import shipped_policies
+from cfb_mjx.control.policy_file import load_policy, shipped_policies
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -153,6 +153,7 @@ def test_cards_of_policies_say_what_was_measured():
     assert len(shipped_policies()) == 7
     for name, path in shipped_policies().items():
         assert path.with_name("card.md").read_text() == cards.card(path.parent), name
+        assert load_policy(path).card == path.with_name("card.md").read_text(), f"{name}: the file has another card"
 
 
 def test_pages_speak_of_the_project_only():

@@ -488,6 +488,22 @@ def test_one_algorithm_goes_on_from_the_others_policy(tmp_path):
         Training.prepare(other, {}, tmp_path / "first" / POLICY)
 
 
+def test_a_policy_carries_a_card_of_its_training(tmp_path, monkeypatch):
+    monkeypatch.setattr(run, "_judged", lambda *given: {"hover_mm": 12.345, "hover_failed": 0.25})
+    training = small("analytic", "noise.pose_jitter_s=0.003", "seed=7")
+    train(training, tmp_path / "first")
+    card = load_policy(tmp_path / "first" / POLICY).card
+    flown = int(list(csv.DictReader((tmp_path / "first" / CURVE).read_text().splitlines()))[-1]["commands"])
+    words = "Back-propagation", "seed 7", f"{flown / 1e6:.3g} M commands", "`cfb-guards`", "plus up to 3 ms"
+    for word in (*words, "- hover_mm: 12.3\n", "- hover_failed: 0.25\n"):
+        assert word in card
+    assert load_policy(tmp_path / "first" / BEST).card != card, "that of its own checkpoint"
+    further = Training.prepare(load_config("target", SMALL_TRAINING), {}, tmp_path / "first" / POLICY)
+    policy = further.policy(further.start.controller, 1000, {})
+    assert f"continues the policy with the weights {further.start.weights_sha256[:12]}" in policy.card
+    assert policy.card.endswith("Not evaluated.\n")
+
+
 def test_a_model_with_effects_is_trained_on_and_a_predictor_is_refused(tmp_path):
     effects = (
         {"name": "rotor_drag", "parameters": {"coefficient": 1e-6}},

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from cfb_mjx.commands.command import Command, OutputFolder, Result, command
-from cfb_mjx.files import require_no_file, write_json
+from cfb_mjx.commands.command import Command, Ending, File, OutputFolder, Result, command
+from cfb_mjx.files import require_folder, require_no_file, write_json
 
 if TYPE_CHECKING:
     from cfb_mjx.deploy.check import Check
@@ -27,6 +27,7 @@ class Exported(Result):
         folder: folder with the sources, the firmware app and the contract.
         check: results of the check (``check.numbers``, ``check.faults``); None if no check was asked for.
         results: path of the file with these numbers; None if no check was asked for.
+        onnx: path of the ONNX model; None if none was asked for.
     """
 
     name: str
@@ -35,6 +36,7 @@ class Exported(Result):
     folder: Path
     check: Check | None = None
     results: Path | None = None
+    onnx: Path | None = None
 
     def __str__(self) -> str:
         hashes = ", ".join(f"{name} {value[:12]}" for name, value in self.weights_sha256.items())
@@ -45,6 +47,8 @@ class Exported(Result):
         if self.check is not None:
             lines += [f"  {text}" if good else f"  {text}   <- outside the limit" for text, good in self.check.findings]
             lines.append(f"results: {self.results}")
+        if self.onnx is not None:
+            lines.append(f"ONNX model: {self.onnx}")
         return "\n".join(lines)
 
     @property
@@ -62,7 +66,7 @@ class Export(Command):
     explains how to fly the policy, and what it does when an estimate is invalid.
 
     Attributes:
-        policy: a shipped policy, a policy file of `cfb train`, or the name of a flip.
+        policy: a shipped policy, a policy file (.npz of `cfb train`, .onnx), or the name of a flip.
             Shipped policies: target, target-analytic, target-adaptive, track, track-rates, flip, flip-analytic.
             Flips: double-flip, triple-flip ...
         output: folder to write to.
@@ -72,6 +76,7 @@ class Export(Command):
             Default: the one with which the settings of the flip were found.
         check: compile the C, compare it with JAX on 10 000 random sequences and in closed loop, and measure its cost.
             The size on the drone's processor needs arm-none-eabi-gcc, the number of instructions also qemu-system-arm.
+        onnx: write the policy as an ONNX model too; of a flip, the policy that turns. Needs the package onnx.
     """
 
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
@@ -79,21 +84,28 @@ class Export(Command):
     knobs: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     holder: Annotated[str | None, tyro.conf.arg(metavar="POLICY")] = None
     check: bool = False
+    onnx: Annotated[File, Ending((".onnx",), "an ONNX model must end in .onnx")] = None
 
     def run(self) -> Exported:
         """Write the C, and check it if a check was asked for.
 
         Raises:
-            CfbError: no such policy, a folder that cannot be written, or no C compiler for the check.
+            CfbError: no such policy, a folder that cannot be written, no C compiler for the check, or no package onnx.
         """
         from cfb_mjx.runtime import configure_jax, environment
 
         require_no_file(self.output)
+        require_folder(self.onnx)
         configure_jax(x64=False)
         from cfb_mjx.deploy.deployment import find_deployment
         from cfb_mjx.deploy.export import RESULTS, export_policy
 
         deployment = find_deployment(self.policy, self.knobs, self.holder)
+        if self.onnx is not None:
+            # First, so that nothing is left behind where the package is missing.
+            from cfb_mjx.control.onnx_file import write_onnx
+
+            write_onnx(deployment.turner or deployment.holder, self.onnx)
         exported = export_policy(deployment, self.output)
         check = results = None
         if self.check:
@@ -103,4 +115,4 @@ class Export(Command):
             write_json(results, check.numbers | {"environment": environment()})
         hashes = {name: policy.weights_sha256 for name, policy in deployment.policies.items()}
         step_s = deployment.holder.controller.control_dt_s
-        return Exported(deployment.name, step_s, hashes, exported.folder, check, results)
+        return Exported(deployment.name, step_s, hashes, exported.folder, check, results, self.onnx)

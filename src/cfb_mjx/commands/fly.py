@@ -73,7 +73,7 @@ class Fly(Command):
     Prints the measured numbers; over several flights these are means, with quantiles and the success rate.
 
     Attributes:
-        controller: a shipped policy, a policy file of `cfb train`, the name of a flip, or pid or mellinger.
+        controller: a shipped policy, a policy file (.npz of `cfb train`, .onnx), the name of a flip, pid or mellinger.
             pid and mellinger are the controllers of the firmware.
         task: task to fly. Default: hover, flip for a flip policy, track for a policy that sees ahead.
         model: preset or model YAML of the drone, with its effects.

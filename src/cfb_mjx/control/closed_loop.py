@@ -119,7 +119,9 @@ def rollout_closed_loop(
             return jax.vmap(plainly, in_axes=axes(own))(*leaves)
         if size > at_once() and jax.default_backend() == "cpu":
             return in_groups(own, leaves)
-        fits = fits_one_kernel(model) and len({x.dtype for x in leaves}) == 1
+        # The kernels know networks that their observation alone determines.
+        plain = fits_one_kernel(model) and not controller.recurrent
+        fits = plain and len({x.dtype for x in leaves}) == 1
         few = fits and size <= FEW
         drones = _Drones(size, own_models, few, between=fits and FEW < size <= LANES)
 

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.control.policy_file import SUFFIXES, load_policy, shipped_policies
 from cfb_mjx.envs.observation import StateEstimate
 from cfb_mjx.errors import CfbError
 from cfb_mjx.firmware import mellinger, pid
@@ -129,7 +129,9 @@ def find_controller(controller: str | Path, nominal: Quadrotor) -> Controller:
     if controller == "mellinger":
         return MellingerController(mellinger.Mellinger())
     found = shipped_policies()
-    if controller not in found and Path(controller).suffix != ".npz":
+    if controller not in found and Path(controller).suffix not in SUFFIXES:
         names = ", ".join(["pid", "mellinger", *found])
-        raise CfbError(f"{controller}: no such controller; give a policy file (.npz) or one of {names}.")
+        raise CfbError(
+            f"{controller}: no such controller; give a policy file ({' or '.join(SUFFIXES)}) or one of {names}."
+        )
     return load_policy(controller).controller

@@ -82,6 +82,8 @@ class Manoeuvre(eqx.Module):
     def __check_init__(self):
         if len(self.turner.layout.setpoint_scales) != 2 or self.holder.layout.setpoint_scales:
             raise CfbError("A flip needs a target policy, and a flip policy with set-points of speed and rate.")
+        if self.holder.recurrent or self.turner.recurrent:
+            raise CfbError("A flip needs fully connected policies, and one of these two is recurrent; train another.")
         require_motor_commands(self.holder, "a flip")
         require_motor_commands(self.turner, "a flip")
         if self.holder.control_dt_s != self.turner.control_dt_s:

@@ -1,20 +1,19 @@
-"""Fully connected networks as controllers."""
+"""Networks as controllers: fully connected layers, with a gated recurrent unit among them if wanted."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cfb_mjx.envs.observation import Layout, Memory, StateEstimate, observation, remember, start
 from cfb_mjx.errors import CfbError
+from cfb_mjx.optional import not_none
 
 ACTIVATIONS: dict[str, Callable] = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
 LIMITS: dict[str, Callable] = {"tanh": jnp.tanh, "clip": lambda x: jnp.clip(x, -1.0, 1.0)}
@@ -23,16 +22,55 @@ WRITTEN = {"tanh": "tanh(output)", "clip": "clip(output, -1, 1)"}
 """The same, as policy files and contracts write them."""
 
 
+class Gru(eqx.Module):
+    """A gated recurrent unit of n numbers: h = (1 - z) c + z h, with the gates r, z and the candidate c of
+
+        r = sigmoid(x Wr + br + h Ur + dr),  z = sigmoid(x Wz + bz + h Uz + dz),  c = tanh(x Wc + bc + r (h Uc + dc)).
+
+    This is the unit of PyTorch, Flax and cuDNN, with the reset gate r inside the candidate. Every array holds reset,
+    update and candidate side by side.
+    """
+
+    input_weight: Float[Array, "inputs gates"]
+    """[Wr, Wz, Wc], (inputs, 3 n)."""
+    input_bias: Float[Array, " gates"]
+    """[br, bz, bc], (3 n,)."""
+    hidden_weight: Float[Array, "n gates"]
+    """[Ur, Uz, Uc], (n, 3 n)."""
+    hidden_bias: Float[Array, " gates"]
+    """[dr, dz, dc], (3 n,)."""
+
+    @property
+    def size(self) -> int:
+        """Numbers that are kept from one step to the next, n."""
+        return self.hidden_weight.shape[0]
+
+    def __call__(self, x: Float[Array, " inputs *drones"], hidden: Float[Array, " n *drones"]) -> Array:
+        """Return the new hidden state, (n, *drones), from -1 to 1 if it began there."""
+
+        def layer(weight, bias, x):
+            return x @ weight + bias if x.ndim == 1 else weight.T @ x + bias[:, None]
+
+        seen = jnp.split(layer(self.input_weight, self.input_bias, x), 3)
+        kept = jnp.split(layer(self.hidden_weight, self.hidden_bias, hidden), 3)
+        reset, update = (jax.nn.sigmoid(a + b) for a, b in zip(seen[:2], kept[:2], strict=True))
+        return (1 - update) * jnp.tanh(seen[2] + reset * kept[2]) + update * hidden
+
+
 class Network(eqx.Module):
     """Weights (inputs, outputs) and biases, first layer first; the activation is applied between layers.
 
-    The limit is applied after the last layer, by the controller.
+    The limit is applied after the last layer, by the controller. A network with a ``gru`` has that unit after its first
+    ``before`` layers; nothing is applied to what the unit gives. Its hidden state is part of the controller's memory.
     """
 
     weights: tuple[Float[Array, "_ _"], ...]
     biases: tuple[Float[Array, " _"], ...]
     activation: str = eqx.field(static=True, default="tanh")
     limit: str = eqx.field(static=True, default="tanh")
+    gru: Gru | None = None
+    before: int = eqx.field(static=True, default=0)
+    """Number of layers before the recurrent unit."""
 
     @classmethod
     def random(cls, key: PRNGKeyArray, sizes: tuple[int, ...], activation: str = "tanh", last: float = 1.0) -> Network:
@@ -42,6 +80,61 @@ class Network(eqx.Module):
             bound = (3 / inputs) ** 0.5 * (last if i == len(sizes) - 2 else 1.0)
             weights.append(jax.random.uniform(jax.random.fold_in(key, i), (inputs, outputs), float, -bound, bound))
         return cls(tuple(weights), tuple(jnp.zeros(n) for n in sizes[1:]), activation)
+
+    @property
+    def parts(self) -> list[Array]:
+        """All arrays in the order of the computation: weights and biases of each layer, and of the recurrent unit."""
+        found = [[weight, bias] for weight, bias in zip(self.weights, self.biases, strict=True)]
+        if (gru := self.gru) is not None:
+            found.insert(self.before, [gru.input_weight, gru.input_bias, gru.hidden_weight, gru.hidden_bias])
+        return [x for layer in found for x in layer]
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Numbers that each layer, and the recurrent unit, takes and gives, first layer first."""
+        found = [(weight.shape[0], weight.shape[1]) for weight in self.weights]
+        if self.gru is not None:
+            found.insert(self.before, (len(self.gru.input_weight), self.gru.size))
+        return found
+
+    def fits(self, inputs: int) -> bool:
+        """Whether the arrays fit each other, ``inputs`` inputs and four outputs, and the activation is known."""
+        gru, layers = self.gru, list(zip(self.weights, self.biases, strict=True))
+        if not layers or self.activation not in ACTIVATIONS or any(x.ndim not in (1, 2) for x in self.parts):
+            return False
+        if gru is not None:
+            layers += [(gru.input_weight, gru.input_bias), (gru.hidden_weight, gru.hidden_bias)]
+            gates = 3 * gru.size
+            if self.before not in range(len(self.weights)) or {len(gru.input_bias), len(gru.hidden_bias)} != {gates}:
+                return False
+        if any(weight.ndim != 2 or bias.shape != weight.shape[1:] for weight, bias in layers):
+            return False
+        return [inputs, *(given for _, given in self.sizes)] == [*(taken for taken, _ in self.sizes), 4]
+
+    @property
+    def multiply_accumulates(self) -> int:
+        """Multiply-accumulates of one evaluation."""
+        return sum(int(x.size) for x in self.parts if x.ndim == 2)
+
+    @property
+    def activations(self) -> int:
+        """Exponentials of one evaluation, at most: one for every output of a layer, three for each of a GRU's."""
+        return sum(len(x) for x in self.biases) + (0 if self.gru is None else 3 * self.gru.size)
+
+    def advance(self, x: Float[Array, " inputs *drones"], hidden: Float[Array, " n *drones"]) -> tuple[Array, Array]:
+        """Return outputs and new hidden state of a network with a recurrent unit."""
+        ahead, after = self.weights[: self.before], self.weights[self.before :]
+
+        def through(weights, biases, x):
+            if not weights:
+                return x
+            part = Network(weights, biases, self.activation)
+            return part(x) if x.ndim == 1 else part.columns(x)
+
+        x = through(ahead, self.biases[: self.before], x)
+        x = ACTIVATIONS[self.activation](x) if ahead else x
+        hidden = not_none(self.gru)(x, hidden)
+        return through(after, self.biases[self.before :], hidden), hidden
 
     def __call__(self, x: Float[Array, "*batch inputs"]) -> Float[Array, "*batch outputs"]:
         return self._through(lambda weight, bias, x: x @ weight + bias, x)
@@ -53,6 +146,8 @@ class Network(eqx.Module):
         return self._through(lambda weight, bias, x: weight.T @ x + bias[:, None], x)
 
     def _through(self, layer: Callable, x: Array) -> Array:
+        if self.gru is not None:
+            raise CfbError("a network with a recurrent unit has no output without its hidden state; use advance.")
         *hidden, last = zip(self.weights, self.biases, strict=True)
         for weight, bias in hidden:
             x = ACTIVATIONS[self.activation](layer(weight, bias, x))
@@ -79,6 +174,7 @@ class WrittenOut(Network):
 class NeuralController(eqx.Module):
     """A network that turns observations into commands u = (1 + tanh(output)) / 2, or with a clip for the tanh.
 
+    The memory of one with a recurrent unit (`recurrent`) holds the unit's state too, which is zero at the start.
     `start` and `command` also accept many drones along the last axis of every array (`cfb_mjx.envs.observation`).
     """
 
@@ -104,10 +200,22 @@ class NeuralController(eqx.Module):
         """Time between two commands, s."""
         return self.layout.control_dt_s
 
+    @property
+    def recurrent(self) -> bool:
+        """Whether the network has a state of its own, which observations alone do not determine."""
+        return self.network.gru is not None
+
     def act(self, shown: Float[Array, " size *drones"]) -> Float[Array, " 4 *drones"]:
-        """Return the command, 0 to 1, for an observation."""
+        """Return the command, 0 to 1, for an observation.
+
+        Raises:
+            CfbError: the network is recurrent; only ``command`` has its state.
+        """
         network = self.network if shown.ndim == 1 else self.network.columns
-        return 0.5 * (1 + LIMITS[self.network.limit](network(shown)))
+        return self._limited(network(shown))
+
+    def _limited(self, output: Array) -> Array:
+        return 0.5 * (1 + LIMITS[self.network.limit](output))
 
     def written_out(self) -> NeuralController:
         """Return the same controller for use within one compiled function (`WrittenOut`)."""
@@ -117,134 +225,21 @@ class NeuralController(eqx.Module):
 
     def start(self, estimate: StateEstimate, command: Float[Array, " 4 *drones"] | float = 0.55) -> Memory:
         """Return the memory of a controller that has commanded ``command`` on ``estimate`` for long."""
-        return start(self.layout, estimate, command)
+        memory = start(self.layout, estimate, command)
+        if (gru := self.network.gru) is None:
+            return memory
+        like = memory.integral
+        nothing = jnp.zeros((gru.size, *like.shape[1:]), jnp.result_type(like, gru.hidden_weight))
+        return replace(memory, hidden=nothing)
 
     def command(
         self, memory: Memory, estimate: StateEstimate, setpoint: Float[Array, " setpoints *drones"] | None = None
     ) -> tuple[Memory, Float[Array, " 4 *drones"]]:
         """New memory and command; call it every ``layout.control_dt_s``. Policies with set-points need ``setpoint``."""
-        u = self.act(observation(self.layout, memory, estimate, setpoint))
-        return remember(self.layout, memory, estimate, u), u
-
-
-def brax_controller(
-    params: Any, layout: Layout, *, normalized: bool, activation: str = "tanh", obs_key: str = "state"
-) -> NeuralController:
-    """Convert a policy of Brax's PPO or SAC to a controller that acts deterministically.
-
-    Args:
-        params: result of the trainer: statistics of the normaliser, policy, and anything after them.
-        layout: observation layout of the task on which the policy was trained.
-        normalized: whether it was trained with ``normalize_observations``. If so, the normalisation is folded into the
-            first layer. Brax returns the statistics in either case.
-        activation: activation of the hidden layers: ``tanh``, ``relu`` or ``swish``.
-        obs_key: key of the observation that the policy reads.
-
-    Raises:
-        CfbError: the network is not fully connected, or its input size differs from the layout's.
-    """
-    statistics, policy = params[0], params[1]["params"]
-    mean, std = (x[obs_key] if isinstance(x, dict) else x for x in (statistics.mean, statistics.std))
-    # The second half of the last layer is the standard deviation.
-    last = max(policy, key=_natural)
-    policy = {**policy, last: {part: np.asarray(x)[..., : x.shape[-1] // 2] for part, x in policy[last].items()}}
-    given = {"mean": mean, "std": std} if normalized else {}
-    try:
-        return foreign_controller(policy, layout, activation=activation, limit="tanh", **given)
-    except CfbError as error:
-        raise CfbError(f"brax_controller: {error}") from None
-
-
-def foreign_controller(
-    params: Mapping[str, Any],
-    layout: Layout,
-    *,
-    activation: str,
-    limit: str,
-    mean: Any = None,
-    std: Any = None,
-) -> NeuralController:
-    """Convert a fully connected policy of another library to a controller that acts deterministically.
-
-    The policy must have been trained on this library's observation (`cfb_mjx.envs.gym`, `cfb_mjx.envs.brax_env`), with
-    actions from -1 to 1. ``save_policy`` then writes it for ``cfb fly`` and ``cfb export``.
-
-        foreign_controller(model.policy.state_dict(), task.layout, activation="tanh", limit="clip")    # SB3's PPO
-        foreign_controller(model.actor.state_dict(), task.layout, activation="relu", limit="tanh")     # SB3's SAC
-        foreign_controller(variables["params"], layout, activation="swish", limit="tanh")              # Flax
-
-    Args:
-        params: ``state_dict()`` of a PyTorch module (layers in order of their definition) or parameters of a Flax
-            module (nested dictionaries; layers in the order of the numbers in their names). Layers of value networks
-            and standard deviations are left out.
-        layout: observation layout of the task.
-        activation: activation of the hidden layers: ``tanh``, ``relu`` or ``swish``.
-        limit: how the action is limited: ``clip`` (Stable-Baselines3's PPO) or ``tanh`` (SAC, Brax).
-        mean: mean by which observations were normalised, (inputs,); None: they were not.
-        std: standard deviation likewise, with what the library adds to it (``sqrt(var + epsilon)``). A clip of
-            normalised observations is not reproduced.
-
-    Raises:
-        CfbError: an unknown activation or limit, layers that are not fully connected, or layers that do not fit each
-            other, the layout's input size, or four motors.
-    """
-    if activation not in ACTIVATIONS or limit not in LIMITS:
-        raise CfbError(
-            f"activation must be one of {', '.join(ACTIVATIONS)} and limit of {', '.join(LIMITS)}, found "
-            f"{activation!r} and {limit!r}."
-        )
-    if (mean is None) != (std is None):
-        raise CfbError("give both mean and std of the observations, or neither.")
-    weights, biases = _layers(params)
-    sizes = [w.shape for w in weights]
-    fits = bool(sizes) and sizes[0][0] == layout.size and sizes[-1][1] == 4
-    if not fits or any(a[1] != b[0] for a, b in pairwise(sizes)) or [len(b) for b in biases] != [s[1] for s in sizes]:
-        found = ", ".join(f"{a} x {b}" for a, b in sizes) or "none"
-        raise CfbError(
-            f"the policy must be fully connected layers from {layout.size} inputs, the layout's, to 4 outputs, "
-            f"each fitting the next; found {found}. Give the parameters of the policy alone."
-        )
-    if mean is not None:
-        kind, mean, std = weights[0].dtype, np.asarray(mean, float), np.asarray(std, float)
-        biases[0] = (biases[0] - (mean / std) @ weights[0]).astype(kind)
-        weights[0] = (weights[0] / std[:, None]).astype(kind)
-    network = Network(tuple(map(jnp.asarray, weights)), tuple(map(jnp.asarray, biases)), activation, limit)
-    return NeuralController(network, layout)
-
-
-_NOT_OF_A_POLICY = re.compile(r"value|critic|log_std|(^|\.)(vf|qf|q_net)")
-
-
-def _layers(params: Mapping[str, Any]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Weights (inputs, outputs) and biases of the fully connected layers of a policy, first layer first."""
-    kinds = {"kernel": False, "weight": True}
-    found: dict[str, dict[str, np.ndarray]] = {}
-
-    def walk(tree: Mapping[str, Any], path: tuple[str, ...], natural: bool) -> None:
-        names = sorted(tree, key=_natural) if natural else tree
-        for name in names:
-            value, *parts = tree[name], *path, *str(name).split(".")
-            if isinstance(value, Mapping):
-                walk(value, tuple(parts), natural)
-            elif not _NOT_OF_A_POLICY.search(".".join(parts)):
-                part = np.asarray(value)
-                if part.ndim != {"bias": 1, "kernel": 2, "weight": 2}.get(parts[-1]):
-                    raise CfbError(
-                        f"the policy must be fully connected layers; {'.'.join(parts)} of shape {part.shape} is not of "
-                        "one."
-                    )
-                found.setdefault(".".join(parts[:-1]), {})[parts[-1]] = part
-
-    walk(params, (), any(isinstance(value, Mapping) for value in params.values()))
-    weights, biases = [], []
-    for layer in found.values():
-        for kind, transposed in kinds.items():
-            if kind in layer:
-                weights.append(layer[kind].T if transposed else layer[kind])
-                biases.append(layer.get("bias", np.zeros(weights[-1].shape[1], weights[-1].dtype)))
-    return weights, biases
-
-
-def _natural(name: str) -> list[tuple[int, str]]:
-    """Sorts the numbers in names by value: layer_2 before layer_10."""
-    return [(int(part), "") if part.isdigit() else (0, part) for part in re.split(r"(\d+)", name)]
+        shown = observation(self.layout, memory, estimate, setpoint)
+        if not self.recurrent:
+            u = self.act(shown)
+            return remember(self.layout, memory, estimate, u), u
+        output, hidden = self.network.advance(shown, not_none(memory.hidden))
+        u = self._limited(output)
+        return replace(remember(self.layout, memory, estimate, u), hidden=hidden), u

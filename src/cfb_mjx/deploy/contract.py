@@ -7,7 +7,7 @@ from typing import Any
 
 from cfb_mjx import __version__
 from cfb_mjx.control.neural import WRITTEN
-from cfb_mjx.control.policy_file import PolicyFile
+from cfb_mjx.control.policy_file import PolicyFile, about_gru
 from cfb_mjx.deploy.deployment import CATCH_S, Deployment
 from cfb_mjx.envs.observation import Layout
 from cfb_mjx.firmware.actions import ACTIONS
@@ -115,10 +115,11 @@ def _policy(policy: PolicyFile) -> dict[str, Any]:
         "task": policy.task,
         "weights_sha256": policy.weights_sha256,
         "weights_hashed": "little-endian float32, each layer's weights (inputs, outputs) and biases, first layer first",
-        "layers": [layout.size, *(len(b) for b in network.biases)],
+        "layers": [layout.size, *(given for _, given in network.sizes)],
         "activation": network.activation,
         "output": f"u = (1 + {WRITTEN[network.limit]}) / 2",
-        "multiply_accumulates": sum(int(w.size) for w in network.weights),
+        **(about_gru(network) if policy.controller.recurrent else {}),
+        "multiply_accumulates": network.multiply_accumulates,
         "observation": _observation(layout),
         "history": {
             "past_estimates": layout.past_estimates,

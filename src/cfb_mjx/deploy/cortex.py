@@ -65,12 +65,12 @@ def has_emulator() -> bool:
 
 def multiply_accumulates(deployment: Deployment) -> int:
     """Multiply-accumulates per step: those of the larger network, because a step evaluates one of them."""
-    return max(sum(int(w.size) for w in p.controller.network.weights) for p in deployment.policies.values())
+    return max(p.controller.network.multiply_accumulates for p in deployment.policies.values())
 
 
 def estimated_instructions(deployment: Deployment) -> float:
     """Instructions per step, estimated without running it."""
-    activations = max(sum(len(b) for b in p.controller.network.biases) for p in deployment.policies.values())
+    activations = max(p.controller.network.activations for p in deployment.policies.values())
     network = INSTRUCTIONS_PER_MAC * multiply_accumulates(deployment) + INSTRUCTIONS_PER_ACTIVATION * activations
     return network + INSTRUCTIONS_PER_STEP
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from cfb_mjx.control.manoeuvre import Manoeuvre, ManoeuvreFile, load_manoeuvre, shipped_manoeuvres
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.control.policy_file import PolicyFile, load_policy, shipped_policies
+from cfb_mjx.control.policy_file import SUFFIXES, PolicyFile, load_policy, shipped_policies
 from cfb_mjx.envs.episode import settled_output
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.errors import CfbError
@@ -130,9 +130,9 @@ def find_deployment(name: str | Path, knobs: str | Path | None = None, holder: s
 
 def _policy(name: str | Path) -> PolicyFile:
     shipped = shipped_policies()
-    if str(name) not in shipped and Path(name).suffix != ".npz":
+    if str(name) not in shipped and Path(name).suffix not in SUFFIXES:
         names = ", ".join([*shipped, *(m for m in shipped_manoeuvres() if m not in shipped)])
-        raise CfbError(f"{name}: no such policy; give a policy file (.npz) or one of {names}.")
+        raise CfbError(f"{name}: no such policy; give a policy file ({' or '.join(SUFFIXES)}) or one of {names}.")
     return load_policy(name)
 
 

@@ -26,6 +26,8 @@ PILOTS = {True: "cfb_pilot_flip.c", False: "cfb_pilot_hold.c"}
 """Both are exported under one name, so that no file of an earlier export remains beside a later one."""
 RESULTS = "check.json"
 """File that ``cfb export --check`` writes."""
+CARD = "card.md"
+"""File with the cards of the policies that have one."""
 _NEVER = 1e9
 """Stands for a time, speed or angle that is never reached."""
 
@@ -54,9 +56,11 @@ def export_policy(deployment: Deployment, folder: str | Path) -> Exported:
     """
     folder = output_folder(folder)
     with together():
-        write_texts(folder, sources(deployment))
-        # The results belong to the export that was overwritten.
-        remove(folder / RESULTS)
+        texts = sources(deployment)
+        write_texts(folder, texts)
+        # These belong to the export that was overwritten.
+        for name in {RESULTS, CARD} - {*texts}:
+            remove(folder / name)
     return Exported(folder, deployment)
 
 
@@ -67,8 +71,14 @@ def sources(deployment: Deployment) -> dict[str, str]:
     texts["cfb_sizes.h"] = _sizes(deployment)
     texts["cfb_data.h"] = _header(deployment)
     texts["cfb_data.c"] = _data(deployment)
+    if cards := _cards(deployment):
+        texts[CARD] = cards
     texts["contract.json"] = json.dumps(plain(contract(deployment)), indent=1) + "\n"
     return texts
+
+
+def _cards(deployment: Deployment) -> str:
+    return "\n".join(policy.card for policy in deployment.policies.values() if policy.card)
 
 
 def _template(name: str) -> str:
@@ -94,7 +104,9 @@ def _abilities(deployment: Deployment) -> set[str]:
     layout = deployment.holder.controller.layout
     return {
         "flip" if deployment.flips else "no flip",
+        "gru" if deployment.holder.controller.recurrent else "no gru",
         "previews" if layout.preview_s else "hold",
+        "card" if _cards(deployment) else "no card",
         "motors" if layout.action == "motors" else "loop",
         layout.action,
         "through_pid" if layout.action in ("attitude", "velocity", "position") else "direct",
@@ -191,7 +203,8 @@ def literal(x) -> str:
 
 def _sizes(deployment: Deployment) -> str:
     layouts = [p.controller.layout for p in deployment.policies.values()]
-    outputs = [len(b) for p in deployment.policies.values() for b in p.controller.network.biases]
+    networks = [p.controller.network for p in deployment.policies.values()]
+    outputs = [given for network in networks for _, given in network.sizes]
     estimates = max(1, *(layout.past_estimates for layout in layouts))
     commands = max(1, *(layout.past_commands for layout in layouts))
     setpoints = max(layout.shown for layout in layouts)
@@ -203,6 +216,8 @@ def _sizes(deployment: Deployment) -> str:
         # Sized for all networks together: a compiler that analyses the loops must not find out-of-bounds writes.
         "CFB_WIDEST": max(frame * (1 + estimates) + 4 * commands + 3 + setpoints, *outputs),
     }
+    kept = [network.gru.size for network in networks if network.gru is not None]
+    numbers |= {"CFB_HIDDEN": max(kept)} if kept else {}
     lines = "\n".join(f"#define {name} {value}" for name, value in numbers.items())
     return _guarded("CFB_SIZES_H", f"/* Generated for {deployment.name}: what its networks need. */", lines)
 
@@ -286,6 +301,12 @@ def _network(name: str, policy: PolicyFile) -> str:
         "layers": len(layers),
         "layer": f"{name}_layers",
     }
+    if (gru := network.gru) is not None:
+        inputs, size = network.sizes[network.before]
+        arrays = [f"{name}_gru_{part}" for part in ("input_weight", "input_bias", "hidden_weight", "hidden_bias")]
+        values = (gru.input_weight.T, gru.input_bias, gru.hidden_weight.T, gru.hidden_bias)
+        parts += [_array(array, np.asarray(x, np.float32)) for array, x in zip(arrays, values, strict=True)]
+        fields |= {"before": network.before, "gru": f"{{{inputs}, {size}, {', '.join(arrays)}}}"}
     parts.append(f"static const cfb_layer_t {name}_layers[] = {{\n" + "\n".join(layers) + "\n};")
     body = "\n".join(f"    .{key} = {value}," for key, value in fields.items())
     parts.append(f"const cfb_network_t cfb_{name} = {{\n{body}\n}};\n")

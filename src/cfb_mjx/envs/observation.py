@@ -12,12 +12,15 @@ row; ``vmap`` would concatenate them drone by drone, which on a CPU takes longer
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cfb_mjx.documents import with_former
 from cfb_mjx.model.state import AnyArray
 from cfb_mjx.optional import not_none
 
@@ -67,6 +70,20 @@ class Layout:
     """Meaning of the four outputs, a name in `cfb_mjx.firmware.ACTIONS`: motor commands, or set-points of the
     firmware's own loops."""
 
+    @classmethod
+    def from_document(cls, written: Mapping[str, Any]) -> Layout:
+        """Return the layout that a file holds.
+
+        Args:
+            written: fields by name; those that a file of an earlier version lacks get the values they had then.
+
+        Raises:
+            TypeError: there is no such field.
+        """
+        settings: dict[str, Any] = dict(with_former(dict(written), "position_scale_m", BEFORE_BENDS))
+        settings |= {key: tuple(written.get(key, ())) for key in ("setpoint_scales", "preview_s")}
+        return cls(**settings)
+
     @property
     def shown(self) -> int:
         """Number of values that are observed beside the estimates: displacements of the target, then set-points."""
@@ -111,6 +128,8 @@ class Memory(eqx.Module):
     """Past commands as observed: 2 u - 1."""
     integral: Float[Array, " 3 *drones"]
     """Integral of the relative position, m s."""
+    hidden: Float[Array, " n *drones"] | None = None
+    """State of a recurrent network."""
 
 
 def rotation_matrix(q: Float[AnyArray, " 4 *drones"]) -> Float[Array, "3 3 *drones"]:
@@ -205,4 +224,4 @@ def remember(layout: Layout, memory: Memory, estimate: StateEstimate, command: F
         commands = jnp.concatenate([(2 * command - 1)[None], commands[:-1]])
     limit, total = layout.integral_input_limit_m, layout.integral_limit_ms
     grown = memory.integral + layout.control_dt_s * jnp.clip(estimate.position, -limit, limit)
-    return Memory(frames, commands, jnp.clip(grown, -total, total))
+    return Memory(frames, commands, jnp.clip(grown, -total, total), memory.hidden)

@@ -60,12 +60,12 @@ def _said(value: Any) -> str:
         return "+".join(f"{key}-{_said(v)}" for key, v in value.items())
     # A path is shortened to its file name without suffix.
     said = text(value)
-    return PurePath(said).stem if "/" in said or said.endswith((".yaml", ".yml", ".npz", ".mcap")) else said
+    return PurePath(said).stem if "/" in said or said.endswith((".yaml", ".yml", ".npz", ".onnx", ".mcap")) else said
 
 
 LOG_SUFFIXES = (".mcap", ".parquet", ".csv")
 """Suffixes of the flight logs in a folder that is given in place of logs."""
-_FILE_SUFFIXES = (".yaml", ".yml", ".npz")
+_FILE_SUFFIXES = (".yaml", ".yml", ".npz", ".onnx")
 _HOLE = re.compile(r"\{([A-Za-z_]\w*)\}")
 
 

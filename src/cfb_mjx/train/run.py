@@ -32,6 +32,7 @@ from cfb_mjx.model.randomised import require_possible
 from cfb_mjx.model.rotors import hover_command
 from cfb_mjx.parameters import ModelFile, load_model_file, load_randomisation
 from cfb_mjx.train.algorithm import Algorithm
+from cfb_mjx.train.card import training_card
 from cfb_mjx.train.checkpoint import load_state, read_about, save_checkpoint
 from cfb_mjx.train.config import TrainingConfig
 from cfb_mjx.train.flips import turning
@@ -99,6 +100,8 @@ class Training:
         policy = None if start is None else load_policy(start)
         if policy is not None:
             controller, wanted = policy.controller, config.network
+            if controller.recurrent:
+                raise CfbError(f"{start}: this policy has a GRU; trainings go on from fully connected policies.")
             hidden = tuple(len(b) for b in controller.network.biases[:-1])
             if controller.layout != config.observation or hidden != wanted.hidden:
                 raise CfbError(f"{start}: the policy's observation or network differs from the configuration's.")
@@ -139,9 +142,17 @@ class Training:
             float(jnp.clip(jnp.mean(hover_command(nominal.changed_parameters())), 0.05, 0.95)),
         )
 
-    def policy(self, controller: NeuralController) -> PolicyFile:
-        """Return the policy as a file, with the inputs of its training."""
-        return PolicyFile(controller, self.config.task, {**self.identity(), "versions": self.versions})
+    def policy(self, controller: NeuralController, commands: int, scores: Row) -> PolicyFile:
+        """Return the policy as a file, with the inputs of its training and a card.
+
+        Args:
+            controller: the policy.
+            commands: number of commands flown so far.
+            scores: its scores; empty: it was not evaluated.
+        """
+        start = None if self.start is None else self.start.weights_sha256
+        card = training_card(self.config.to_mapping(), self.described.name, start, commands, scores)
+        return PolicyFile(controller, self.config.task, {**self.identity(), "versions": self.versions}, card)
 
 
 def train(
@@ -228,11 +239,10 @@ def train(
         controller = jax.tree.map(lambda x: jnp.asarray(x) if eqx.is_array_like(x) else x, algorithm.controller(whole))
         if not all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves(eqx.filter(controller, eqx.is_inexact_array))):
             raise CfbError(_diverged(output, done, rows))
+        scores = _judged(controller, training, task, nominal) if evaluate and first() else {}
+        rows = [*rows, row | scores]
         if first():
-            row |= _judged(controller, training, task, nominal) if evaluate else {}
-        rows = [*rows, row]
-        if first():
-            policy = training.policy(controller)
+            policy = training.policy(controller, row["commands"], scores)
             with together():
                 # The checkpoint is written first, so that an interrupted training can always be resumed.
                 save_checkpoint(checkpoint, whole, kept())
@@ -241,7 +251,7 @@ def train(
                     save_policy(policy, output / BEST)
                 write_text(output / UPDATES, _csv(updates))
                 write_text(output / CURVE, _csv(rows))
-            report(row)
+            report(rows[-1])
     return rows
 
 
@@ -293,8 +303,7 @@ def segments(updates: int, count: int) -> list[int]:
 
 def spread(state: Any, over: Devices) -> Any:
     """Spread the drones over the devices, and copy everything else to each."""
-    episodes = over.along(state.episodes)
-    return eqx.tree_at(lambda s: s.episodes, over.whole(state), episodes)
+    return replace(over.whole(state), episodes=over.along(state.episodes))
 
 
 def _loaded(checkpoint: Path, like: Any) -> Any:

@@ -37,6 +37,14 @@ static float swish(float x) {
   return x > 80.0f ? x : x / (1.0f + exponential(-x));
 }
 
+//@gru
+/* Written so that what is no number is a shut gate. */
+static float sigmoid(float x) {
+  if (!(x > -80.0f)) return 0.0f;
+  return x > 80.0f ? 1.0f : 1.0f / (1.0f + exponential(-x));
+}
+
+//@end
 static float activated(cfb_activation_t activation, float x) {
   switch (activation) {
     case CFB_RELU:
@@ -142,13 +150,41 @@ static float product(const float *a, const float *b, int length) {
   return (sum0 + sum1) + (sum2 + sum3);
 }
 
+//@gru
+/* The reset gate is inside the candidate. The new state is written to ``next``: all gates see the old one. */
+static void unit(const cfb_gru_t *gru, const float *seen, const float *hidden, float *next) {
+  for (int j = 0; j < gru->size; j++) {
+    float given[3], kept[3];
+    for (int gate = 0; gate < 3; gate++) {
+      const int row = gate * gru->size + j;
+      given[gate] = gru->input_biases[row] + product(gru->input_weights + row * gru->inputs, seen, gru->inputs);
+      kept[gate] = gru->hidden_biases[row] + product(gru->hidden_weights + row * gru->size, hidden, gru->size);
+    }
+    const float reset = sigmoid(given[0] + kept[0]), update = sigmoid(given[1] + kept[1]);
+    next[j] = (1.0f - update) * hyperbolic_tangent(given[2] + reset * kept[2]) + update * hidden[j];
+  }
+}
+
+void cfb_network_command(const cfb_network_t *network, cfb_memory_t *memory, const cfb_estimate_t *estimate,
+//@end
+//@no gru
 void cfb_network_command(const cfb_network_t *network, const cfb_memory_t *memory, const cfb_estimate_t *estimate,
+//@end
                          const float *setpoint, float command[4]) {
   /* Not on the stack: the firmware's task has little of it. */
   static float one[CFB_WIDEST], other[CFB_WIDEST];
   float *from = one, *to = other;
   observe(network, memory, estimate, setpoint, from);
   for (int i = 0; i < network->layers; i++) {
+//@gru
+    if (i == network->before) {
+      unit(&network->gru, from, memory->hidden, to);
+      memcpy(memory->hidden, to, (size_t)network->gru.size * sizeof *to);
+      float *const seen = from;
+      from = to;
+      to = seen;
+    }
+//@end
     const cfb_layer_t *const layer = &network->layer[i];
     const int last = i + 1 == network->layers;
     for (int j = 0; j < layer->outputs; j++) {

@@ -1,4 +1,4 @@
-/* A small fully connected network, and what it is shown: the observation with its history.
+/* A small network, and what it is shown: the observation with its history.
  *
  * Part of a policy exported by cfb_mjx. C11, single precision, no heap; nothing here changes but the memory it is
  * given, and numbers between two layers: one caller at a time. The meaning of every number is in contract.json.
@@ -18,6 +18,17 @@ typedef struct {
   const float *biases;
 } cfb_layer_t;
 
+//@gru
+/* A gated recurrent unit: rows of reset, then update, then candidate. */
+typedef struct {
+  int inputs, size;
+  const float *input_weights;  /* 3 size rows of inputs */
+  const float *input_biases;
+  const float *hidden_weights; /* 3 size rows of size */
+  const float *hidden_biases;
+} cfb_gru_t;
+
+//@end
 typedef struct {
   /* What is shown. */
   int position, body_position, body_velocity, integral; /* yes or no */
@@ -30,6 +41,10 @@ typedef struct {
   cfb_limit_t limit;
   int layers;
   const cfb_layer_t *layer;
+//@gru
+  int before; /* number of layers before the recurrent unit */
+  cfb_gru_t gru;
+//@end
 } cfb_network_t;
 
 /* What the state estimator says, position relative to the target. */
@@ -43,15 +58,29 @@ typedef struct {
   float frames[CFB_KEPT_FRAMES][CFB_FRAME];  /* of every step, shown or not, newest first */
   float commands[CFB_KEPT_COMMANDS][4];      /* as they are shown, 2 u - 1, newest first */
   float integral[3];                         /* of the relative position, m s */
+//@gru
+  float hidden[CFB_HIDDEN];                  /* state of the recurrent unit */
+//@end
 } cfb_memory_t;
 
+//@no gru
 /* As if this had been estimated, and these outputs been commanded, for long. */
+//@end
+//@gru
+/* As if this had been estimated, and these outputs been commanded, for long; the recurrent unit's state is zero. */
+//@end
 void cfb_network_start(const cfb_network_t *network, cfb_memory_t *memory, const cfb_estimate_t *estimate,
                        const float command[4]);
 
 /* The four outputs, each in [0, 1]. setpoint: displacements of the target, three numbers for each preview, and then
  * the set-points; it may be NULL where the network has neither. */
+//@no gru
 void cfb_network_command(const cfb_network_t *network, const cfb_memory_t *memory, const cfb_estimate_t *estimate,
+//@end
+//@gru
+/* The recurrent unit's state moves on: once every step. */
+void cfb_network_command(const cfb_network_t *network, cfb_memory_t *memory, const cfb_estimate_t *estimate,
+//@end
                          const float *setpoint, float command[4]);
 
 /* Once every step, with the command that was given. */
