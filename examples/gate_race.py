@@ -10,6 +10,7 @@ minutes on two cores.
 from __future__ import annotations
 
 import argparse
+import time
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -224,20 +225,25 @@ def main() -> None:
     configure_jax(x64=False)
     drone = Quadrotor.from_file("cfb-guards")
     task = RaceTask(gates=gates_of(TRACK), randomisation=load_randomisation("paper"), magnitude=0.3)
+    begun = time.perf_counter()
     controller = trained(task, drone, arguments.commands, arguments.seed)
+    seconds = time.perf_counter() - begun
     if arguments.policy is not None:
         save_policy(PolicyFile(controller, "race"), arguments.policy)
     keys = jax.random.split(jax.random.PRNGKey(1), arguments.drones)
-    passed, touched, _ = jax.jit(jax.vmap(partial(raced, task, controller, drone)))(keys)
-    laps = 10.0 * len(task.gates) / np.asarray(passed)
+    passed, touched, way = jax.jit(jax.vmap(partial(raced, task, controller, drone)))(keys)
+    laps = 10.0 * len(task.gates) / np.maximum(passed, 1)
+    speeds = np.linalg.norm(np.diff(way, axis=1), axis=-1) / controller.control_dt_s
     results = {
         "environment": environment(),
         "commands": arguments.commands,
+        "seconds": seconds,
         "seed": arguments.seed,
         "drones": arguments.drones,
         "gates_in_10_s": float(np.mean(passed)),
         "lap_s": float(np.median(laps)),
         "touched": float(np.mean(touched)),
+        "speed_mps": float(speeds.max()),
     }
     print(
         f"{results['gates_in_10_s']:.1f} gates in 10 s, a lap of {len(task.gates)} gates in {results['lap_s']:.2f} s; "

@@ -23,6 +23,7 @@ PAGES = (
     *("tutorial", "my-drone", "train-and-deploy", "choosing", "adding-an-effect", "effects", "faq", "scaling"),
     "swarms",
     "tracking",
+    "scenes",
 )
 BLOCK = re.compile(r"^```python\n(?P<code>.*?)^```\n(?:\n```text\n(?P<output>.*?)^```\n)?", re.S | re.M)
 

@@ -81,7 +81,7 @@ def test_python_may_say_it_shorter():
     [
         (lambda: Sweep("randomisation", "out", workers=0), "--workers 0: must be at least 1."),
         (lambda: Sweep("randomisation", "out", retries=-1), "--retries -1: must be at least 0."),
-        (lambda: Train("targets", "out"), "--task targets: choose from target, flip."),
+        (lambda: Train("targets", "out"), "--task targets: choose from target, flip, track."),
         (lambda: Fly("pid", task="stand"), "--task stand: choose from hover"),
         (lambda: Fit("a.mcap", "model.json"), "model.json: the output is a model and must end in .yaml."),
         (lambda: Fit("a.mcap", "m.yaml", figure="f.bmp"), "f.bmp: a figure must end in"),

@@ -150,7 +150,7 @@ def accelerations_by_c(path: str, inputs: Inputs) -> Float[AnyArray, " nv"]:
     return on_host(accelerate, model.nv, _packed(inputs))
 
 
-def _packed(inputs: Inputs) -> Float[AnyArray, " numbers"]:
+def _packed(inputs: Inputs) -> Float[Array, " numbers"]:
     return jnp.concatenate([jnp.ravel(x) for x in inputs])
 
 
