@@ -238,6 +238,7 @@ def page(results: dict) -> str:
     rays = results["rays"]["rates"]
     return PAGE.format(
         facts=facts,
+        quotes='"""',
         cores=cores(),
         bodies="\n".join(of_bodies),
         worlds="\n".join(of_worlds),
@@ -267,7 +268,7 @@ import jax.numpy as jnp
 
 from cfb_mjx.model import Quadrotor, Scene
 
-Path("world.xml").write_text('''
+Path("world.xml").write_text({quotes}
 <mujoco>
   <worldbody>
     <geom name="floor" type="plane" size="0 0 1"/>
@@ -276,13 +277,13 @@ Path("world.xml").write_text('''
     <body name="ball" pos="3 0 1"><freejoint/><geom type="sphere" size="0.05" mass="0.02"/></body>
   </worldbody>
 </mujoco>
-''')
-scene = Scene("world.xml", engine="c")           # without a drone: it is added
+{quotes})
+scene = Scene("world.xml", engine="c")  # without a drone: it is added
 drone = Quadrotor.from_file("cfb-guards", dt=0.002)
 
 thrown = replace(drone.hover_state((0.2, 0.0, 1.0)), velocity=jnp.array([1.0, 0.0, 0.0]))
 state = scene.begin(drone, thrown)
-state = replace(state, mocap_positions=jnp.array([[-2.0, 0.0, 0.3]]))    # moves the platform
+state = replace(state, mocap_positions=jnp.array([[-2.0, 0.0, 0.3]]))  # moves the platform
 flown = jax.jit(scene.rollout)(drone, state, jnp.tile(drone.hover_command(), (300, 1)))
 farthest, ball = float(flown.drone.position[:, 0].max()), float(flown.positions[-1, 2])
 print(f"stopped at {{farthest:.2f}} m; the ball has fallen to {{ball:.2f}} m")
@@ -312,7 +313,7 @@ print(f"stopped at {{farthest:.2f}} m; the ball has fallen to {{ball:.2f}} m")
 ```py
 from cfb_mjx.model.scene_camera import geom_names, look
 
-image = look(scene, drone, state, "front", width=32, height=24)     # image.depth, image.geom
+image = look(scene, drone, state, "front", width=32, height=24)  # image.depth, image.geom
 ```
 
 On the race track below, with {geoms} geoms, the engine `mjx` casts {mjx_rays:.1f} M rays a second here, `c`

@@ -27,7 +27,7 @@ from cfb_mjx.envs import Layout, StateEstimate, TargetTask, figure_eight
 from cfb_mjx.files import write_json
 from cfb_mjx.model import Quadrotor, State, rollout, rollout_final
 from cfb_mjx.runtime import configure_jax, environment
-from cfb_mjx.train.flying import track
+from cfb_mjx.train.tracking import track
 
 DT_S, STEPS = 0.016, 20
 """Time between two commands, and number of commands that are planned."""

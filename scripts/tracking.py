@@ -60,8 +60,9 @@ def measured(drones: int) -> dict:
     from cfb_mjx.files import scratch
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import load_randomisation
-    from cfb_mjx.train.flying import Course, demanded, find_course, load_plants, track
+    from cfb_mjx.train.flying import load_plants
     from cfb_mjx.train.judge import Judge
+    from cfb_mjx.train.tracking import Course, demanded, find_course, track
     from cfb_mjx.view.flight import track_figure
 
     judge = Judge(random_drones=0)
@@ -233,7 +234,7 @@ import jax.numpy as jnp
 from cfb_mjx.control import find_controller
 from cfb_mjx.envs import TargetTask, demand, through
 from cfb_mjx.model import Quadrotor, balanced_thrust_to_weight
-from cfb_mjx.train.flying import track
+from cfb_mjx.train.tracking import track
 
 drone = Quadrotor.from_file("cfb-guards")
 path = through(jnp.array([[0, 0, 0], [1, 0, 0.3], [1, 1, 0], [0, 0, 0.0]]), jnp.array([0.0, 0.8, 1.6, 2.6]))

@@ -12,8 +12,8 @@ import pytest
 
 from cfb_mjx.control.controllers import find_controller, has_lumped_delay
 from cfb_mjx.envs import Starts, TargetTask, reset, step, with_room
-from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.envs.gym import TargetVectorEnv
+from cfb_mjx.envs.task import QUIET
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.parameters import Randomisation

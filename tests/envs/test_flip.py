@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cfb_mjx.envs import FlipReward, FlipTask, Setpoints, observe, reset, step
-from cfb_mjx.envs.episode import QUIET
+from cfb_mjx.envs.task import QUIET
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.parameters import load_randomisation
 

@@ -16,7 +16,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from cfb_mjx.envs import FlipStarts, FlipTask, Starts, TargetTask, reset, step
-from cfb_mjx.envs.episode import QUIET, Streams, mildness
+from cfb_mjx.envs.episode import Streams, mildness
+from cfb_mjx.envs.task import QUIET
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.model.rotors import hover_rotor_speed
 from cfb_mjx.parameters import load_randomisation

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from cfb_mjx.envs import PAPER_REWARD, Layout, Noise, Starts, TargetReward, TargetTask, observe, reset, step
-from cfb_mjx.envs.episode import QUIET
 from cfb_mjx.envs.observation import StateEstimate, frame, observation, remember, start
+from cfb_mjx.envs.task import QUIET
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, State, rollout
 from cfb_mjx.parameters import load_randomisation

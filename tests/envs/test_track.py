@@ -29,12 +29,13 @@ from cfb_mjx.envs import (
     step,
     through,
 )
-from cfb_mjx.envs.episode import QUIET
+from cfb_mjx.envs.task import QUIET
 from cfb_mjx.envs.track import _path
 from cfb_mjx.errors import CfbError
 from cfb_mjx.firmware.actions import ACTIONS
 from cfb_mjx.model import Quadrotor
-from cfb_mjx.train.flying import find_course, fly, track
+from cfb_mjx.train.flying import fly
+from cfb_mjx.train.tracking import find_course, track
 
 DRONE = Quadrotor.from_file("cfb-guards")
 TASK = TrackTask()

@@ -13,7 +13,7 @@ import pytest
 
 from cfb_mjx.control.controllers import find_controller
 from cfb_mjx.envs import TargetTask
-from cfb_mjx.envs.episode import QUIET
+from cfb_mjx.envs.task import QUIET
 from cfb_mjx.files import shipped
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_model_file

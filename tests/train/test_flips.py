@@ -12,7 +12,7 @@ from cfb_mjx.control.manoeuvre import CATCH, CLIMB, TURN, Manoeuvre, load_manoeu
 from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.deploy.deployment import find_deployment
 from cfb_mjx.envs import TargetTask
-from cfb_mjx.envs.episode import QUIET
+from cfb_mjx.envs.task import QUIET
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.gate import judge
 from cfb_mjx.model import Quadrotor

@@ -151,12 +151,12 @@ class Fly(Command):
         from cfb_mjx.control.controllers import find_controller, has_lumped_delay, is_flip_policy, is_tracking_policy
         from cfb_mjx.devices import Devices
         from cfb_mjx.envs import Noise, TargetTask
-        from cfb_mjx.envs.episode import QUIET, with_room
+        from cfb_mjx.envs.task import QUIET, with_room
         from cfb_mjx.model import Quadrotor, require_possible
         from cfb_mjx.parameters import load_model_file, load_randomisation
         from cfb_mjx.train.flips import FLIPS
-        from cfb_mjx.train.flying import demanded, find_course
         from cfb_mjx.train.measuring import measured
+        from cfb_mjx.train.tracking import demanded, find_course
 
         name, task = self.controller, self.task
         if task is None and name in FLIPS:

@@ -22,7 +22,8 @@ from cfb_mjx.deploy.compiled import FLAGS, CompiledPolicy, compile_policy
 from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.deploy.export import Exported
 from cfb_mjx.envs import StateEstimate, TargetTask, Task
-from cfb_mjx.envs.episode import Episode, reset, step, with_room
+from cfb_mjx.envs.episode import Episode, reset, step
+from cfb_mjx.envs.task import with_room
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
 from cfb_mjx.optional import not_none

@@ -1,6 +1,6 @@
 """Tasks for training: observations, rewards, and how episodes begin and end."""
 
-from cfb_mjx.envs.episode import Episode, Noise, Starts, Task, observe, privileged, reset, step, with_room
+from cfb_mjx.envs.episode import Episode, observe, privileged, reset, step
 from cfb_mjx.envs.flip import FlipReward, FlipStarts, FlipTask, Setpoints
 from cfb_mjx.envs.observation import Layout, Memory, StateEstimate
 from cfb_mjx.envs.path import (
@@ -15,7 +15,9 @@ from cfb_mjx.envs.path import (
     through,
 )
 from cfb_mjx.envs.reward import PAPER_REWARD, TargetReward
+from cfb_mjx.envs.starts import Starts
 from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.envs.task import Noise, Task, with_room
 from cfb_mjx.envs.track import Paths, TrackTask
 
 __all__ = [

@@ -18,9 +18,10 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 
-from cfb_mjx.envs.episode import Episode, Task, choose, observe, privileged, reset, step, with_room
+from cfb_mjx.envs.episode import Episode, choose, observe, privileged, reset, step
 from cfb_mjx.envs.reward import length
 from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.envs.task import Task, with_room
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.randomised import require_possible
 from cfb_mjx.quiet import quietly

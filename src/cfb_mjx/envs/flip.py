@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cfb_mjx.envs.episode import Task
 from cfb_mjx.envs.observation import Layout, rotation_matrix
 from cfb_mjx.envs.reward import length, too_fast, triangle
+from cfb_mjx.envs.task import Task
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import hover_rotor_speed
 from cfb_mjx.model.state import AnyArray, State

@@ -22,9 +22,10 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from cfb_mjx.envs.episode import Episode, Outcome, Task, choose, observe, reset, step, with_room
+from cfb_mjx.envs.episode import Episode, Outcome, choose, observe, reset, step
 from cfb_mjx.envs.flip import FlipTask
 from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.envs.task import Task, with_room
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.randomised import require_possible

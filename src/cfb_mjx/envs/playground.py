@@ -22,9 +22,10 @@ from jaxtyping import Array, Float
 from mujoco import mjx
 
 from cfb_mjx.envs.brax_env import BraxEnv
-from cfb_mjx.envs.episode import Episode, Task
+from cfb_mjx.envs.episode import Episode
 from cfb_mjx.envs.flip import FlipTask
 from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.envs.task import Task
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
 from cfb_mjx.model.mjx_body import BODY_NAME

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from cfb_mjx.envs.episode import Starts, Task, draw
 from cfb_mjx.envs.reward import TargetReward, length
+from cfb_mjx.envs.starts import Starts, draw
+from cfb_mjx.envs.task import Task
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State
 from cfb_mjx.parameters import Parameters

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from cfb_mjx.envs.episode import Starts, draw
 from cfb_mjx.envs.observation import Layout
 from cfb_mjx.envs.path import Harmonics
+from cfb_mjx.envs.starts import Starts, draw
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import State

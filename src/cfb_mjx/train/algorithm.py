@@ -10,7 +10,8 @@ import jax
 from jaxtyping import PRNGKeyArray
 
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.envs.episode import Episode, Task, reset
+from cfb_mjx.envs.episode import Episode, reset
+from cfb_mjx.envs.task import Task
 from cfb_mjx.model.quadrotor import Quadrotor
 
 

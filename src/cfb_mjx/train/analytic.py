@@ -19,7 +19,8 @@ from jaxtyping import Array, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.devices import Devices
-from cfb_mjx.envs.episode import Episode, Task, choose, observe, reset, step
+from cfb_mjx.envs.episode import Episode, choose, observe, reset, step
+from cfb_mjx.envs.task import Task
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.train.algorithm import in_progress, strong
 from cfb_mjx.train.config import AnalyticSettings

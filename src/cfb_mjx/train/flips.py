@@ -19,9 +19,10 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.control.manoeuvre import CATCH, Knobs, Manoeuvre, roll_angle, unwrapped
 from cfb_mjx.control.neural import NeuralController
-from cfb_mjx.envs.episode import QUIET, observe, reset, step, with_room
+from cfb_mjx.envs.episode import observe, reset, step
 from cfb_mjx.envs.flip import FlipTask, deviations
 from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.envs.task import QUIET, with_room
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rollout import rollout

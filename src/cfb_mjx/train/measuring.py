@@ -17,7 +17,16 @@ from cfb_mjx.devices import Devices
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.train.flips import FLIPS, flips
-from cfb_mjx.train.flying import TESTS, Course, Flight
+from cfb_mjx.train.flying import Flight, hover, recovery, six_metres
+from cfb_mjx.train.tracking import Course, track
+
+TESTS: dict[str, Callable[..., tuple[Any, Flight]]] = {
+    "hover": hover,
+    "step": six_metres,
+    "recover": recovery,
+    "track": track,
+}
+"""Tests by name; each takes controller, task, nominal drone and keys, and returns measurements and flights."""
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
@@ -35,7 +44,7 @@ def measured(
     Args:
         test: name in `TESTS` or `FLIPS`.
         controller: the controller; a manoeuvre for a flip.
-        task: determines the drones and the noise; with room for its delays (`cfb_mjx.envs.episode.with_room`).
+        task: determines the drones and the noise; with room for its delays (`cfb_mjx.envs.task.with_room`).
         keys: one key per flight.
         over: devices that share the flights.
         course: what to track, for the test ``track``; default: a figure eight.

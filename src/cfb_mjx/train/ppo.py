@@ -21,7 +21,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import Network, NeuralController
 from cfb_mjx.devices import Devices
-from cfb_mjx.envs.episode import Episode, Task, choose, observe, privileged, reset, step
+from cfb_mjx.envs.episode import Episode, choose, observe, privileged, reset, step
+from cfb_mjx.envs.task import Task
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.train.algorithm import in_progress, strong
 from cfb_mjx.train.brax_compat import parts

@@ -36,7 +36,8 @@ from cfb_mjx.train.card import training_card
 from cfb_mjx.train.checkpoint import load_state, read_about, save_checkpoint
 from cfb_mjx.train.config import TrainingConfig
 from cfb_mjx.train.flips import turning
-from cfb_mjx.train.flying import hover, nominal_task, track
+from cfb_mjx.train.flying import hover, nominal_task
+from cfb_mjx.train.tracking import track
 
 CHECKPOINT, POLICY, CURVE, CONFIG = "checkpoint.npz", "policy.npz", "curve.csv", "config.yaml"
 BEST, UPDATES = "best.npz", "updates.csv"
