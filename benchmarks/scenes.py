@@ -8,6 +8,7 @@ Writes ``docs/scenes.md``, ``docs/scenes.png`` and ``benchmarks/scenes.json``. T
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import subprocess
 import sys
@@ -19,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from cfb_mjx.files import write_text
+from cfb_mjx.files import scratch, write_text
 from cfb_mjx.runtime import cores, environment, say
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -63,7 +64,9 @@ def main() -> None:
 
     path = ROOT / "docs" / "scenes.md"
     write_text(path, page(results))
-    write_text(path, page_outputs.written(path.read_text(), page_outputs.run(path)))
+    with scratch("cfb-scenes-") as folder, contextlib.chdir(folder):
+        printed = page_outputs.run(path)
+    write_text(path, page_outputs.written(path.read_text(), printed))
 
 
 def _rates(functions: dict, amount: dict) -> dict[str, float]:
@@ -124,7 +127,6 @@ def bodies() -> dict:
 
 def worlds() -> dict:
     """Scenes in both engines, beside `mujoco.batch` alone."""
-    from cfb_mjx.files import scratch
     from cfb_mjx.model import Quadrotor, Scene
 
     found, counts = {}, {"mjx": 128, "c": 1024, "mujoco.batch alone": 1024}
@@ -143,7 +145,6 @@ def worlds() -> dict:
 
 def rays() -> dict:
     """Rays per second of a depth camera at the race track."""
-    from cfb_mjx.files import scratch
     from cfb_mjx.model import Quadrotor, Scene
     from cfb_mjx.model.scene_camera import look
 
@@ -177,7 +178,6 @@ def race() -> dict:
     import gate_race
 
     from cfb_mjx.control import load_policy
-    from cfb_mjx.files import scratch
     from cfb_mjx.model import Quadrotor
 
     with scratch("cfb-scenes-") as folder:
