@@ -16,7 +16,17 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.runtime import environment, set_up_xla
 
-POLICIES = ("target", "target-analytic", "target-adaptive", "flip", "double-flip", "triple-flip", "double-flip-ppo")
+POLICIES = (
+    "target",
+    "target-analytic",
+    "target-adaptive",
+    "track",
+    "track-rates",
+    "flip",
+    "double-flip",
+    "triple-flip",
+    "double-flip-ppo",
+)
 NUMBERS, PAGE = ROOT / "benchmarks" / "deploying.json", ROOT / "docs" / "deploying.md"
 
 
@@ -107,10 +117,11 @@ too.
 ```c
 void cfb_policy_reset(void);
 void cfb_policy_step(const float position[3], const float velocity[3], const float quaternion_wxyz[4],
-                     const float body_rate[3], const float target[3], float motor_command[4]);
+                     const float body_rate[3], const float target[3], float command[4]);
 float cfb_policy_dt(void);
 cfb_fault_t cfb_policy_fault(void);                             /* fine, blind, stopped */
 
+void cfb_policy_set_preview(const float ahead[]);               /* tracking only: where the target will be */
 void cfb_policy_set_flip(float v_target, float rate_target);    /* flips only: begin one */
 cfb_phase_t cfb_policy_phase(void);                             /* hold, climb, turn, catch */
 ```
@@ -121,6 +132,9 @@ estimate is not finite, if steps are missed or if the set-point disappears; `tes
 
 ## What the firmware does between the policy and the motors
 
+- A policy that commands set-points (`track-rates`: thrust and body rates) leaves the motors to the firmware's own loops:
+  the app hands thrust and rates to its rate loop, attitudes, velocities and positions to its PID, in the firmware's
+  units and signs. The rest of this section is about policies that command the motors.
 - The app uses `controlModeForce` with `normalizedForces`, which the firmware passes to the motors as fractions of
   65535. This fraction is the `u` of the model ([conventions](conventions.md)). It is proportional to the voltage, not
   to the thrust.
