@@ -132,9 +132,9 @@ estimate is not finite, if steps are missed or if the set-point disappears; `tes
 
 ## What the firmware does between the policy and the motors
 
-- A policy that commands set-points (`track-rates`: thrust and body rates) leaves the motors to the firmware's own loops:
-  the app hands thrust and rates to its rate loop, attitudes, velocities and positions to its PID, in the firmware's
-  units and signs. The rest of this section is about policies that command the motors.
+- A policy that commands set-points (`track-rates`: thrust and body rates) leaves the motors to the firmware's own
+  loops: the app hands thrust and rates to its rate loop, attitudes, velocities and positions to its PID, in the
+  firmware's units and signs. The rest of this section is about policies that command the motors.
 - The app uses `controlModeForce` with `normalizedForces`, which the firmware passes to the motors as fractions of
   65535. This fraction is the `u` of the model ([conventions](conventions.md)). It is proportional to the voltage, not
   to the thrust.

@@ -234,6 +234,31 @@ def test_what_is_flown_through_is_said(write):
 
 
 @mjx
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_touch_between_two_returned_states_is_not_lost(worlds, drone, engine):
+    """Another project's gate was hit, and the one state that was returned after it said that nothing was touched."""
+    scene = worlds[0][engine]
+    start = replace(drone.hover_state((0.35, 0.0, 1.0)), velocity=jnp.array([1.0, 0.0, 0.0]))
+    commands = _commands(drone, 200)
+    fly = jax.jit(lambda state: scene.rollout(drone, state, commands, every=100), compiler_options=QUICK)
+    flown = fly(scene.begin(drone, start))
+    touched = np.abs(np.asarray(flown.constraint)).max(axis=1)
+    assert touched[0] > 0.1
+    assert float(flown.drone.velocity[0, 0]) < 0.5
+
+
+def test_what_acts_beside_the_model_is_said(write, drone):
+    thick = WORLD.replace("<worldbody>", '<option density="1.2" timestep="0.0005"/><worldbody>')
+    path = write(thick, "thick.xml")
+    with pytest.warns(CfbWarning, match="MuJoCo's drag"):
+        scene = Scene(path, "c")
+    with pytest.warns(
+        CfbWarning, match="asks for steps of 0.5 ms, and is stepped every 2 ms; give the drone substeps=4"
+    ):
+        scene.begin(drone, drone.hover_state((0.0, 5.0, 1.0)))
+
+
+@mjx
 def test_the_c_engine_says_that_it_has_no_derivatives(worlds, drone):
     scene = worlds[0]["c"]
     state = scene.begin(drone, drone.hover_state((0.0, 5.0, 1.0)))

@@ -52,7 +52,7 @@ def compiled_scene(path: str) -> mujoco.MjModel:
         CfbError: MuJoCo cannot compile it, or its body ``cfb`` has other joints than one free joint.
 
     Warns:
-        CfbWarning: the drone cannot touch some of its geoms.
+        CfbWarning: the drone cannot touch some of its geoms, or MuJoCo's drag acts on it.
     """
     spec = specification(path)
     body = spec.body(BODY_NAME)
@@ -63,6 +63,13 @@ def compiled_scene(path: str) -> mujoco.MjModel:
     if body.jntnum[0] != 1 or model.jnt_type[body.jntadr[0]] != mujoco.mjtJoint.mjJNT_FREE:
         raise CfbError(f"{path}: body '{BODY_NAME}' must have one joint, a free joint.")
     warn_of_untouched(path, model)
+    if model.opt.density or model.opt.viscosity:
+        warnings.warn(
+            f"{path}: MuJoCo's drag (density, viscosity) acts on the drone too, beside the effects of its model; leave "
+            "them out if the model has rotor_drag or parasitic_drag.",
+            CfbWarning,
+            stacklevel=4,
+        )
     return model
 
 

@@ -11,6 +11,7 @@ derivatives) and ``c`` (MuJoCo's own C by `mujoco.batch`, on the CPU, no derivat
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -22,7 +23,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfb_mjx.errors import CfbError
+from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.model import rotors
 from cfb_mjx.model.mjcf import BODY_NAME, compiled_scene
 from cfb_mjx.model.quadrotor import (
@@ -55,7 +56,8 @@ class SceneState(eqx.Module):
     mocap_quaternions: Float[AnyArray, "*batch mocaps 4"]
     time: Float[AnyArray, "*batch"]
     constraint: Float[AnyArray, "*batch 6"]
-    """Force [N, world] and torque [N m, body] of contacts and cables on the drone in the step before this state."""
+    """Force [N, world] and torque [N m, body] of contacts and cables on the drone: the largest since the last state
+    that was returned, whatever was between. Zero: nothing was touched."""
 
 
 class Scene:
@@ -71,7 +73,8 @@ class Scene:
         CfbError: the MJCF cannot be compiled, its body ``cfb`` has other joints, or it has a feature that MJX lacks.
 
     Warns:
-        CfbWarning: the drone cannot touch some of its geoms (``contype`` and ``conaffinity``).
+        CfbWarning: the drone cannot touch some of its geoms (``contype`` and ``conaffinity``), or MuJoCo's own drag
+            acts on the drone (``density`` and ``viscosity``).
     """
 
     def __init__(self, mjcf: str | Path, engine: Literal["mjx", "c"] = "mjx"):
@@ -89,7 +92,11 @@ class Scene:
         Args:
             drone: the drone, for the memory of its effects.
             state: state of the drone.
+
+        Warns:
+            CfbWarning: the MJCF asks for shorter steps than the drone's.
         """
+        self._warn_of_steps(drone)
         model, data = self.mujoco_model, mujoco.MjData(self.mujoco_model)
         mujoco.mj_resetData(model, data)
         kind = jnp.asarray(state.position).dtype
@@ -111,7 +118,7 @@ class Scene:
         The integrator is the one of the MJCF's option, with steps of ``drone.dt / drone.substeps``; ``drone.body`` and
         ``drone.integrator`` are not used.
         """
-        return self._advanced(prepare(drone), state, Vec.unstack(command))
+        return self._advanced(prepare(drone), _untouched(state), Vec.unstack(command))
 
     def rollout(
         self, drone: Quadrotor, state: SceneState, commands: Float[Array, "steps 4"], *, hold: int = 1, every: int = 1
@@ -133,7 +140,7 @@ class Scene:
             return jax.lax.scan(again, state, length=hold)[0], None
 
         def some(state, rows):
-            state = jax.lax.scan(one, state, rows)[0]
+            state = jax.lax.scan(one, _untouched(state), rows)[0]
             return state, state
 
         return jax.lax.scan(some, state, commands.reshape(steps // every, every, 4))[1]
@@ -164,6 +171,8 @@ class Scene:
             pushed = (velocity - at.velocity) * prepared.rotors.inverse_dt
             memory = advanced(prepared, felt, pushed)
         after = replace(stack(replace(unstack(after, center), memory=memory), center), quaternion=pose[3:])
+        force = moved.constraint[self._velocities[0]]
+        larger = jnp.sum(force**2) > jnp.sum(jnp.asarray(state.constraint) ** 2)
         return SceneState(
             after,
             moved.positions[self._positions[1]],
@@ -173,7 +182,7 @@ class Scene:
             state.mocap_positions,
             state.mocap_quaternions,
             state.time + jnp.asarray(prepared.dt, state.positions.dtype),
-            moved.constraint[self._velocities[0]],
+            jnp.where(larger, force, state.constraint),
         )
 
     def inputs(self, prepared: Prepared, state: SceneState, force: Float[Array, "6"] | None = None) -> Inputs:
@@ -201,6 +210,17 @@ class Scene:
             jnp.stack([parameters.mass, parameters.gravity]),
         )
 
+    def _warn_of_steps(self, drone: Quadrotor) -> None:
+        """MJCFs that do not say ask for MuJoCo's 2 ms, which stiff contacts need; only what was chosen is told."""
+        own, asked = drone.dt / drone.substeps, float(self.mujoco_model.opt.timestep)
+        if own > 1.01 * asked and asked != mujoco.MjModel.from_xml_string("<mujoco/>").opt.timestep:
+            warnings.warn(
+                f"{self.mjcf}: asks for steps of {1e3 * asked:g} ms, and is stepped every {1e3 * own:g} ms; give the "
+                f"drone substeps={-int(-drone.dt // asked)} if things shake or fall through each other.",
+                CfbWarning,
+                stacklevel=3,
+            )
+
     def _whole(self, places: tuple[np.ndarray, np.ndarray], own: Array, others: AnyArray) -> Array:
         """Numbers of the drone and of the others, in MuJoCo's order."""
         return jnp.zeros(len(own) + len(others), own.dtype).at[places[0]].set(own).at[places[1]].set(others)
@@ -213,6 +233,10 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"Scene({self.mjcf!r}, engine={self.engine!r})"
+
+
+def _untouched(state: SceneState) -> SceneState:
+    return replace(state, constraint=jnp.zeros_like(state.constraint))
 
 
 def _span(first: int, count: int, total: int) -> tuple[np.ndarray, np.ndarray]:
