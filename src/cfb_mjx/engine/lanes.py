@@ -81,7 +81,7 @@ class _Lanes:
         self.prepare = not_none(scalars.trace(prepared, *examples, elementwise=HELD))
         (self.structure,) = structure
         self.prepared = self.prepared_from(self.model)
-        shapes = [x.shape for x in self.prepare.traced.out_avals]
+        shapes = [np.shape(x) for x in self.prepare.traced.out_avals]
         self.prepared_axes = [-1 if x.ndim > len(s) else None for x, s in zip(self.prepared, shapes, strict=True)]
 
     def _whole(self, state: Sequence, model: Sequence) -> tuple[Any, Any, Any]:
@@ -258,7 +258,7 @@ def pulled(flight, batched, moving, lanes, packed, *operands):
     if early:
         shapes = [[()] * len(model[i]) for i in moved]
     else:
-        shapes = [drones.prepare.traced.out_avals[i].shape for i in which]
+        shapes = [np.shape(drones.prepare.traced.out_avals[i]) for i in which]
     zeros = jax.tree.map(lambda s: jnp.zeros((*s, lanes), dtype), shapes, is_leaf=lambda s: isinstance(s, tuple))
     of_kept = zip(operands[flight.arrays :], batched[flight.arrays :], strict=True)
     given = [_each(x, b, lanes) for x, b in of_kept], kept, drones.rows

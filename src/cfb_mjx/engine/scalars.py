@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Literal  # pyright: ignore[reportPrivateImportUsage]  # jax 0.12 hides it
 
 _ELEMENTWISE = """
     abs add and ceil clamp convert_element_type cos div eq exp expm1 floor ge gt integer_pow is_finite le log log1p lt

@@ -76,7 +76,7 @@ def predicted(flight: Flight, said: Replay, gravity: float) -> Signals:
     dt = flight.interval[:, None]
     middle = between(flight.quaternion)
     middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)
-    world = to_world(middle, np.asarray(said.specific_force))
+    world = to_world(np.asarray(middle), np.asarray(said.specific_force))
     up = np.array([0.0, 0.0, gravity])
 
     def summed(rate):
