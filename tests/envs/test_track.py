@@ -34,6 +34,7 @@ from cfb_mjx.envs.track import _path
 from cfb_mjx.errors import CfbError
 from cfb_mjx.firmware.actions import ACTIONS
 from cfb_mjx.model import Quadrotor
+from cfb_mjx.train.config import load_config
 from cfb_mjx.train.flying import fly
 from cfb_mjx.train.tracking import find_course, track
 
@@ -268,3 +269,13 @@ def test_a_path_can_be_a_function_of_ones_own():
         lambda key: fly(controller, TargetTask(), DRONE, key, 3.0, DRONE.hover_state((0.0, 0.0, 0.0)), path=line)
     )(jax.random.PRNGKey(0))
     assert np.linalg.norm(np.asarray(flown.position - flown.watched)[-100:], axis=1).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    "change",
+    ["paths.lap_s=[3.0]", "paths.lap_s=[4.0,2.0]", "paths.lap_s=[0.0,2.0]", "paths.size_m=0", "paths.eights=1.5",
+     "paths.thrust_to_weight=1.0", "observation.preview_s=[]", "observation.action=torques"],
+)  # fmt: skip
+def test_paths_that_cannot_be_drawn_are_refused(change):
+    with pytest.raises(CfbError, match=change.partition("=")[0]):
+        load_config("track", (change,))

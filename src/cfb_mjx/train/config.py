@@ -375,7 +375,8 @@ _POSITIVE_OF = {
     ),
     "flip": ("reward.axis_width", "analytic.cost.axis_width", "analytic.cost.body_rate_width_radps"),
 }
-_PAIRS = ("setpoints.speed_mps", "setpoints.rate_radps", "starts.rotor_speed")
+_POSITIVE_OF["track"] = (*_POSITIVE_OF["target"], "observation.preview_scale_m", "paths.size_m")
+_PAIRS = {"flip": ("setpoints.speed_mps", "setpoints.rate_radps", "starts.rotor_speed"), "track": ("paths.lap_s",)}
 
 
 def _require_sense(config: TrainingConfig, where: str) -> None:
@@ -383,16 +384,22 @@ def _require_sense(config: TrainingConfig, where: str) -> None:
         if _at(config, key) < least:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be at least {least}.")
     require_seed(config.seed, f"{where}: seed =")
-    for key in _POSITIVE + _POSITIVE_OF["flip" if config.task == "flip" else "target"]:
+    for key in _POSITIVE + _POSITIVE_OF[config.task]:
         if not _at(config, key) > 0:
             raise CfbError(f"{where}: {key} = {_at(config, key)} must be positive.")
-    if config.task == "flip":
-        for key in _PAIRS:
-            pair = _at(config, key)
-            if len(pair) != 2 or pair[0] > pair[1]:
-                raise CfbError(f"{where}: {key} must be two numbers, the smaller first, found {told(list(pair))}.")
-        if isinstance(config.reward, FlipReward) and len(config.reward.axis_direction) != 3:
-            raise CfbError(f"{where}: reward.axis_direction must be three numbers.")
+    for key in _PAIRS.get(config.task, ()):
+        pair = _at(config, key)
+        if len(pair) != 2 or pair[0] > pair[1]:
+            raise CfbError(f"{where}: {key} must be two numbers, the smaller first, found {told(list(pair))}.")
+    if isinstance(config, TrackTrainingConfig):
+        paths = config.paths
+        if not (paths.lap_s[0] > 0 and paths.thrust_to_weight > 1 and 0 <= paths.eights <= 1):
+            raise CfbError(
+                f"{where}: paths.lap_s must be positive, paths.thrust_to_weight larger than 1, and paths.eights "
+                "between 0 and 1."
+            )
+    if config.task == "flip" and isinstance(config.reward, FlipReward) and len(config.reward.axis_direction) != 3:
+        raise CfbError(f"{where}: reward.axis_direction must be three numbers.")
     if len(config.observation.setpoint_scales) != (2 if config.task == "flip" else 0):
         raise CfbError(f"{where}: observation.setpoint_scales needs one number for each set-point of {config.task}.")
     if (
