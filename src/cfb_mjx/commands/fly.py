@@ -195,7 +195,7 @@ class Fly(Command):
         numbers |= {"magnitude": self.magnitude, "gyro": "late" if course.lumped_delay else "local"}
         if way is not None:
             numbers["path"] = {"name": self.path or "figure-eight", "timescale": self.timescale, **demanded(way)}
-            _require_feasible(numbers["path"], nominal)
+            _warn_if_infeasible(numbers["path"], nominal)
         if manoeuvre is not None:
             numbers["knobs"] = {name: float(x) for name, x in manoeuvre.knobs._asdict().items() if np.isfinite(x)}
         found, flown = self._measured(fly, described, nominal)
@@ -303,7 +303,7 @@ class Fly(Command):
         return manoeuvre
 
 
-def _require_feasible(path: Mapping[str, Any], nominal: Quadrotor) -> None:
+def _warn_if_infeasible(path: Mapping[str, Any], nominal: Quadrotor) -> None:
     """Warn if a path asks for more thrust than the drone has."""
     import warnings
 

@@ -12,10 +12,8 @@ import numpy as np
 from cfb_mjx.control.manoeuvre import Manoeuvre, ManoeuvreFile, load_manoeuvre, shipped_manoeuvres
 from cfb_mjx.control.neural import NeuralController
 from cfb_mjx.control.policy_file import SUFFIXES, PolicyFile, load_policy, shipped_policies
-from cfb_mjx.envs.episode import settled_output
-from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.errors import CfbError
-from cfb_mjx.firmware.actions import ACTIONS
+from cfb_mjx.firmware.actions import ACTIONS, Action
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.optional import not_none
 from cfb_mjx.parameters.model_file import load_model_file
@@ -83,16 +81,18 @@ class Deployment:
         """Command at which the drone of the training hovers, mean of the motors."""
         return float(np.mean(self.plant().hover_command()))
 
+    @property
+    def action(self) -> Action:
+        """What the policy's outputs mean."""
+        return ACTIONS[self.holder.controller.layout.action]
+
     def settled(self) -> np.ndarray:
         """Outputs of the network, (4,), 0 to 1, that its history is filled with: those of a hover."""
-        model = self.plant()
-        task = TargetTask(layout=self.holder.controller.layout)
-        return np.asarray(settled_output(task, jnp.full(4, jnp.mean(model.hover_command()))))
+        return np.asarray(self.action.settled(jnp.full(4, self.hover_command())))
 
     def outputs(self, commands: np.ndarray) -> np.ndarray:
         """Outputs of the network, 0 to 1, from commands of the C in their units; both (..., 4)."""
-        low, high = np.array([(x.low, x.high) for x in ACTIONS[self.holder.controller.layout.action].outputs]).T
-        return ((commands - low) / (high - low)).astype(np.float32)
+        return self.action.fractions(commands).astype(np.float32)
 
     def plant(self) -> Quadrotor:
         """Drone of the training, without effects; the paper's with guards if the policy's file does not say."""

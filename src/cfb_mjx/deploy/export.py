@@ -15,7 +15,6 @@ from cfb_mjx.control.policy_file import PolicyFile
 from cfb_mjx.deploy.contract import BLIND_STEPS, FROZEN_STEPS, LARGEST, contract
 from cfb_mjx.deploy.deployment import CATCH_S, Deployment
 from cfb_mjx.files import output_folder, plain, remove, together, write_texts
-from cfb_mjx.firmware.actions import ACTIONS
 from cfb_mjx.optional import not_none
 
 FIXED = ("cfb_network.h", "cfb_network.c", "cfb_pilot.h", "cfb_policy.h", "cfb_policy.c", "controller_out_of_tree.c")
@@ -232,7 +231,7 @@ def _header(deployment: Deployment) -> str:
         "CFB_HOVER_OUTPUTS": "{" + ", ".join(map(literal, deployment.settled())) + "}",
     }
     layout = deployment.holder.controller.layout
-    outputs = ACTIONS[layout.action].outputs
+    outputs = deployment.action.outputs
     values |= {
         f"CFB_{end.upper()}": "{" + ", ".join(literal(getattr(each, end)) for each in outputs) + "}"
         for end in ("low", "high")

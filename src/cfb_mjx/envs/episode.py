@@ -20,7 +20,7 @@ from cfb_mjx.envs.observation import Memory, StateEstimate
 from cfb_mjx.envs.task import Task, room_s
 from cfb_mjx.firmware.actions import InnerLoop, start
 from cfb_mjx.firmware.actions import command as follow
-from cfb_mjx.firmware.pid import DT, FirmwarePid
+from cfb_mjx.firmware.pid import FirmwarePid
 from cfb_mjx.model.delay import DelayLine
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
 from cfb_mjx.model.randomised import differences, require_possible, sample_drone
@@ -123,8 +123,7 @@ def reset(
             delays that can be drawn, or these are unknown because the model is traced.
     """
     room = room_s(task, nominal, magnitude)
-    if task.action.has_loop:
-        nominal = replace(nominal, dt=DT)
+    nominal = task.stepped(nominal)
     streams = Streams.of(key)
     model = nominal
     if task.randomisation is not None:
@@ -142,19 +141,13 @@ def reset(
     past = DelayLine.filled(_pose(state), model.dt, room)
     estimate = _estimate(task, model, past, target, streams.first_estimate)
     motors = settled_command(model, state)
-    memory = seen.start(task.layout, estimate, settled_output(task, motors))
-    # The firmware was set for the nominal drone, not for the one that is flown.
-    loop = start(task.action, FirmwarePid.hovering(nominal.changed_parameters()), state)
+    memory = seen.start(task.layout, estimate, task.action.settled(motors))
+    loop = None
+    if task.action.has_loop:
+        # The firmware was set for the nominal drone, not for the one that is flown.
+        loop = start(task.action, FirmwarePid.hovering(nominal.changed_parameters()), state)
     count = jnp.asarray(0)
     return Episode(model, state, origin, target, setpoint, past, memory, estimate, count, streams.noise, motors, loop)
-
-
-def settled_output(task: Task, motors: Float[Array, "4"]) -> Float[Array, "4"]:
-    """Outputs of a policy that has long commanded what the motors do now, with any set-point of its loop at rest."""
-    if not task.action.has_loop:
-        return motors
-    rest = jnp.full(4, 0.5, motors.dtype)
-    return rest.at[0].set(jnp.mean(motors)) if task.layout.action in ("body_rates", "attitude") else rest
 
 
 def mildness(task: Task, key: PRNGKeyArray) -> Float[Array, ""] | float:

@@ -6,7 +6,6 @@ A path is any function from a time [s] to a position (3,) [m] that JAX can diffe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path as File
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -185,6 +184,11 @@ class Demand(NamedTuple):
     """Rate at which the thrust has to change its direction."""
 
 
+def derivative(of: Path) -> Path:
+    """Return the derivative of a path by time: its velocity; of that, its acceleration."""
+    return lambda time_s: jax.jvp(of, (time_s,), (jnp.ones_like(time_s),))[1]
+
+
 def demand(path: Path, times_s: Float[AnyArray, " times"], gravity: float = 9.81) -> Demand:
     """Return what a path asks of a drone, from the derivatives of the path (differential flatness).
 
@@ -193,10 +197,6 @@ def demand(path: Path, times_s: Float[AnyArray, " times"], gravity: float = 9.81
         times_s: times, s.
         gravity: gravitational acceleration, m/s^2.
     """
-
-    def derivative(of: Callable) -> Callable:
-        return lambda time: jax.jvp(of, (time,), (jnp.ones_like(time),))[1]
-
     velocity = derivative(path)
     acceleration = derivative(velocity)
 

@@ -66,13 +66,13 @@ class Task:
         """Number of commands in a full episode."""
         return round(self.episode_s / self.layout.control_dt_s)
 
-    def hold(self, model: Quadrotor) -> int:
-        """Number of simulation steps per command; raises as `Quadrotor.steps_per_command`.
+    def stepped(self, model: Quadrotor) -> Quadrotor:
+        """The model with the steps of the task: beneath a policy a loop of the firmware runs every 2 ms."""
+        return replace(model, dt=DT) if self.action.has_loop else model
 
-        With a loop of the firmware beneath the policy, the drone is stepped with that loop, every 2 ms.
-        """
-        model = replace(model, dt=DT) if self.action.has_loop else model
-        return model.steps_per_command(self.layout.control_dt_s)
+    def hold(self, model: Quadrotor) -> int:
+        """Number of simulation steps per command; raises as `Quadrotor.steps_per_command`."""
+        return self.stepped(model).steps_per_command(self.layout.control_dt_s)
 
     @property
     def largest_reward(self) -> float:
@@ -99,6 +99,10 @@ class Task:
     def target_velocity(self, setpoint: Float[Array, " setpoints"]) -> Float[Array, "3"]:
         """Velocity of the target, world, m/s; by default zero."""
         return jnp.zeros(3, setpoint.dtype)
+
+    def relative(self, state: State, setpoint: Float[Array, " setpoints"]) -> State:
+        """The state with a velocity relative to the target's, for rewards and costs of a target that moves."""
+        return replace(state, velocity=state.velocity - self.target_velocity(setpoint))
 
     def shown(self, setpoint: Float[Array, " setpoints"]) -> Float[Array, " shown"]:
         """What the policy sees of the set-point: ``layout.shown`` numbers; by default the set-point."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from cfb_mjx.envs.observation import Layout
-from cfb_mjx.envs.path import Harmonics
+from cfb_mjx.envs.path import Harmonics, derivative
 from cfb_mjx.envs.starts import Starts, draw
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
@@ -87,7 +87,7 @@ class TrackTask(TargetTask):
 
     def target_velocity(self, setpoint: Float[Array, " setpoints"]) -> Float[Array, "3"]:
         """Velocity along the path, m/s."""
-        return _derivative(_path(setpoint))(setpoint[0])
+        return derivative(_path(setpoint))(setpoint[0])
 
     def shown(self, setpoint: Float[Array, " setpoints"]) -> Float[Array, " shown"]:
         """Displacements of the target from now until each of ``layout.preview_s`` later, m."""
@@ -99,7 +99,7 @@ class TrackTask(TargetTask):
     ) -> State:
         """Draw an initial state about the path's position, velocity and attitude."""
         drawn, path = draw(self.starts, model, target, key), _path(setpoint)
-        force = _derivative(_derivative(path))(setpoint[0]) + jnp.array([0.0, 0.0, 9.81])
+        force = derivative(derivative(path))(setpoint[0]) + jnp.array([0.0, 0.0, 9.81])
         x, y, z = force / jnp.sqrt(jnp.sum(force**2))
         # The shortest turn that takes the body's z axis there.
         turn = Vec(1 + z, -y, x, 0.0) * (1 / jnp.sqrt(2 * jnp.maximum(1 + z, 1e-3)))
@@ -115,22 +115,15 @@ class TrackTask(TargetTask):
         parameters: Parameters,
     ) -> Float[Array, ""]:
         """Reward of the state from ``reward``, with velocities relative to the target's."""
-        relative = replace(state, velocity=state.velocity - self.target_velocity(setpoint))
-        return self.reward(relative, target, command, parameters)
+        return self.reward(self.relative(state, setpoint), target, command, parameters)
 
     def errors(
         self, state: State, target: Float[Array, "3"], setpoint: Float[Array, " setpoints"]
     ) -> Float[Array, "3"]:
         """Errors of position and velocity, and the body rate."""
-        return super().errors(
-            replace(state, velocity=state.velocity - self.target_velocity(setpoint)), target, setpoint
-        )
+        return super().errors(self.relative(state, setpoint), target, setpoint)
 
 
 def _path(setpoint: Float[Array, " setpoints"]) -> Harmonics:
     sine, cosine = setpoint[2:].reshape(2, _HARMONICS, 3)
     return Harmonics(setpoint[1], sine, cosine, jnp.zeros_like(setpoint[1]))
-
-
-def _derivative(path):
-    return lambda time: jax.jvp(path, (time,), (jnp.ones_like(time),))[1]

@@ -36,10 +36,12 @@ class Action:
 
     Attributes:
         name: name in configurations and policy files.
+        words: what the policy commands, for texts.
         outputs: the four outputs.
     """
 
     name: str
+    words: str
     outputs: tuple[Output, ...]
 
     @property
@@ -49,8 +51,30 @@ class Action:
 
     def values(self, outputs: Float[Array, "4"]) -> Float[Array, "4"]:
         """The policy's ``outputs`` [0 to 1] in the units of `outputs`."""
+        low, span = (jnp.asarray(x, outputs.dtype) for x in self._range)
+        return low + span * outputs
+
+    def fractions(self, values: np.ndarray) -> np.ndarray:
+        """Undo `values`: outputs from 0 to 1, (..., 4), of values in their units."""
+        low, span = self._range
+        return (values - low) / span
+
+    @property
+    def _range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Least value of every output, and how far its values reach."""
         low, high = np.array([(each.low, each.high) for each in self.outputs]).T
-        return low.astype(outputs.dtype) + (high - low).astype(outputs.dtype) * outputs
+        return low, high - low
+
+    def settled(self, motors: Float[Array, "4"]) -> Float[Array, "4"]:
+        """Outputs of a policy that has long commanded what the motors do now, with set-points at rest.
+
+        Args:
+            motors: commands of M1..M4, 0 to 1.
+        """
+        if not self.has_loop:
+            return motors
+        rest = jnp.full(4, 0.5, motors.dtype)
+        return rest.at[0].set(jnp.mean(motors)) if self.outputs[0] == _THRUST else rest
 
 
 def _rates(limit: float, yaw_limit: float) -> tuple[Output, ...]:
@@ -58,19 +82,24 @@ def _rates(limit: float, yaw_limit: float) -> tuple[Output, ...]:
     return tuple(Output(name, "rad/s", -x, x) for name, x in about)
 
 
+def _along(name: str, unit: str, limit: float) -> tuple[Output, ...]:
+    return (*(Output(f"{name} along world {axis}", unit, -limit, limit) for axis in "xyz"), _YAW)
+
+
 _THRUST = Output("mean command of the motors", "1", 0.0, 1.0)
 _YAW = Output("yaw", "rad", -math.pi, math.pi)
 ACTIONS = {
     action.name: action
     for action in (
-        Action("motors", tuple(Output(f"command of M{i}", "1", 0.0, 1.0) for i in (1, 2, 3, 4))),
-        Action("body_rates", (_THRUST, *_rates(15.0, 5.0))),
+        Action("motors", "the motors", tuple(Output(f"command of M{i}", "1", 0.0, 1.0) for i in (1, 2, 3, 4))),
+        Action("body_rates", "thrust and body rates", (_THRUST, *_rates(15.0, 5.0))),
         Action(
             "attitude",
+            "thrust and attitude",
             (_THRUST, *(Output(name, "rad", -math.pi / 3, math.pi / 3) for name in ("roll", "pitch")), _YAW),
         ),
-        Action("velocity", (*(Output(f"velocity along world {axis}", "m/s", -2.0, 2.0) for axis in "xyz"), _YAW)),
-        Action("position", (*(Output(f"target + along world {axis}", "m", -1.0, 1.0) for axis in "xyz"), _YAW)),
+        Action("velocity", "velocities", _along("velocity", "m/s", 2.0)),
+        Action("position", "positions", _along("target +", "m", 1.0)),
     )
 }
 """Actions by name. Roll and pitch are right-handed about body x and y."""
@@ -83,10 +112,8 @@ class InnerLoop(eqx.Module):
     memory: Any
 
 
-def start(action: Action, firmware: FirmwarePid, measurement: State) -> InnerLoop | None:
-    """Return the loop after ``measurement``, with empty integrators; None for an action without a loop."""
-    if not action.has_loop:
-        return None
+def start(action: Action, firmware: FirmwarePid, measurement: State) -> InnerLoop:
+    """Return the loop of an action that has one after ``measurement``, with empty integrators."""
     memory = pid.init(firmware, measurement)
     # Arrays, so that episodes can be stacked.
     firmware = jax.tree.map(lambda x: jnp.asarray(x, memory.thrust.dtype), firmware)

@@ -190,8 +190,4 @@ def _body_index(model: mujoco.MjModel) -> int:
 
 @functools.lru_cache(maxsize=8)
 def _on_device(mjcf: str | None, floor: bool, x64: bool):
-    # Host copies: a device array that is cached during one trace must not leak into another.
-    with jax.ensure_compile_time_eval():
-        model = on_mjx(str(mjcf), _compile(mjcf, floor))
-        data = mjx.make_data(model)
-    return jax.tree.map(np.asarray, (model, data))
+    return on_mjx(str(mjcf), _compile(mjcf, floor))

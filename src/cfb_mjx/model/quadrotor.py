@@ -31,7 +31,7 @@ from cfb_mjx.model.effects import (
 from cfb_mjx.model.effects.base import CONSTRAINT, in_order
 from cfb_mjx.model.effects.inertia import Inertia
 from cfb_mjx.model.integrate import END, INTEGRATORS, MIDDLE, START
-from cfb_mjx.model.state import Components, State, stack, unstack
+from cfb_mjx.model.state import Components, State, stack, stacked, unstack
 from cfb_mjx.model.vector import Vec, rotate_inverse
 from cfb_mjx.parameters import SPECIFICATIONS, ModelFile, Parameters, load_model_file
 from cfb_mjx.parameters.parameters import concrete, physical_inertia
@@ -182,8 +182,7 @@ def begin(model: Quadrotor, state: State) -> State:
         raise ValueError(f"the state remembers {len(state.memory)} effects, the model has {len(model.effects)}")
     parameters, speed = _unstacked(model.changed_parameters()), Vec.unstack(jnp.asarray(state.rotor_speed))
     memory = tuple(effect.begin(speed, parameters, model.dt / model.substeps) for effect in model.effects)
-    memory = jax.tree.map(lambda v: v.stack(), memory, is_leaf=lambda x: isinstance(x, Vec))
-    return State(state.position, state.velocity, state.quaternion, state.body_rate, state.rotor_speed, memory)
+    return replace(state, memory=stacked(memory))
 
 
 class Prepared(eqx.Module):

@@ -51,8 +51,7 @@ def rollout(
         ValueError: ``hold`` or ``every`` is below one, or ``every`` does not divide ``steps``.
     """
     steps = commands.shape[0]
-    if hold < 1 or every < 1 or steps % every:
-        raise ValueError(f"{steps} commands, each held {hold} steps, cannot be kept every {every}")
+    require_kept(steps, hold, every)
     prepared = prepare(model)
 
     def plain(prepared, state, commands):
@@ -69,6 +68,16 @@ def rollout(
 
     kept = gpu.fly(SYSTEM, plain, in_components, prepared, state, commands, hold=hold, every=every)
     return stack(kept, prepared.parameters.center_of_gravity)
+
+
+def require_kept(steps: int, hold: int, every: int) -> None:
+    """Refuse numbers of commands that a rollout cannot keep.
+
+    Raises:
+        ValueError: ``hold`` or ``every`` is below one, or ``every`` does not divide ``steps``.
+    """
+    if hold < 1 or every < 1 or steps % every:
+        raise ValueError(f"{steps} commands, each held {hold} steps, cannot be kept every {every}")
 
 
 def rollout_final(model: Quadrotor, state: State, commands: Float[Array, "steps 4"], *, hold: int = 1) -> State:

@@ -11,6 +11,7 @@ derivatives) and ``c`` (MuJoCo's own C by `mujoco.batch`, on the CPU, no derivat
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -35,9 +36,11 @@ from cfb_mjx.model.quadrotor import (
     conditions,
     loaded,
     prepare,
+    remembering,
 )
+from cfb_mjx.model.rollout import require_kept
 from cfb_mjx.model.scene_engines import ENGINES, Inputs
-from cfb_mjx.model.state import AnyArray, State, stack, unstack
+from cfb_mjx.model.state import AnyArray, State, stacked, unstack
 from cfb_mjx.model.vector import Vec, rotate
 
 
@@ -129,8 +132,7 @@ class Scene:
             ValueError: ``hold`` or ``every`` is below one, or ``every`` does not divide the number of commands.
         """
         steps = commands.shape[0]
-        if hold < 1 or every < 1 or steps % every:
-            raise ValueError(f"{steps} commands, each held {hold} steps, cannot be kept every {every}")
+        require_kept(steps, hold, every)
         prepared = prepare(drone)
 
         def one(state, row):
@@ -155,7 +157,7 @@ class Scene:
         center = Vec.unstack(parameters.center_of_gravity)
         at = unstack(state.drone, center)
         path, memory = commanded_path(prepared, at.rotor_speed, at.memory, command)
-        at = replace(at, memory=memory)
+        at = remembering(at, memory)
         loads = path.mean
         if drone.rotor_loads == "instant":
             loads = rotors.loads_at(prepared.rotors, path.start, path.rate_start)
@@ -164,13 +166,11 @@ class Scene:
         force = jnp.concatenate([rotate(at.quaternion, wrench.force).stack(), wrench.torque.stack()])
         moved = ENGINES[self.engine](self.mjcf, self.inputs(prepared, state, force))
         pose, twist = moved.positions[self._positions[0]], moved.velocities[self._velocities[0]]
-        rotors_at, rest = path.end.stack(), ()
-        after = State(pose[:3], twist[:3], pose[3:], twist[3:], rotors_at, rest)
-        if len(drone.effects):
-            velocity = unstack(after, center).velocity
-            pushed = (velocity - at.velocity) * prepared.rotors.inverse_dt
+        after = State(pose[:3], twist[:3], pose[3:], twist[3:], path.end.stack())
+        if drone.effects:
+            pushed = (unstack(after, center).velocity - at.velocity) * prepared.rotors.inverse_dt
             memory = advanced(prepared, felt, pushed)
-        after = replace(stack(replace(unstack(after, center), memory=memory), center), quaternion=pose[3:])
+        after = replace(after, memory=stacked(memory))
         force = moved.constraint[self._velocities[0]]
         larger = jnp.sum(force**2) > jnp.sum(jnp.asarray(state.constraint) ** 2)
         return SceneState(
@@ -216,7 +216,7 @@ class Scene:
         if own > 1.01 * asked and asked != mujoco.MjModel.from_xml_string("<mujoco/>").opt.timestep:
             warnings.warn(
                 f"{self.mjcf}: asks for steps of {1e3 * asked:g} ms, and is stepped every {1e3 * own:g} ms; give the "
-                f"drone substeps={-int(-drone.dt // asked)} if things shake or fall through each other.",
+                f"drone substeps={math.ceil(drone.dt / asked)} if things shake or fall through each other.",
                 CfbWarning,
                 stacklevel=3,
             )

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.model.mjcf import BODY_NAME, compiled_scene
+from cfb_mjx.model.mjcf import BODY_NAME
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.scene import Scene, SceneState
 from cfb_mjx.model.scene_engines import cast_by_c, cast_by_mjx
@@ -80,5 +80,5 @@ def _directions(fovy_deg: float, width: int, height: int) -> np.ndarray:
 
 def geom_names(scene: Scene) -> list[str]:
     """Names of the geoms by their numbers, for the segmentation; empty for a geom without one."""
-    model = compiled_scene(scene.mjcf)
+    model = scene.mujoco_model
     return [model.geom(i).name for i in range(model.ngeom)]

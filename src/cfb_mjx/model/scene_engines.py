@@ -60,7 +60,7 @@ def by_mjx(path: str, inputs: Inputs) -> Moved:
 def set_mjx(path: str, inputs: Inputs) -> tuple[mjx.Model, mjx.Data]:
     """MJX model and data of a scene before its step; one example."""
     x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]  # jax adds it as it loads
-    model, data = jax.tree.map(jnp.asarray, _on_device(path, x64))
+    model, data = jax.tree.map(jnp.asarray, _template(path, x64))
     body = int(compiled_scene(path).body(BODY_NAME).id)
     mass, gravity = inputs.mass_gravity
     change = mass - model.body_mass[body]
@@ -86,25 +86,26 @@ def set_mjx(path: str, inputs: Inputs) -> tuple[mjx.Model, mjx.Data]:
 
 
 @functools.lru_cache(maxsize=8)
-def _on_device(path: str, x64: bool) -> Any:
-    # Host copies: a device array that is cached during one trace must not leak into another.
-    with jax.ensure_compile_time_eval():
-        model = on_mjx(path, compiled_scene(path))
-        data = mjx.make_data(model)
-    return jax.tree.map(np.asarray, (model, data))
+def _template(path: str, x64: bool) -> Any:
+    return on_mjx(path, compiled_scene(path))
 
 
-def on_mjx(path: str, model: mujoco.MjModel) -> mjx.Model:
-    """Put a compiled MJCF into MJX.
+def on_mjx(path: str, compiled: mujoco.MjModel) -> tuple[mjx.Model, mjx.Data]:
+    """Put a compiled MJCF into MJX, as arrays on the host.
+
+    A device array that is cached during one trace must not leak into another.
 
     Raises:
         CfbError: it has a feature that MJX lacks.
     """
     try:
-        return mjx.put_model(model, impl="jax")
+        with jax.ensure_compile_time_eval():
+            model = mjx.put_model(compiled, impl="jax")
+            data = mjx.make_data(model)
     except NotImplementedError as error:
         said = " ".join(str(error).split())
         raise CfbError(f'{path}: MJX cannot simulate this MJCF ({said}); use Scene(..., engine="c").') from None
+    return jax.tree.map(np.asarray, (model, data))
 
 
 def _without_derivatives(said: str) -> Callable:

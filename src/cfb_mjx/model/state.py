@@ -93,5 +93,10 @@ def stack(state: Components, center_of_gravity: Vec | AnyArray) -> State:
         state.quaternion.stack(),
         state.body_rate.stack(),
         state.rotor_speed.stack(),
-        jax.tree.map(lambda x: x.stack(), state.memory, is_leaf=lambda x: isinstance(x, Vec)),
+        stacked(state.memory),
     )
+
+
+def stacked(memory: Any) -> Any:
+    """Memory of effects as arrays, from components."""
+    return jax.tree.map(lambda x: x.stack(), memory, is_leaf=lambda x: isinstance(x, Vec))

@@ -29,7 +29,7 @@ from cfb_mjx.model import rotors
 from cfb_mjx.model.effects import Downwash
 from cfb_mjx.model.effects.downwash import FORECAST, MOMENTUM, Other
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
-from cfb_mjx.model.rollout import SYSTEM, fits_one_kernel, fly_rows
+from cfb_mjx.model.rollout import SYSTEM, fits_one_kernel, fly_rows, require_kept
 from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec, rotate, up_axis
 
@@ -70,8 +70,7 @@ def rollout_swarm(
         ValueError: ``hold`` or ``every`` is below one, or ``every`` does not divide ``steps``.
     """
     steps, count = commands.shape[:2]
-    if hold < 1 or every < 1 or steps % every:
-        raise ValueError(f"{steps} commands, each held {hold} steps, cannot be kept every {every}")
+    require_kept(steps, hold, every)
     if not any(isinstance(effect, Downwash) for effect in models.effects):
         raise CfbError("the drones of a swarm act on each other by their wakes: add the effect downwash to the models.")
     if models.parameters.mass.ndim != 1 or len(models.parameters.mass) != count:

@@ -7,7 +7,6 @@ new episode after it.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -91,9 +90,8 @@ class Analytic:
             after, outcome = step(self.task, episode, command, prepared)
             alive = alive & ~outcome.failed
             last = episode.memory.commands[0] if self.task.layout.past_commands else 2 * command - 1
-            relative = after.state.velocity - self.task.target_velocity(after.setpoint)
-            seen = replace(after.state, velocity=relative)
-            paid = cost(seen, after.target, after.setpoint, command, (1 + last) / 2)
+            relative = self.task.relative(after.state, after.setpoint)
+            paid = cost(relative, after.target, after.setpoint, command, (1 + last) / 2)
             # A failed drone stays where it was: later steps must neither count nor overflow.
             after = choose(alive, after, jax.lax.stop_gradient(episode))
             return (after, alive), jnp.where(alive, paid, cost.failure)

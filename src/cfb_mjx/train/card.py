@@ -5,14 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from cfb_mjx.firmware.actions import ACTIONS
+
 ALGORITHMS = {"ppo": "PPO", "analytic": "Back-propagation through the model"}
-_GIVEN = {
-    "motors": "the motors",
-    "body_rates": "thrust and body rates",
-    "attitude": "thrust and attitude",
-    "velocity": "velocities",
-    "position": "positions",
-}
 
 
 def training_card(
@@ -59,5 +54,5 @@ def conditions(config: Mapping[str, Any]) -> list[str]:
     ahead = ", ".join(f"{1e3 * x:g}" for x in seen.get("preview_s") or ())
     told += f", where the target will be in {ahead} ms" if ahead else ""
     told += ", an integral of the position error" if seen.get("integral") else ""
-    given = _GIVEN[seen.get("action", "motors")]
+    given = ACTIONS[seen.get("action", "motors")].words
     return [*lines, f"- Observation: {told}. It commands {given}, every {1e3 * seen['control_dt_s']:g} ms."]

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.control.controllers import Controller
 from cfb_mjx.documents import is_named, load_named, refuse_unknown, told
-from cfb_mjx.envs.episode import reset, settled_output, step
+from cfb_mjx.envs.episode import reset, step
 from cfb_mjx.envs.observation import Layout
 from cfb_mjx.envs.path import Path as Way
 from cfb_mjx.envs.target import TargetTask
@@ -109,7 +109,7 @@ def fly(
             seen = jax.vmap(lambda time: jax.vmap(lambda ahead: path(time + ahead))(horizons))(times[:-1])
             ahead = (seen - targets[:, None]).reshape(steps, -1)
     episode = reset(task, nominal, key, state)
-    memory = controller.start(episode.estimate, settled_output(task, episode.motors))
+    memory = controller.start(episode.estimate, task.action.settled(episode.motors))
 
     def one(carry, course):
         episode, memory, failed = carry

@@ -90,18 +90,41 @@ def track_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
             ("speed, m/s", np.linalg.norm(np.asarray(flown.velocity)[:_SHOWN], axis=-1)),
             ("command, M1", np.asarray(flown.command)[:_SHOWN, :, 0]),
         )
-        first = None
-        for i, (label, values) in enumerate(rows):
-            axis = first = figure.add_subplot(grid[i, 1], sharex=first)
-            axis.plot(time, values.T, color=_BLUE, linewidth=0.9, alpha=fade)
-            axis.set_ylabel(label)
-            axis.set_xlim(0, time[-1])
-            axis.set_xlabel("time, s" if i == 2 else "")
-            axis.tick_params(labelbottom=i == 2)
-        more = "" if count <= _SHOWN else f" ({_SHOWN} of {count} flights)"
-        figure.suptitle(title + more, fontsize=10)
-        figure.subplots_adjust(left=0.08, right=0.98, bottom=0.12, top=0.91, hspace=0.15, wspace=0.25)
+        _over_time(figure, grid, time, rows, time[-1], fade)
+        _finish(figure, title, count)
         save(figure, path)
+
+
+def _over_time(figure, grid, time: np.ndarray, rows, until: float, fade: float) -> list:
+    """Draw values over time below each other, to the right of what a figure shows in a plane; return the axes.
+
+    Args:
+        figure: the figure.
+        grid: its grid of two columns.
+        time: times, s.
+        rows: label and values (flights, steps) of each panel.
+        until: end of the time that is shown, s.
+        fade: opacity of the lines.
+    """
+    axes = []
+    for i, (label, values) in enumerate(rows):
+        axis = figure.add_subplot(grid[i, 1], sharex=axes[0] if axes else None)
+        axis.plot(time, values.T, color=_BLUE, linewidth=0.9, alpha=fade)
+        axis.set_ylabel(label)
+        axis.set_xlim(0, until)
+        inside = values[:, time <= until]
+        if np.isfinite(inside).any():
+            axis.set_ylim(*_padded(np.nanmin(inside), np.nanmax(inside)))
+        axis.tick_params(labelbottom=i + 1 == len(rows))
+        axes.append(axis)
+    axes[-1].set_xlabel("time, s")
+    return axes
+
+
+def _finish(figure, title: str, count: int) -> None:
+    more = "" if count <= _SHOWN else f" ({_SHOWN} of {count} flights)"
+    figure.suptitle(title + more, fontsize=10)
+    figure.subplots_adjust(left=0.08, right=0.98, bottom=0.11, top=0.92, hspace=0.15, wspace=0.25)
 
 
 _BLUE, _RED, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#e8e8e8"
@@ -135,25 +158,12 @@ def flip_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
             ("roll rate, deg/s", np.degrees(rate[..., 0])),
             ("vertical speed, m/s", velocity[..., 2]),
         )
-        above = None
-        for i, (label, values) in enumerate(rows):
-            axis = above = figure.add_subplot(grid[i, 1], sharex=above)
-            axis.plot(time, values.T, color=_BLUE, linewidth=0.9, alpha=fade)
-            axis.set_ylabel(label)
-            axis.set_xlim(0, shown)
-            inside = values[:, time <= shown]
-            if np.isfinite(inside).any():
-                axis.set_ylim(*_padded(np.nanmin(inside), np.nanmax(inside)))
-            if count == 1:
-                turning = time[np.asarray(flown.watched)[0] == TURN]
+        panels = _over_time(figure, grid, time, rows, shown, fade)
+        if count == 1:
+            turning = time[np.asarray(flown.watched)[0] == TURN]
+            for axis in panels:
                 axis.axvspan(turning[0] - dt, turning[-1], color=_GREY, linewidth=0)
-            if i < 2:
-                axis.tick_params(labelbottom=False)
-            else:
-                axis.set_xlabel("time, s")
-        more = "" if count <= _SHOWN else f" ({_SHOWN} of {count} flights)"
-        figure.suptitle(title + more, fontsize=10)
-        figure.subplots_adjust(left=0.08, right=0.98, bottom=0.11, top=0.92, hspace=0.15, wspace=0.25)
+        _finish(figure, title, count)
         save(figure, path)
 
 
