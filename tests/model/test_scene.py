@@ -14,9 +14,11 @@ import pytest
 
 from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.files import shipped
-from cfb_mjx.model import MjxBody, Quadrotor, Scene, rollout
+from cfb_mjx.model import MjxBody, Quadrotor, Scene, State, rollout
+from cfb_mjx.model.effects import Downwash
 from cfb_mjx.model.randomised import sample_drone
 from cfb_mjx.model.scene_camera import geom_names, look
+from cfb_mjx.model.swarm import rollout_swarm
 from cfb_mjx.parameters import load_randomisation
 
 WORLD = """
@@ -225,6 +227,74 @@ def test_a_box_in_a_copy_of_our_file_stops_the_drone(write, guards):
     start = model.hover_state((0.0, 0.0, 0.7))
     flown = jax.jit(rollout, compiler_options=QUICK)(model, start, jnp.zeros((150, 4)))
     assert 0.52 < float(flown.position[-1, 2]) < 0.54
+
+
+def _side_by_side(drone: Quadrotor, places, velocities=0.0) -> tuple[Quadrotor, State]:
+    places = jnp.asarray(places)
+    hover = jax.vmap(drone.hover_state)(places)
+    velocities = jnp.broadcast_to(jnp.asarray(velocities), places.shape)
+    return jax.tree.map(lambda x: jnp.stack([x] * len(places)), drone), replace(hover, velocity=velocities, memory=())
+
+
+@mjx
+@pytest.mark.parametrize("engine", ENGINES)
+def test_drones_collide(write, drone, engine):
+    scene = Scene(write("<mujoco/>", "empty.xml"), engine, drones=2)
+    drones, start = _side_by_side(drone, [[0.0, 0.0, 1.0], [0.25, 0.0, 1.0]], [[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]])
+    commands = jnp.broadcast_to(drone.hover_command(), (150, 2, 4))
+    flown = jax.jit(scene.rollout, compiler_options=QUICK)(drones, scene.begin(drones, start), commands)
+    apart = np.asarray(flown.drone.position[:, 1, 0] - flown.drone.position[:, 0, 0])
+    # Their outlines reach 0.067 m from their centres.
+    assert 0.125 < apart.min() < 0.135
+    assert apart[-1] > 0.15
+    # What the one is pushed the other is pushed back.
+    force = np.asarray(flown.constraint)[..., :3]
+    assert np.abs(force[:, 0, 0]).max() > 0.5
+    np.testing.assert_allclose(force[:, 0], -force[:, 1], atol=1e-6)
+
+
+@mjx
+@pytest.mark.parametrize("count", [2, 6])
+def test_wakes_in_a_scene_are_those_of_a_swarm(write, drone, count):
+    drone = replace(drone, effects=(Downwash(coefficient=0.004),))
+    scene = Scene(write("<mujoco/>", "empty.xml"), "c", drones=count)
+    places = [[0.05 * i, 3.0 * (i // 2), 1.5 - 0.5 * (i % 2)] for i in range(count)]
+    drones, start = _side_by_side(drone, places)
+    commands = jnp.broadcast_to(drone.hover_command(), (100, count, 4))
+    flown = jax.jit(lambda state: scene.rollout(drones, state, commands, every=50))(scene.begin(drones, start)).drone
+    swarm = rollout_swarm(drones, start, commands, every=50).state
+    assert float(swarm.position[-1, 1, 2]) < 0.985
+    # A swarm of more than four exchanges its states every 20 ms.
+    np.testing.assert_allclose(flown.position, swarm.position, atol=1e-9 if count == 2 else 2e-4)
+    np.testing.assert_allclose(flown.quaternion, swarm.quaternion, atol=1e-9 if count == 2 else 2e-3)
+
+
+@mjx
+def test_a_drone_sees_another(write, drone):
+    text = SEEN.replace('<body name="cfb">', '<body name="cfb1">')
+    for engine in ENGINES:
+        scene = Scene(write(text, "two.xml"), engine, drones=2)
+        drones, start = _side_by_side(drone, [[0.7, 0.0, 1.0], [0.0, 0.0, 1.0]])
+        seen = look(scene, drones, scene.begin(drones, start), "front", 3, 3)
+        # The back of the other's outline, 0.067 m from its centre.
+        assert float(seen.depth[1, 1]) == pytest.approx(0.67 - 0.067, abs=0.006)
+
+
+def test_drones_that_do_not_fit_a_scene_are_refused(write, drone):
+    scene = Scene(write("<mujoco/>", "empty.xml"), "c", drones=3)
+    drones, start = _side_by_side(drone, [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
+    with pytest.raises(CfbError, match=r"there are 3, the mass has shape \(2,\)"):
+        scene.begin(drones, start)
+    scene = Scene(write("<mujoco/>", "empty.xml"), "c", drones=2)
+    uneven = replace(drones, parameters=replace(drones.parameters, gravity=jnp.array([9.81, 1.62])))
+    with pytest.raises(CfbError, match="one gravity"):
+        scene.begin(uneven, start)
+    with pytest.raises(CfbError, match="at least 1, found 0"):
+        Scene(write("<mujoco/>", "empty.xml"), "c", drones=0)
+    ghosts = "".join(f'<body name="{n}"><freejoint/><geom size="0.05" mass="1"/></body>' for n in ("cfb", "cfb1"))
+    ghosts = ghosts.replace("<geom", '<geom contype="0" conaffinity="0"')
+    with pytest.warns(CfbWarning, match="the drones fly through each other"):
+        Scene(write(f"<mujoco><worldbody>{ghosts}</worldbody></mujoco>", "ghosts.xml"), "c", drones=2)
 
 
 def test_what_is_flown_through_is_said(write):

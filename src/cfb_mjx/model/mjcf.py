@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -14,6 +16,18 @@ from cfb_mjx.files import shipped
 from cfb_mjx.optional import not_none
 
 BODY_NAME = "cfb"
+
+
+class World(NamedTuple):
+    """What determines a compiled world."""
+
+    mjcf: str
+    drones: int = 1
+
+    @property
+    def bodies(self) -> list[str]:
+        """Names of the drones' bodies: cfb, cfb1, cfb2 ..."""
+        return [BODY_NAME, *(f"{BODY_NAME}{i}" for i in range(1, self.drones))]
 
 
 def specification(path: str | Path) -> mujoco.MjSpec:
@@ -45,24 +59,29 @@ def _uncompiled(path: str | Path, error: ValueError) -> CfbError:
 
 
 @functools.lru_cache(maxsize=8)
-def compiled_scene(path: str) -> mujoco.MjModel:
-    """Compile a world, and add the drone if it has none.
+def compiled_scene(world: World) -> mujoco.MjModel:
+    """Compile a world, and add the drones that it lacks.
 
     Raises:
-        CfbError: MuJoCo cannot compile it, or its body ``cfb`` has other joints than one free joint.
+        CfbError: MuJoCo cannot compile it, or a drone's body has other joints than one free joint.
 
     Warns:
-        CfbWarning: the drone cannot touch some of its geoms, or MuJoCo's drag acts on it.
+        CfbWarning: the drones cannot touch some of its geoms or each other, or MuJoCo's drag acts on them.
     """
-    spec = specification(path)
-    body = spec.body(BODY_NAME)
-    if body is None or not (list(body.joints) or list(body.geoms)):
-        _add_drone(spec, body)
+    path, spec = world.mjcf, specification(world.mjcf)
+    for name in world.bodies:
+        body = spec.body(name)
+        if body is None or not (list(body.joints) or list(body.geoms)):
+            _add_drone(spec, name, body)
+    if world.drones > 1 and spec.numeric("max_geom_pairs") is None:
+        # Of each kind of pairs MJX looks at the nearest only; the number of all grows with the square of the drones.
+        spec.add_numeric(name="max_geom_pairs", size=1, data=[4 * world.drones])
     model = compiled(path, spec)
-    body = model.body(BODY_NAME)
-    if body.jntnum[0] != 1 or model.jnt_type[body.jntadr[0]] != mujoco.mjtJoint.mjJNT_FREE:
-        raise CfbError(f"{path}: body '{BODY_NAME}' must have one joint, a free joint.")
-    warn_of_untouched(path, model)
+    for name in world.bodies:
+        body = model.body(name)
+        if body.jntnum[0] != 1 or model.jnt_type[body.jntadr[0]] != mujoco.mjtJoint.mjJNT_FREE:
+            raise CfbError(f"{path}: body '{name}' must have one joint, a free joint.")
+    warn_of_untouched(path, model, world.bodies)
     if model.opt.density or model.opt.viscosity:
         warnings.warn(
             f"{path}: MuJoCo's drag (density, viscosity) acts on the drone too, beside the effects of its model; leave "
@@ -73,45 +92,53 @@ def compiled_scene(path: str) -> mujoco.MjModel:
     return model
 
 
-_COPIED = ("name", "type", "size", "pos", "quat", "fromto", "contype", "conaffinity", "condim", "friction", "solref")
+_COPIED = ("type", "size", "pos", "quat", "fromto", "contype", "conaffinity", "condim", "friction", "solref")
 
 
-def _add_drone(spec: mujoco.MjSpec, body: mujoco.MjsBody | None) -> None:
+def _add_drone(spec: mujoco.MjSpec, name: str, body: mujoco.MjsBody | None) -> None:
     """Add the drone of ``assets/cfb.xml``, to an empty body if there is one.
 
     Geom by geom, because attaching the file would bring its options and its floor.
     """
     drone = not_none(specification(shipped("assets", "cfb.xml")).body(BODY_NAME))
-    own = not_none(spec.worldbody.add_body(name=BODY_NAME, pos=drone.pos) if body is None else body)
+    own = not_none(spec.worldbody.add_body(name=name, pos=drone.pos) if body is None else body)
     own.mass, own.inertia, own.explicitinertial = drone.mass, drone.inertia, True
-    own.add_freejoint(name=BODY_NAME)
+    own.add_freejoint(name=name)
+    suffix = name.removeprefix(BODY_NAME)
     for geom in drone.geoms:
-        own.add_geom(mass=0, group=geom.group, rgba=geom.rgba, **{name: getattr(geom, name) for name in _COPIED})
+        copied = {key: getattr(geom, key) for key in _COPIED}
+        own.add_geom(name=geom.name + suffix, mass=0, group=geom.group, rgba=geom.rgba, **copied)
 
 
-def warn_of_untouched(path: str | Path, model: mujoco.MjModel) -> None:
-    """Warn of geoms in view that the drone flies through.
+def warn_of_untouched(path: str | Path, model: mujoco.MjModel, drones: Sequence[str] = (BODY_NAME,)) -> None:
+    """Warn of geoms in view that the drone flies through, and of drones that fly through each other.
 
     Args:
         path: name of the file, for the message.
         model: the compiled world.
+        drones: names of the drones' bodies.
     """
-    if untouched := _untouched(model):
+    bodies = [model.body(name).id for name in drones]
+    first = model.geom_bodyid == bodies[0]
+    others = np.flatnonzero(~np.isin(model.geom_bodyid, bodies) & (model.geom_group < 3))
+    if untouched := [f"geom '{model.geom(i).name or i}'" for i in others if not _touch(model, first, [i])]:
         warnings.warn(
             f'{path}: the drone flies through {", ".join(untouched)}; give them contype="1" conaffinity="1", or a '
             "group from 3 if they are not there to be touched.",
             CfbWarning,
             stacklevel=4,
         )
+    if not all(_touch(model, first, model.geom_bodyid == body) for body in bodies[1:]):
+        warnings.warn(
+            f"{path}: the drones fly through each other; leave their geoms out, so that those of assets/cfb.xml are "
+            "added, or copy the geoms of class outline from there.",
+            CfbWarning,
+            stacklevel=4,
+        )
 
 
-def _untouched(model: mujoco.MjModel) -> list[str]:
-    """Names of geoms in view that neither the drone nor any of its geoms can touch."""
-    drone = model.geom_bodyid == model.body(BODY_NAME).id
-    own = [(int(a), int(b)) for a, b in zip(model.geom_contype[drone], model.geom_conaffinity[drone], strict=True)]
-    found = []
-    for i in np.flatnonzero(~drone & (model.geom_group < 3)):
-        kind, affinity = int(model.geom_contype[i]), int(model.geom_conaffinity[i])
-        if not any(kind & b or a & affinity for a, b in own):
-            found.append(f"geom '{model.geom(i).name or i}'")
-    return found
+def _touch(model: mujoco.MjModel, some, others) -> bool:
+    """Whether any of some geoms can touch any of others."""
+    kinds, affinities = model.geom_contype, model.geom_conaffinity
+    met = kinds[some][:, None] & affinities[others] | affinities[some][:, None] & kinds[others]
+    return bool(met.any())

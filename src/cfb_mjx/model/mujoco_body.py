@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
 from cfb_mjx.model.effects.base import Wrench
-from cfb_mjx.model.mjcf import compiled_scene
+from cfb_mjx.model.mjcf import World, compiled_scene
 from cfb_mjx.model.scene_engines import Inputs, accelerations_by_c
 from cfb_mjx.model.state import Components
 from cfb_mjx.model.vector import Vec, rotate
@@ -22,7 +22,8 @@ class _Prepared(eqx.Module):
     dt: Float[Array, ""]
     inertia: Vec
     center: Vec
-    mass_gravity: Float[Array, "2"]
+    mass: Float[Array, ""]
+    gravity: Float[Array, ""]
 
 
 class MujocoBody:
@@ -42,7 +43,7 @@ class MujocoBody:
 
     def __init__(self, mjcf: str | Path | None = None):
         self.mjcf = str(shipped("assets", "cfb.xml") if mjcf is None else mjcf)
-        self.mujoco_model = compiled_scene(self.mjcf)
+        self.mujoco_model = compiled_scene(World(self.mjcf))
         if self.mujoco_model.nq != 7:
             raise CfbError(f"{self.mjcf}: other bodies than the drone move in this MJCF; use Scene for such a world.")
 
@@ -51,7 +52,8 @@ class MujocoBody:
             jnp.asarray(dt, parameters.mass.dtype),
             Vec.unstack(parameters.inertia),
             Vec.unstack(parameters.center_of_gravity),
-            jnp.stack([parameters.mass, parameters.gravity]),
+            parameters.mass,
+            parameters.gravity,
         )
 
     def accelerations(
@@ -75,11 +77,12 @@ class MujocoBody:
             none.reshape(0, 4),
             jnp.concatenate([rotate(state.quaternion, wrench.force).stack(), torque.stack()]),
             prepared.dt,
-            prepared.inertia.stack(),
-            center.stack(),
-            prepared.mass_gravity,
+            prepared.inertia.stack()[None],
+            center.stack()[None],
+            prepared.mass[None],
+            prepared.gravity,
         )
-        found = accelerations_by_c(self.mjcf, inputs)
+        found = accelerations_by_c(World(self.mjcf), inputs)
         linear, angular = Vec.unstack(found[:3]), Vec.unstack(found[3:])
         # qacc of the origin is its coordinate acceleration in the world.
         lever = angular.cross(center) + omega.cross(omega.cross(center))

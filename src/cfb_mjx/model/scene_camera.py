@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from cfb_mjx.errors import CfbError
-from cfb_mjx.model.mjcf import BODY_NAME
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.scene import Scene, SceneState
-from cfb_mjx.model.scene_engines import cast_by_c, cast_by_mjx
+from cfb_mjx.model.scene_engines import body_numbers, cast_by_c, cast_by_mjx
 from cfb_mjx.model.vector import Vec, multiply, rotate
 
 
@@ -28,7 +27,7 @@ class Image(NamedTuple):
 
 
 def look(scene: Scene, drone: Quadrotor, state: SceneState, camera: str, width: int = 32, height: int = 24) -> Image:
-    """Return what a camera sees; the drone does not see itself.
+    """Return what a camera sees; a drone does not see itself, nor does a camera on the world see a single drone.
 
     Use ``jax.vmap`` over drone and state. A pixel costs a ray; a training needs few.
 
@@ -36,7 +35,7 @@ def look(scene: Scene, drone: Quadrotor, state: SceneState, camera: str, width: 
         scene: the scene.
         drone: the drone.
         state: one state.
-        camera: name of a ``<camera>`` of the MJCF, on the body ``cfb`` or on the world.
+        camera: name of a ``<camera>`` of the MJCF, on a drone (body ``cfb``, ``cfb1`` ...) or on the world.
         width: number of pixels in a row.
         height: number of rows.
 
@@ -47,23 +46,26 @@ def look(scene: Scene, drone: Quadrotor, state: SceneState, camera: str, width: 
     names = [model.camera(i).name for i in range(model.ncam)]
     if camera not in names:
         raise CfbError(f"{scene.mjcf}: has no camera '{camera}'; its cameras: {', '.join(names) or 'none'}.")
-    number, body = names.index(camera), int(model.body(BODY_NAME).id)
+    number, bodies = names.index(camera), body_numbers(scene.world).tolist()
     of = int(model.cam_bodyid[number])
-    if of not in (0, body):
-        raise CfbError(f"{scene.mjcf}: camera '{camera}' must be on the body '{BODY_NAME}' or on the world.")
+    if of not in (0, *bodies):
+        drones = ", ".join(f"'{name}'" for name in scene.world.bodies)
+        raise CfbError(f"{scene.mjcf}: camera '{camera}' must be on a drone (body {drones}) or on the world.")
     kind = jnp.asarray(state.drone.position).dtype
     place = Vec.unstack(jnp.asarray(model.cam_pos[number], kind))
     turn = Vec.unstack(jnp.asarray(model.cam_quat[number], kind))
-    if of == body:
-        attitude = Vec.unstack(jnp.asarray(state.drone.quaternion))
-        place = Vec.unstack(jnp.asarray(state.drone.position)) + rotate(attitude, place)
+    if of:
+        carrier = state.drone if scene.drones is None else jax.tree.map(lambda x: x[bodies.index(of)], state.drone)
+        attitude = Vec.unstack(jnp.asarray(carrier.quaternion))
+        place = Vec.unstack(jnp.asarray(carrier.position)) + rotate(attitude, place)
         turn = multiply(attitude, turn)
     local = _directions(float(model.cam_fovy[number]), width, height)
     world = jax.vmap(lambda ray: rotate(turn, Vec.unstack(ray)).stack())(jnp.asarray(local, kind))
     # The camera looks along its own -z, and every direction has a length of one along it.
-    inputs = scene.inputs(prepare(drone), state)
+    inputs = scene.inputs(scene.each(prepare)(drone), state)
     cast = {"mjx": cast_by_mjx, "c": cast_by_c}[scene.engine]
-    distance, geom = cast(scene.mjcf, inputs, place.stack(), world)
+    unseen = of or (bodies[0] if scene.drones is None else -1)
+    distance, geom = cast(scene.world, unseen, inputs, place.stack(), world)
     depth = jnp.where(geom < 0, jnp.inf, distance)
     return Image(depth.reshape(height, width), geom.reshape(height, width))
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from cfb_mjx.engine.host import on_host
 from cfb_mjx.errors import CfbError
-from cfb_mjx.model.mjcf import BODY_NAME, compiled_scene
+from cfb_mjx.model.mjcf import World, compiled_scene
 from cfb_mjx.model.state import AnyArray
 from cfb_mjx.quiet import quietly
 
@@ -34,10 +34,11 @@ class Inputs(NamedTuple):
     forces: Float[AnyArray, "*batch nv"]
     """Generalised forces of the rotors and effects."""
     dt: Float[AnyArray, "*batch"]
-    inertia: Float[AnyArray, "*batch 3"]
-    center: Float[AnyArray, "*batch 3"]
-    """Centre of gravity of the drone, body axes, m."""
-    mass_gravity: Float[AnyArray, "*batch 2"]
+    inertia: Float[AnyArray, "*batch drones 3"]
+    center: Float[AnyArray, "*batch drones 3"]
+    """Centres of gravity of the drones, body axes, m."""
+    mass: Float[AnyArray, "*batch drones"]
+    gravity: Float[AnyArray, "*batch"]
 
 
 class Moved(NamedTuple):
@@ -50,28 +51,29 @@ class Moved(NamedTuple):
     """Generalised forces of contacts and cables."""
 
 
-def by_mjx(path: str, inputs: Inputs) -> Moved:
+def by_mjx(world: World, inputs: Inputs) -> Moved:
     """One step in MuJoCo XLA, from the state alone (no warm start)."""
-    model, data = set_mjx(path, inputs)
+    model, data = set_mjx(world, inputs)
     after = mjx.step(model, data)
     return Moved(after.qpos, after.qvel, after.act, after.qfrc_constraint)
 
 
-def set_mjx(path: str, inputs: Inputs) -> tuple[mjx.Model, mjx.Data]:
+def set_mjx(world: World, inputs: Inputs) -> tuple[mjx.Model, mjx.Data]:
     """MJX model and data of a scene before its step; one example."""
     x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]  # jax adds it as it loads
-    model, data = jax.tree.map(jnp.asarray, _template(path, x64))
-    body = int(compiled_scene(path).body(BODY_NAME).id)
-    mass, gravity = inputs.mass_gravity
-    change = mass - model.body_mass[body]
+    model, data = jax.tree.map(jnp.asarray, _template(world, x64))
+    bodies, mass, gravity = body_numbers(world), inputs.mass, inputs.gravity
+    change = mass - model.body_mass[bodies]
     model = model.replace(
         opt=model.opt.replace(gravity=jnp.stack([0.0 * gravity, 0.0 * gravity, -gravity]), timestep=inputs.dt),
-        body_mass=model.body_mass.at[body].set(mass),
-        body_subtreemass=model.body_subtreemass.at[body].add(change).at[0].add(change),
-        body_inertia=model.body_inertia.at[body].set(inputs.inertia),
-        body_ipos=model.body_ipos.at[body].set(inputs.center),
-        body_iquat=model.body_iquat.at[body].set(jnp.array([1.0, 0.0, 0.0, 0.0])),
-        body_invweight0=model.body_invweight0.at[body].set(jnp.stack([1 / mass, jnp.mean(1 / inputs.inertia)])),
+        body_mass=model.body_mass.at[bodies].set(mass),
+        body_subtreemass=model.body_subtreemass.at[bodies].add(change).at[0].add(jnp.sum(change)),
+        body_inertia=model.body_inertia.at[bodies].set(inputs.inertia),
+        body_ipos=model.body_ipos.at[bodies].set(inputs.center),
+        body_iquat=model.body_iquat.at[bodies].set(jnp.array([1.0, 0.0, 0.0, 0.0])),
+        body_invweight0=model.body_invweight0.at[bodies].set(
+            jnp.stack([1 / mass, jnp.mean(1 / inputs.inertia, axis=-1)], axis=-1)
+        ),
     )
     data = data.replace(
         qpos=inputs.positions,
@@ -86,8 +88,13 @@ def set_mjx(path: str, inputs: Inputs) -> tuple[mjx.Model, mjx.Data]:
 
 
 @functools.lru_cache(maxsize=8)
-def _template(path: str, x64: bool) -> Any:
-    return on_mjx(path, compiled_scene(path))
+def _template(world: World, x64: bool) -> Any:
+    return on_mjx(world.mjcf, compiled_scene(world))
+
+
+def body_numbers(world: World) -> np.ndarray:
+    """Numbers of the drones' bodies."""
+    return np.array([int(compiled_scene(world).body(name).id) for name in world.bodies])
 
 
 def on_mjx(path: str, compiled: mujoco.MjModel) -> tuple[mjx.Model, mjx.Data]:
@@ -109,14 +116,14 @@ def on_mjx(path: str, compiled: mujoco.MjModel) -> tuple[mjx.Model, mjx.Data]:
 
 
 def _without_derivatives(said: str) -> Callable:
-    """Decorator of functions of a path and arrays: their derivatives raise what is ``said`` of the path."""
+    """Decorator of functions of a world and arrays: their derivatives raise what is ``said`` of its file."""
 
     def decorate(function: Callable) -> Callable:
         outer = functools.partial(jax.custom_jvp, nondiff_argnums=(0,))(function)
 
         @outer.defjvp
-        def none(path, primals, tangents):
-            raise CfbError(f"{path}: {said}")
+        def none(world, primals, tangents):
+            raise CfbError(f"{world.mjcf}: {said}")
 
         return outer
 
@@ -124,13 +131,13 @@ def _without_derivatives(said: str) -> Callable:
 
 
 @_without_derivatives('the engine "c" has no derivatives; use Scene(..., engine="mjx") for those.')
-def by_c(path: str, inputs: Inputs) -> Moved:
+def by_c(world: World, inputs: Inputs) -> Moved:
     """One step in MuJoCo's C, of all examples at once on all cores (`mujoco.batch`); it has no derivatives."""
-    model = compiled_scene(path)
+    model = compiled_scene(world)
 
     def step(rows: np.ndarray) -> np.ndarray:
-        worker = _worker(path, len(rows))
-        worker.take(_taken(model, rows))
+        worker = _worker(world, len(rows))
+        worker.take(_taken(world, rows))
         return worker.step()
 
     ends = np.cumsum([model.nq, model.nv, model.na, model.nv])
@@ -138,13 +145,13 @@ def by_c(path: str, inputs: Inputs) -> Moved:
 
 
 @_without_derivatives("MujocoBody has no derivatives; use MjxBody(floor=False) or RigidBody for those.")
-def accelerations_by_c(path: str, inputs: Inputs) -> Float[AnyArray, " nv"]:
+def accelerations_by_c(world: World, inputs: Inputs) -> Float[AnyArray, " nv"]:
     """Generalised accelerations in MuJoCo's C, of all examples at once; it has no derivatives."""
-    model = compiled_scene(path)
+    model = compiled_scene(world)
 
     def accelerate(rows: np.ndarray) -> np.ndarray:
-        worker = _worker(path, len(rows))
-        worker.take(_taken(model, rows))
+        worker = _worker(world, len(rows))
+        worker.take(_taken(world, rows))
         worker.batch.forward()
         return worker.acceleration
 
@@ -155,8 +162,9 @@ def _packed(inputs: Inputs) -> Float[Array, " numbers"]:
     return jnp.concatenate([jnp.ravel(x) for x in inputs])
 
 
-def _taken(model: mujoco.MjModel, rows: np.ndarray) -> Inputs:
+def _taken(world: World, rows: np.ndarray) -> Inputs:
     """`_packed` undone, of many examples."""
+    model = compiled_scene(world)
     shapes = (
         (model.nq,),
         (model.nv,),
@@ -166,9 +174,10 @@ def _taken(model: mujoco.MjModel, rows: np.ndarray) -> Inputs:
         (model.nmocap, 4),
         (model.nv,),
         (),
-        (3,),
-        (3,),
-        (2,),
+        (world.drones, 3),
+        (world.drones, 3),
+        (world.drones,),
+        (),
     )
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes])
     parts = np.split(rows[:, : ends[-1]], ends[:-1], axis=1)
@@ -176,24 +185,23 @@ def _taken(model: mujoco.MjModel, rows: np.ndarray) -> Inputs:
 
 
 def cast_by_mjx(
-    path: str, inputs: Inputs, origin: Float[Array, "3"], directions: Float[Array, "rays 3"]
+    world: World, unseen: int, inputs: Inputs, origin: Float[Array, "3"], directions: Float[Array, "rays 3"]
 ) -> tuple[Float[Array, " rays"], Int[Array, " rays"]]:
-    """Cast rays from ``origin`` [m], in MJX; the drone is not seen.
+    """Cast rays from ``origin`` [m], in MJX; the body ``unseen`` is not seen (-1: all are).
 
     Returns:
         Distances in lengths of the directions, and numbers of the geoms that were hit; -1 for none.
     """
-    compiled, (model, data) = compiled_scene(path), set_mjx(path, inputs)
-    body = int(compiled.body(BODY_NAME).id)
+    compiled, (model, data) = compiled_scene(world), set_mjx(world, inputs)
     # MJX leaves out what it cannot hit, without a word.
-    if unseen := set(compiled.geom_type[compiled.geom_bodyid != body].tolist()) - _SEEN_BY_MJX:
-        kinds = ", ".join(sorted(mujoco.mjtGeom(kind).name for kind in unseen))
-        raise CfbError(f'{path}: MJX casts no rays at {kinds}; use Scene(..., engine="c").')
+    if missed := set(compiled.geom_type[compiled.geom_bodyid != unseen].tolist()) - _SEEN_BY_MJX:
+        kinds = ", ".join(sorted(mujoco.mjtGeom(kind).name for kind in missed))
+        raise CfbError(f'{world.mjcf}: MJX casts no rays at {kinds}; use Scene(..., engine="c").')
     if not compiled.nmat:
         # It also looks up the material of geoms without one.
         model = model.replace(mat_rgba=jnp.ones((1, 4), model.geom_rgba.dtype))
     data = mjx.kinematics(model, data)
-    return jax.vmap(lambda ray: mjx.ray(model, data, origin, ray, bodyexclude=body))(directions)
+    return jax.vmap(lambda ray: mjx.ray(model, data, origin, ray, bodyexclude=unseen))(directions)
 
 
 _SEEN_BY_MJX = {
@@ -203,17 +211,16 @@ _SEEN_BY_MJX = {
 
 
 def cast_by_c(
-    path: str, inputs: Inputs, origin: Float[Array, "3"], directions: Float[Array, "rays 3"]
+    world: World, unseen: int, inputs: Inputs, origin: Float[Array, "3"], directions: Float[Array, "rays 3"]
 ) -> tuple[Float[Array, " rays"], Int[Array, " rays"]]:
     """`cast_by_mjx` in MuJoCo's C."""
-    model, rays = compiled_scene(path), directions.shape[0]
-    own = _packed(inputs)
+    own, rays = _packed(inputs), directions.shape[0]
 
     def cast(rows: np.ndarray) -> np.ndarray:
-        worker, ray = _worker(path, len(rows)), rows[:, own.size :]
-        worker.take(_taken(model, rows))
+        worker, ray = _worker(world, len(rows)), rows[:, own.size :]
+        worker.take(_taken(world, rows))
         starts, ways = ray[:, None, :3], ray[:, 3:].reshape(len(rows), rays, 3)
-        return np.concatenate(worker.batch.ray(starts, ways, bodyexclude=worker.body)[:2], axis=1)
+        return np.concatenate(worker.batch.ray(starts, ways, bodyexclude=unseen)[:2], axis=1)
 
     found = on_host(cast, 2 * rays, jnp.concatenate([own, origin, directions.reshape(-1)]))
     return found[:rays], found[rays:].astype(jnp.int32)
@@ -222,18 +229,17 @@ def cast_by_c(
 class _Worker:
     """A batch of simulations in C, set and stepped from the host."""
 
-    def __init__(self, path: str, count: int):
+    def __init__(self, world: World, count: int):
         from mujoco.batch import Batch
 
-        model = compiled_scene(path)
-        self.body, self.batch = int(model.body(BODY_NAME).id), Batch(model, count)
+        self.bodies, self.batch = body_numbers(world), Batch(compiled_scene(world), count)
         names = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "qfrc_applied")
         self.state = [self.batch.bind(name) for name in names]
         self.start, self.constraint = self.batch.bind("qacc_warmstart"), self.batch.bind("qfrc_constraint")
         self.acceleration = self.batch.bind("qacc")
         self.constants = [self.batch.expand(name) for name in ("body_mass", "body_inertia", "body_ipos")]
         self.gravity, self.dt = self.batch.expand("opt.gravity"), self.batch.expand("opt.timestep")
-        self.batch.expand("body_iquat")[:, self.body] = (1.0, 0.0, 0.0, 0.0)
+        self.batch.expand("body_iquat")[:, self.bodies] = (1.0, 0.0, 0.0, 0.0)
         self.before: list[np.ndarray] = []
 
     def take(self, inputs: Inputs) -> None:
@@ -248,9 +254,9 @@ class _Worker:
         self.before = [np.array(x) for x in constants]
         mass, inertia, center = self.constants
         self.dt[...] = np.reshape(inputs.dt, self.dt.shape)
-        inertia[:, self.body], center[:, self.body] = inputs.inertia, inputs.center
-        mass[:, self.body] = inputs.mass_gravity[:, 0]
-        self.gravity[:, 2] = -inputs.mass_gravity[:, 1]
+        inertia[:, self.bodies], center[:, self.bodies] = inputs.inertia, inputs.center
+        mass[:, self.bodies] = inputs.mass
+        self.gravity[:, 2] = -inputs.gravity
         # The softness of contacts follows from masses and inertias.
         self.batch.set_const()
 
@@ -261,8 +267,8 @@ class _Worker:
 
 
 @functools.lru_cache(maxsize=4)
-def _worker(path: str, count: int) -> _Worker:
-    return _Worker(path, count)
+def _worker(world: World, count: int) -> _Worker:
+    return _Worker(world, count)
 
 
-ENGINES: dict[str, Callable[[str, Inputs], Moved]] = {"mjx": by_mjx, "c": by_c}
+ENGINES: dict[str, Callable[[World, Inputs], Moved]] = {"mjx": by_mjx, "c": by_c}

@@ -12,34 +12,39 @@ extrapolates their motion.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.engine import primitive
 from cfb_mjx.engine.lanes import System
 from cfb_mjx.errors import CfbError
-from cfb_mjx.model import rotors
-from cfb_mjx.model.effects import Downwash
-from cfb_mjx.model.effects.downwash import FORECAST, MOMENTUM, Other
-from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, begin, prepare
+from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, prepare
 from cfb_mjx.model.rollout import SYSTEM, fits_one_kernel, fly_rows, require_kept
-from cfb_mjx.model.state import Components, State, stack, unstack
-from cfb_mjx.model.vector import Vec, rotate, up_axis
+from cfb_mjx.model.state import Components, State, stack
+from cfb_mjx.model.vector import Vec
+from cfb_mjx.model.wakes import (
+    FEW,
+    NEIGHBOURS,
+    SEARCHED_S,
+    begun,
+    divisor,
+    interact,
+    neighbours,
+    require_drones,
+    seen_by,
+    sense,
+    sensing,
+    wake_of,
+)
 
-FEW = 4
-"""Largest swarm that is one system of the engine. Its compile time grows with the square of the number."""
-NEIGHBOURS = 4
-EXCHANGED_S, SEARCHED_S, MARGIN = 0.02, 0.1, 0.1
-"""In larger swarms: longest time between two exchanges of the drones' states, s, and between two choices of neighbours;
-width that is added to the wakes in this choice, m."""
-WINDOW = 32
+EXCHANGED_S = 0.02
+"""Longest time between two exchanges of the drones' states in a swarm of more than `FEW`, s. A smaller one is a single
+system of the engine, whose compile time grows with the square of the number."""
 
 
 class Swarm(NamedTuple):
@@ -71,19 +76,15 @@ def rollout_swarm(
     """
     steps, count = commands.shape[:2]
     require_kept(steps, hold, every)
-    if not any(isinstance(effect, Downwash) for effect in models.effects):
+    if not interact(models):
         raise CfbError("the drones of a swarm act on each other by their wakes: add the effect downwash to the models.")
-    if models.parameters.mass.ndim != 1 or len(models.parameters.mass) != count:
-        raise CfbError(
-            f"the models of a swarm have a leading axis of drones: commands are for {count}, the mass has shape "
-            f"{models.parameters.mass.shape}."
-        )
+    require_drones(models, count)
     if count > FEW:
         return _many(models, state, commands, hold, every)
     each = [(_one(models, i), _one(state, i)) for i in range(count)]
     prepared = tuple(prepare(model) for model, _ in each)
     dtype = jnp.result_type(models.parameters.mass, state.position, commands)
-    start = tuple(_begun(p, model, own, count - 1) for p, (model, own) in zip(prepared, each, strict=True))
+    start = tuple(begun(p, model, own, count - 1) for p, (model, own) in zip(prepared, each, strict=True))
     start = jax.tree.map(lambda x: x.astype(dtype), start)
     rows = commands.reshape(steps, 4 * count)
     if all(fits_one_kernel(model) for model, _ in each):
@@ -108,50 +109,12 @@ def _one(tree, index: int):
     return jax.tree.map(lambda x: x[index], tree)
 
 
-def _begun(prepared: Prepared, model: Quadrotor, state: State, others: int) -> Components:
-    """Components of a state, with room for so many other drones."""
-    found = unstack(begin(model, state), prepared.parameters.center_of_gravity)
-    zero = jnp.zeros_like(found.rotor_speed[0])
-    return replace(found, memory=_sensing(model, found.memory, [Vec(*(zero,) * (3 * sum(FORECAST)))] * others))
-
-
-def _place(model: Quadrotor) -> int:
-    return next(i for i, effect in enumerate(model.effects) if isinstance(effect, Downwash))
-
-
-def _sensing(model: Quadrotor, memory: tuple, others: Sequence[Vec]) -> tuple:
-    """Memory of all effects of a model with these other drones."""
-    return tuple(tuple(others) if i == _place(model) else own for i, own in enumerate(memory))
-
-
-def _wake(prepared: Prepared, at: Components) -> Other:
-    """A drone as others see it, except that the wake and its derivative are multiplied by the root of the mass.
-
-    It accelerates under thrust and gravity and turns with its body rate.
-    """
-    lever = rotate(at.quaternion, Vec.unstack(prepared.parameters.center_of_gravity))
-    thrust = rotors.loads_at(prepared.rotors, at.rotor_speed, 0.0 * at.rotor_speed).thrust.sum()
-    lifts = thrust > 0
-    size = jnp.where(lifts, jnp.sqrt(jnp.where(lifts, thrust, 1.0)), 0.0)
-    up = up_axis(at.quaternion)
-    acceleration = up * (thrust / prepared.parameters.mass) - Vec(0.0, 0.0, prepared.parameters.gravity)
-    turning = rotate(at.quaternion, at.body_rate).cross(up)
-    path, wake = (at.position - lever, at.velocity, acceleration), (-size * up, -size * turning)
-    return Other(path, wake)
-
-
-def _seen_by(prepared: Prepared, other: Other) -> Other:
-    """Another drone as the memory of this one holds it."""
-    root = 1 / jnp.sqrt(prepared.parameters.mass)
-    return other._replace(wake=tuple(part * root for part in other.wake))
-
-
 def _stepped(prepared: tuple[Prepared, ...], states: tuple[Components, ...], row: Array, plain: bool):
-    wakes = [_wake(p, at) for p, at in zip(prepared, states, strict=True)]
+    wakes = [wake_of(p, at) for p, at in zip(prepared, states, strict=True)]
     moved = []
     for i, (own, at) in enumerate(zip(prepared, states, strict=True)):
-        others = [_seen_by(own, wake).memory() for j, wake in enumerate(wakes) if j != i]
-        at = replace(at, memory=_sensing(own.model, at.memory, others))
+        others = [seen_by(own, wake).memory() for j, wake in enumerate(wakes) if j != i]
+        at = replace(at, memory=sensing(own.model, at.memory, others))
         moved.append(advance(replace(own, wrench_once=plain), at, Vec.unstack(row[4 * i : 4 * i + 4])))
     return tuple(moved)
 
@@ -166,10 +129,10 @@ _SYSTEM = System(_prepared, _stepped)
 def _many(models: Quadrotor, state: State, commands: Array, hold: int, every: int) -> Swarm:
     """A swarm in which every drone sees its neighbours only, and extrapolates their motion between exchanges."""
     steps, count = commands.shape[:2]
-    exchanged = _divisor(every, EXCHANGED_S / (hold * models.dt))
-    searched = _divisor(every // exchanged, SEARCHED_S / EXCHANGED_S)
+    exchanged = divisor(every, EXCHANGED_S / (hold * models.dt))
+    searched = divisor(every // exchanged, SEARCHED_S / EXCHANGED_S)
     prepared = jax.vmap(prepare)(models)
-    start = jax.vmap(lambda p, model, own: _begun(p, model, own, min(NEIGHBOURS, count - 1)))(prepared, models, state)
+    start = jax.vmap(lambda p, model, own: begun(p, model, own, min(NEIGHBOURS, count - 1)))(prepared, models, state)
     dtype = jnp.result_type(models.parameters.mass, state.position, commands)
     start = jax.tree.map(lambda x: x.astype(dtype), start)
     fits = fits_one_kernel(_one(models, 0))
@@ -181,20 +144,14 @@ def _many(models: Quadrotor, state: State, commands: Array, hold: int, every: in
 
     def exchange(near):
         def one(at, rows):
-            wakes = jax.vmap(_wake)(prepared, at)
-
-            def sensing(own, at, near):
-                others = [_seen_by(own, jax.tree.map(lambda x, j=j: x[j], wakes)).memory() for j in near]
-                return replace(at, memory=_sensing(own.model, at.memory, others))
-
-            at = jax.vmap(sensing)(prepared, at, near)
+            at = sense(prepared, at, near)
             return jax.vmap(flown, in_axes=(0, 0, 0, 1))(models, prepared, at, rows), None
 
         return one
 
     def search(carry, rows):
         at, neglected = carry
-        near, left = _neighbours(prepared, at)
+        near, left = neighbours(prepared, at)
         at = jax.lax.scan(exchange(near), at, rows)[0]
         return (at, jnp.maximum(neglected, left.astype(neglected.dtype))), None
 
@@ -206,54 +163,3 @@ def _many(models: Quadrotor, state: State, commands: Array, hold: int, every: in
     (_, neglected), kept = jax.lax.scan(some, (start, jnp.zeros((), dtype)), rows)
     center = prepared.parameters.center_of_gravity
     return Swarm(jax.vmap(jax.vmap(stack), in_axes=(0, None))(kept, center), neglected)
-
-
-def _divisor(number: int, most: float) -> int:
-    """Largest divisor of a number that is not above ``most``; 1 if there is none."""
-    return next((n for n in range(min(number, int(most + 1e-6)), 0, -1) if number % n == 0), 1)
-
-
-def _neighbours(prepared: Prepared, at: Components) -> tuple[Array, Array]:
-    """Indices (drones, NEIGHBOURS) of the strongest wakes near each drone, and the speed of the next strongest, m/s.
-
-    Only the `WINDOW` next drones on either side, sorted along x, are looked at, so that the cost grows no faster than
-    the swarm. Wakes are widened for the choice by the distance that two drones may approach each other until the next
-    one.
-    """
-    wakes = jax.lax.stop_gradient(jax.vmap(_wake)(prepared, at))
-    place, wake = wakes.path[0], wakes.wake[0]
-    x = place[0]
-    count = len(x)
-    order = jnp.argsort(x)
-    offsets = np.array([k for k in range(-min(WINDOW, count - 1), min(WINDOW, count - 1) + 1) if k])
-    ranks = jnp.argsort(order)[:, None] + offsets
-    there = (ranks >= 0) & (ranks < count)
-    others = order[jnp.clip(ranks, 0, count - 1)]
-
-    def speeds(own, here, others, there, wider):
-        effect = own.model.effects[_place(own.model)]
-        effect = replace(effect, width=effect.width + wider)
-
-        def one(other):
-            begun, wake = effect.wake_at(here, other, own.parameters)
-            air = effect.air_velocity(here - begun, wake)
-            return air.dot(air)
-
-        squares = jax.vmap(one)(jax.tree.map(lambda x: x[others], _seen_by(own, wakes)))
-        return jnp.where(there, squares, -1.0)
-
-    now, soon = (
-        jax.vmap(speeds, in_axes=(0, 0, 0, 0, None))(prepared, place, others, there, wider) for wider in (0.0, MARGIN)
-    )
-    likely = jnp.maximum(now, soon)
-    near = []
-    for _ in range(min(NEIGHBOURS, count - 1)):
-        near.append(jnp.argmax(likely, axis=1)[:, None])
-        likely = jnp.where(jnp.arange(len(offsets)) == near[-1], -1.0, likely)
-    left = jnp.sqrt(jnp.where(likely < 0, 0.0, now).max())
-    if count > WINDOW + 1:
-        # At the distance r beside a vertical axis, wherever along it, a wake is no faster than 0.505 w / r.
-        apart = x[order][WINDOW + 1 :] - x[order][: -WINDOW - 1]
-        strength = jnp.sqrt(wake.dot(wake).max() / MOMENTUM)
-        left = jnp.maximum(left, 0.505 * strength / jnp.maximum(apart.min(), 1e-3))
-    return jnp.take_along_axis(others, jnp.concatenate(near, axis=1), axis=1), left
