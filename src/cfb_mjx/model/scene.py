@@ -138,10 +138,7 @@ class Scene:
         if not wakes.interact(drone):
             return jax.vmap(begin)(drone, state)
         others = min(wakes.NEIGHBOURS, self.drones - 1)
-        at = jax.vmap(lambda own, model, state: wakes.begun(own, model, state, others))(
-            jax.vmap(prepare)(drone), drone, state
-        )
-        return replace(state, memory=stacked(at.memory))
+        return jax.vmap(lambda model, state: wakes.begin_among(model, state, others))(drone, state)
 
     def _require_one_world(self, drone: Quadrotor) -> None:
         if self.drones is None:

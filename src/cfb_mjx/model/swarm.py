@@ -25,13 +25,13 @@ from cfb_mjx.engine.lanes import System
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, advance, prepare
 from cfb_mjx.model.rollout import SYSTEM, fits_one_kernel, fly_rows, require_kept
-from cfb_mjx.model.state import Components, State, stack
+from cfb_mjx.model.state import Components, State, stack, unstack
 from cfb_mjx.model.vector import Vec
 from cfb_mjx.model.wakes import (
     FEW,
     NEIGHBOURS,
     SEARCHED_S,
-    begun,
+    begin_among,
     divisor,
     interact,
     neighbours,
@@ -84,7 +84,10 @@ def rollout_swarm(
     each = [(_one(models, i), _one(state, i)) for i in range(count)]
     prepared = tuple(prepare(model) for model, _ in each)
     dtype = jnp.result_type(models.parameters.mass, state.position, commands)
-    start = tuple(begun(p, model, own, count - 1) for p, (model, own) in zip(prepared, each, strict=True))
+    start = tuple(
+        unstack(begin_among(model, own, count - 1), p.parameters.center_of_gravity)
+        for p, (model, own) in zip(prepared, each, strict=True)
+    )
     start = jax.tree.map(lambda x: x.astype(dtype), start)
     rows = commands.reshape(steps, 4 * count)
     if all(fits_one_kernel(model) for model, _ in each):
@@ -132,7 +135,8 @@ def _many(models: Quadrotor, state: State, commands: Array, hold: int, every: in
     exchanged = divisor(every, EXCHANGED_S / (hold * models.dt))
     searched = divisor(every // exchanged, SEARCHED_S / EXCHANGED_S)
     prepared = jax.vmap(prepare)(models)
-    start = jax.vmap(lambda p, model, own: begun(p, model, own, min(NEIGHBOURS, count - 1)))(prepared, models, state)
+    start = jax.vmap(lambda model, own: begin_among(model, own, min(NEIGHBOURS, count - 1)))(models, state)
+    start = jax.vmap(lambda p, own: unstack(own, p.parameters.center_of_gravity))(prepared, start)
     dtype = jnp.result_type(models.parameters.mass, state.position, commands)
     start = jax.tree.map(lambda x: x.astype(dtype), start)
     fits = fits_one_kernel(_one(models, 0))

@@ -19,7 +19,7 @@ from cfb_mjx.model import rotors
 from cfb_mjx.model.effects import Downwash
 from cfb_mjx.model.effects.downwash import FORECAST, MOMENTUM, Other
 from cfb_mjx.model.quadrotor import Prepared, Quadrotor, begin
-from cfb_mjx.model.state import AnyArray, Components, State, unstack
+from cfb_mjx.model.state import AnyArray, Components, State, stacked, unstack
 from cfb_mjx.model.vector import Vec, rotate, up_axis
 
 FEW = 4
@@ -44,11 +44,11 @@ def interact(models: Quadrotor) -> bool:
     return any(isinstance(effect, Downwash) for effect in models.effects)
 
 
-def begun(prepared: Prepared, model: Quadrotor, state: State, others: int) -> Components:
-    """Components of a state, with room for so many other drones."""
-    found = unstack(begin(model, state), prepared.parameters.center_of_gravity)
-    zero = jnp.zeros_like(found.rotor_speed[0])
-    return replace(found, memory=sensing(model, found.memory, [Vec(*(zero,) * (3 * sum(FORECAST)))] * others))
+def begin_among(model: Quadrotor, state: State, others: int) -> State:
+    """Add the memory of a long steady flight to a state without memory, with room for so many other drones."""
+    at = unstack(begin(model, state), Vec(0.0, 0.0, 0.0))
+    unseen = Vec(*(jnp.zeros_like(at.rotor_speed[0]),) * (3 * sum(FORECAST)))
+    return replace(state, memory=stacked(sensing(model, at.memory, [unseen] * others)))
 
 
 def _place(model: Quadrotor) -> int:

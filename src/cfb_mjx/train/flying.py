@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.control.controllers import Controller
 from cfb_mjx.documents import is_named, load_named, refuse_unknown, told
-from cfb_mjx.envs.episode import reset, step
+from cfb_mjx.envs.episode import Episode, reset, step
 from cfb_mjx.envs.observation import Layout
 from cfb_mjx.envs.path import Path as Way
 from cfb_mjx.envs.target import TargetTask
@@ -65,6 +65,29 @@ def steps_flown(flown: Flight, drone: int = 0) -> int:
     return len(well) if well.all() else int(np.argmin(well))
 
 
+class Rows(NamedTuple):
+    """Targets of every command, as a path has them (`rows_along`)."""
+
+    target: Float[Array, "*steps 3"]
+    ahead: Float[Array, "*steps displacements"] | None
+    """How far the target will have moved after each of the controller's ``layout.preview_s``, m."""
+    later: Float[Array, "*steps 3"] | None
+    """Target after the command."""
+
+
+def rows_along(controller: Controller, path: Way, steps: int) -> Rows:
+    """Targets along a path, for a controller."""
+    layout, dt = getattr(controller, "layout", None), controller.control_dt_s
+    times = dt * jnp.arange(steps + 1)
+    places = jax.vmap(path)(times)
+    ahead = None
+    if isinstance(layout, Layout) and layout.preview_s:
+        horizons = jnp.asarray(layout.preview_s)
+        seen = jax.vmap(lambda time: jax.vmap(lambda ahead: path(time + ahead))(horizons))(times[:-1])
+        ahead = (seen - places[:-1, None]).reshape(steps, -1)
+    return Rows(places[:-1], ahead, places[1:])
+
+
 def fly(
     controller: Controller,
     task: TargetTask,
@@ -74,7 +97,8 @@ def fly(
     state: State | None = None,
     watch: Callable[[Any], Any] = lambda memory: None,
     targets: Float[Array, "steps 3"] | None = None,
-    path: Way | None = None,
+    path: Way | Rows | None = None,
+    between: Callable[[Episode, Rows], tuple[Episode, Rows]] | None = None,
 ) -> Flight:
     """Fly to the origin once, on a drone drawn by the task. Use ``vmap`` over ``key`` (and ``state``) for many flights.
 
@@ -91,6 +115,8 @@ def fly(
         targets: target of every command. With it, positions are in the world, and ``watched`` is the target.
         path: path of the target instead; policies that were trained to see ahead of it do so. ``watched`` is the
             target after every command, which the position after it should have reached.
+        between: function that is called before every command, and may change the episode and the target. It is also
+            called at the start, for the memory of effects that it adds to.
     """
     dt = controller.control_dt_s
     if dt < nominal.dt:
@@ -99,21 +125,20 @@ def fly(
     action = layout.action if isinstance(layout, Layout) else "motors"
     # Other controllers do not need the history that the episode keeps for a network, so keep it small.
     task = replace(task, layout=Layout(control_dt_s=dt, past_estimates=0, past_commands=0, action=action))
-    steps, ahead, later = round(seconds / dt) if targets is None else len(targets), None, None
-    if path is not None:
-        times = dt * jnp.arange(steps + 1)
-        places = jax.vmap(path)(times)
-        targets, later = places[:-1], places[1:]
-        if isinstance(layout, Layout) and layout.preview_s:
-            horizons = jnp.asarray(layout.preview_s)
-            seen = jax.vmap(lambda time: jax.vmap(lambda ahead: path(time + ahead))(horizons))(times[:-1])
-            ahead = (seen - targets[:, None]).reshape(steps, -1)
+    steps = round(seconds / dt) if targets is None else len(targets)
+    rows = Rows(targets, None, None) if targets is not None else path
+    if rows is not None and not isinstance(rows, Rows):
+        rows = rows_along(controller, rows, steps)
     episode = reset(task, nominal, key, state)
+    if between is not None:
+        episode, _ = between(episode, jax.tree.map(lambda x: x[0], rows))
     memory = controller.start(episode.estimate, task.action.settled(episode.motors))
 
-    def one(carry, course):
+    def one(carry, row):
         episode, memory, failed = carry
-        target, ahead, later = course
+        if between is not None:
+            episode, row = between(episode, row)
+        target, ahead, later = (None, None, None) if row is None else row
         if target is not None:
             # The estimate was relative to the last target; make it relative to this one.
             seen = replace(episode.estimate, position=episode.estimate.position + episode.target - target)
@@ -129,7 +154,7 @@ def fly(
         row = Flight(position, velocity, quaternion, body_rate, episode.motors, failed, watched, state.rotor_speed)
         return (episode, memory, failed), row
 
-    return jax.lax.scan(one, (episode, memory, jnp.asarray(False)), (targets, ahead, later), length=steps)[1]
+    return jax.lax.scan(one, (episode, memory, jnp.asarray(False)), rows, length=steps)[1]
 
 
 class Hover(NamedTuple):
