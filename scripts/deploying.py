@@ -12,6 +12,7 @@ from pathlib import Path
 from campaign import ROOT, facts_line
 
 from cfb_mjx.commands import Export
+from cfb_mjx.deploy.check import FREE_RAM
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.runtime import environment, set_up_xla
@@ -26,6 +27,7 @@ POLICIES = (
     "double-flip",
     "triple-flip",
     "double-flip-ppo",
+    "target --loadable",
 )
 NUMBERS, PAGE = ROOT / "benchmarks" / "deploying.json", ROOT / "docs" / "deploying.md"
 
@@ -34,8 +36,9 @@ def measure() -> dict:
     """Run `cfb export --check` on every policy and collect its numbers."""
     found = {}
     for name in POLICIES:
+        policy, *options = name.split()
         with tempfile.TemporaryDirectory() as folder:
-            exported = Export(name, Path(folder) / name, check=True).run()
+            exported = Export(policy, Path(folder) / policy, check=True, loadable="--loadable" in options).run()
         print(exported)
         if exported.complaint is not None:
             raise CfbError(exported.complaint)
@@ -64,7 +67,7 @@ def row(name: str, found: dict) -> str:
 def page(found: dict) -> str:
     """Write the text of docs/deploying.md."""
     rows = "\n".join(row(name, one) for name, one in found["policies"].items())
-    costs = next(iter(found["policies"].values()))["cortex_m4"]
+    costs, free_kb = next(iter(found["policies"].values()))["cortex_m4"], FREE_RAM / 1024
     return f"""# Onto the drone
 
 This page is for users who want to run a policy on a Crazyflie. `cfb export` turns the policy into C for the drone's
@@ -74,6 +77,7 @@ STM32F405: C11, single precision, static memory, and no function of the C librar
 cfb export target -o target-c --check              # a shipped policy; or policy.npz of cfb train
 cfb export double-flip -o flip-c --check           # holds a target, flips on demand
 cfb export target -o target-c --onnx target.onnx   # also for runtimes of ONNX
+cfb export target -o target-c --loadable           # takes new weights over the radio
 ```
 
 The output folder holds
@@ -111,6 +115,32 @@ as on this machine |
 
 Nothing here has been measured on a drone. A step is due every 8 ms, and the firmware's other tasks need processor time
 too.
+
+## New weights without flashing
+
+With `--loadable` the drone keeps a second set of weights in memory. Later policies are loaded over the radio, with
+`cflib`:
+
+```sh
+cfb export target -o target-c --loadable --check   # flash this once
+cfb export again.npz -o new-c --loadable           # trained again: the same network and observation
+python new-c/load_weights.py radio://0/80/2M/E7E7E7E7E7 new-c/weights.bin
+```
+
+- `weights.bin` holds the weights, the outputs of a hover with which the history begins, a hash of the architecture and
+  a CRC-32. The C takes only a complete set with the right CRC, of its own architecture, whose numbers are finite; each
+  refusal has a status of its own. The architecture is everything else that the C computes with: layers, activation,
+  observation, scales, ranges of the outputs.
+- The weights in flash fly until a set is complete and checked, and after a refusal. No set is written or taken in
+  flight.
+- The loaded set is lost when the drone is switched off.
+- The log variables `cfb.loaded`, `cfb.crc` and `cfb.weights` say which weights fly, and what became of the last set.
+- It costs memory: the row `target --loadable` of the table. `--check` compares it with the {free_kb:.0f} kB
+  that [the firmware's default build](https://github.com/bitcraze/crazyflie-firmware/pull/1700) for the Crazyflie 2
+  leaves free; `target-adaptive` and `track` need more, and their check fails.
+- It needs firmware since December 2025. Flips are exported without it.
+- It was never run on a drone, nor linked with the whole firmware. Tested are the C on this machine, with the weights in
+  flash also on an emulated processor, and app and script with stand-ins for the firmware and `cflib`.
 
 ## The interface
 

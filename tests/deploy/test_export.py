@@ -424,12 +424,14 @@ _FIRMWARE_FLAGS = """
 
 
 @pytest.mark.skipif(not cortex.has_compiler(), reason="arm-none-eabi-gcc is not installed")
-@pytest.mark.parametrize("name", ["target", "double-flip", "rates", "velocity", "ahead"])
+@pytest.mark.parametrize("name", ["target", "double-flip", "rates", "velocity", "ahead", "loadable"])
 def test_the_app_compiles_as_the_firmware_compiles_it(name, tmp_path):
     layouts = {"rates": {"action": "body_rates"}, "velocity": {"action": "velocity"}, "ahead": {"preview_s": (0.1,)}}
+    layouts["loadable"] = {"preview_s": (0.1,), "action": "position"}
     chosen = layouts.get(name)
     policy = None if chosen is None else random_policy(1, Layout(**chosen))
-    exported = export_policy(find_deployment(name) if policy is None else Deployment(name, policy), tmp_path / "c")
+    deployment = find_deployment(name) if policy is None else Deployment(name, policy, loadable=name == "loadable")
+    exported = export_policy(deployment, tmp_path / "c")
     objects = re.findall(r"obj-y \+= (\w+)\.o", (exported.folder / "Kbuild").read_text())
     assert "controller_out_of_tree" in objects
     for stem in objects:
@@ -555,6 +557,7 @@ REFUSED = {
     "pid": (["export", "pid"], "no such policy"),
     "knobs of a target": (["export", "target", "--knobs", "flip"], "flip policies"),
     "knobs twice": (["export", "double-flip", "--knobs", "flip"], "manoeuvre already"),
+    "loadable flip": (["export", "double-flip", "--loadable"], "cannot be loadable"),
     "a flip that holds": (["export", "flip", "--holder", "flip"], "needs a target policy"),
 }
 

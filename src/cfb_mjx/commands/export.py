@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -76,6 +76,8 @@ class Export(Command):
             Default: the one with which the settings of the flip were found.
         check: compile the C, compare it with JAX on 10 000 random sequences and in closed loop, and measure its cost.
             The size on the drone's processor needs arm-none-eabi-gcc, the number of instructions also qemu-system-arm.
+        loadable: keep a copy of the weights in memory that can be replaced over the radio, without flashing; writes
+            weights.bin too, a set that fits every export of the same architecture. Not for flips.
         onnx: write the policy as an ONNX model too; of a flip, the policy that turns. Needs the package onnx.
     """
 
@@ -84,13 +86,15 @@ class Export(Command):
     knobs: Annotated[str | None, tyro.conf.arg(metavar="NAME")] = None
     holder: Annotated[str | None, tyro.conf.arg(metavar="POLICY")] = None
     check: bool = False
+    loadable: bool = False
     onnx: Annotated[File, Ending((".onnx",), "an ONNX model must end in .onnx")] = None
 
     def run(self) -> Exported:
         """Write the C, and check it if a check was asked for.
 
         Raises:
-            CfbError: no such policy, a folder that cannot be written, no C compiler for the check, or no package onnx.
+            CfbError: no such policy, a flip with loadable weights, a folder that cannot be written, no C compiler for
+                the check, or no package onnx.
         """
         from cfb_mjx.runtime import configure_jax, environment
 
@@ -100,7 +104,7 @@ class Export(Command):
         from cfb_mjx.deploy.deployment import find_deployment
         from cfb_mjx.deploy.export import RESULTS, export_policy
 
-        deployment = find_deployment(self.policy, self.knobs, self.holder)
+        deployment = replace(find_deployment(self.policy, self.knobs, self.holder), loadable=self.loadable)
         if self.onnx is not None:
             # First, so that nothing is left behind where the package is missing.
             from cfb_mjx.control.onnx_file import write_onnx

@@ -21,6 +21,7 @@ from cfb_mjx.deploy import cortex
 from cfb_mjx.deploy.compiled import FLAGS, CompiledPolicy, compile_policy
 from cfb_mjx.deploy.deployment import Deployment
 from cfb_mjx.deploy.export import Exported
+from cfb_mjx.deploy.weights import FILE, GOOD
 from cfb_mjx.envs import StateEstimate, TargetTask, Task
 from cfb_mjx.envs.episode import Episode, reset, step
 from cfb_mjx.envs.task import with_room
@@ -195,6 +196,9 @@ NEAR_M = 1e-3
 """Largest distance between the flights of C and JAX."""
 FLASH, RAM, STEP_S = 64 * 1024, 8 * 1024, 1e-3
 """Limits of flash [bytes], memory [bytes] and time [s] of a step on the drone."""
+FREE_RAM = 29_044
+"""Limit of the memory with loadable weights, bytes: what the firmware's default build for the Crazyflie 2 leaves of its
+128 kB (github.com/bitcraze/crazyflie-firmware/pull/1700, 2026)."""
 STACK, FIRMWARE_STACK = 1000, 1800
 """Limit of the stack of a step, and the stack of the firmware's task that calls it (``STABILIZER_TASK_STACKSIZE``, 450
 words), bytes. The task's own functions need the rest."""
@@ -246,6 +250,7 @@ def check_export(exported: Exported) -> Check:
         Finding(f"commands of a second in closed loop: within {largest:.1e}", largest <= TOLERANCE),
         Finding(f"6 s of {what} in closed loop: within {1e3 * six.distance_m:.1e} mm of JAX", six.distance_m <= NEAR_M),
         *about_costs,
+        *([_loads(exported, compiled)] if deployment.loadable else []),
     ]
     numbers = {
         "policy": deployment.name,
@@ -258,6 +263,15 @@ def check_export(exported: Exported) -> Check:
     return Check(numbers, findings)
 
 
+def _loads(exported: Exported, compiled: CompiledPolicy) -> Finding:
+    """Whether the C takes its own weights as a set, and then gives the same commands."""
+    rows = random_inputs(np.random.default_rng(2), 16, 12, compiled.previews).reshape(192, -1)
+    compiled.reset()
+    flash, status = compiled.steps(rows), compiled.load_weights((exported.folder / FILE).read_bytes())
+    same = status == GOOD and np.array_equal(compiled.steps(rows), flash)
+    return Finding(f"{FILE}: status {status}, {'the same' if same else 'other'} commands as from flash", same)
+
+
 def _costs(exported: Exported, compiled: CompiledPolicy) -> tuple[dict[str, Any], list[Finding]]:
     """Cost of a step on the drone's processor: numbers and findings."""
     deployment, findings = exported.deployment, []
@@ -266,8 +280,9 @@ def _costs(exported: Exported, compiled: CompiledPolicy) -> tuple[dict[str, Any]
     if cortex.has_compiler():
         size = cortex.size(exported)
         found |= {"flash_bytes": size.flash, "ram_bytes": size.ram, "stack_bytes": size.stack}
-        said = f"{size.flash / 1024:.1f} of {FLASH // 1024} kB of flash, {size.ram} of {RAM} B of memory"
-        findings.append(Finding(f"Cortex-M4: {said}", size.flash <= FLASH and size.ram <= RAM))
+        ram = FREE_RAM if deployment.loadable else RAM
+        said = f"{size.flash / 1024:.1f} of {FLASH // 1024} kB of flash, {size.ram} of {ram} B of memory"
+        findings.append(Finding(f"Cortex-M4: {said}", size.flash <= FLASH and size.ram <= ram))
         said = f"at most {size.stack} of {STACK} B of stack, of the {FIRMWARE_STACK} B that the firmware's task has"
         findings.append(Finding(said, size.stack <= STACK))
     else:

@@ -53,6 +53,11 @@ class CompiledPolicy:
         """Begin a flip at the next step."""
         self._library.cfb_policy_set_flip(speed_mps, rate_radps)
 
+    def load_weights(self, data: bytes) -> int:
+        """Write a set of weights and let it fly; return its status, `cfb_weights_status_t`."""
+        self._library.cfb_weights_write(0, data, len(data))
+        return int(self._library.cfb_weights_apply())
+
     def step(self, position, velocity, quaternion, body_rate, target=(0.0, 0.0, 0.0)) -> np.ndarray:
         """Do one step; return the commands of M1..M4, (4,), float32."""
         return self.steps(np.concatenate([position, velocity, quaternion, body_rate, target])[None])[0]

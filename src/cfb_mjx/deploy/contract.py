@@ -9,6 +9,7 @@ from cfb_mjx import __version__
 from cfb_mjx.control.neural import WRITTEN
 from cfb_mjx.control.policy_file import PolicyFile, about_gru
 from cfb_mjx.deploy.deployment import CATCH_S, Deployment
+from cfb_mjx.deploy.weights import about_set
 from cfb_mjx.envs.observation import Layout
 from cfb_mjx.firmware.actions import ACTIONS
 from cfb_mjx.optional import not_none
@@ -53,6 +54,8 @@ def contract(deployment: Deployment) -> dict[str, Any]:
         "policies": {name: _policy(policy) for name, policy in deployment.policies.items()},
         "trained_on": trained,
     }
+    if deployment.loadable:
+        found["weights_set"] = about_set(deployment)
     if deployment.flips:
         ranges, manoeuvre = deployment.setpoint_ranges, not_none(deployment.manoeuvre)
         found["flip"] = {

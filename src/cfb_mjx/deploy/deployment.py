@@ -32,12 +32,21 @@ class Deployment:
         holder: policy that flies to targets.
         turner: policy of the flip; None: no flip.
         manoeuvre: rotations and knobs of the flip.
+        loadable: whether the C takes other weights without being flashed; not with a flip.
+
+    Raises:
+        CfbError: a flip with loadable weights.
     """
 
     name: str
     holder: PolicyFile
     turner: PolicyFile | None = None
     manoeuvre: ManoeuvreFile | None = None
+    loadable: bool = False
+
+    def __post_init__(self):
+        if self.loadable and self.flips:
+            raise CfbError(f"{self.name}: the weights of a flip cannot be loadable; export it without --loadable.")
 
     @property
     def flips(self) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
@@ -14,13 +15,16 @@ from cfb_mjx import __version__
 from cfb_mjx.control.policy_file import PolicyFile
 from cfb_mjx.deploy.contract import BLIND_STEPS, FROZEN_STEPS, LARGEST, contract
 from cfb_mjx.deploy.deployment import CATCH_S, Deployment
-from cfb_mjx.files import output_folder, plain, remove, together, write_texts
+from cfb_mjx.deploy.weights import FILE, HEADER, weight_arrays, weight_set
+from cfb_mjx.files import output_folder, plain, remove, replacing, together, write_texts
 from cfb_mjx.optional import not_none
 
 FIXED = ("cfb_network.h", "cfb_network.c", "cfb_pilot.h", "cfb_policy.h", "cfb_policy.c", "controller_out_of_tree.c")
 BUILD = ("Kbuild", "Makefile", "app-config", "README.md")
 LIBRARY = ("cfb_policy.c", "cfb_pilot.c", "cfb_network.c", "cfb_data.c")
 """Sources of the plain library."""
+LOADABLE = ("cfb_weights.h", "cfb_weights.c", "load_weights.py")
+"""Further files of a policy whose weights can be replaced without flashing."""
 PILOTS = {True: "cfb_pilot_flip.c", False: "cfb_pilot_hold.c"}
 """Both are exported under one name, so that no file of an earlier export remains beside a later one."""
 RESULTS = "check.json"
@@ -40,7 +44,8 @@ class Exported(NamedTuple):
     @property
     def sources(self) -> list[Path]:
         """Sources of the plain library."""
-        return [self.folder / name for name in LIBRARY]
+        more = [name for name in LOADABLE if name.endswith(".c")] if self.deployment.loadable else []
+        return [self.folder / name for name in (*LIBRARY, *more)]
 
 
 def export_policy(deployment: Deployment, folder: str | Path) -> Exported:
@@ -58,14 +63,18 @@ def export_policy(deployment: Deployment, folder: str | Path) -> Exported:
         texts = sources(deployment)
         write_texts(folder, texts)
         # These belong to the export that was overwritten.
-        for name in {RESULTS, CARD} - {*texts}:
+        for name in {RESULTS, CARD, FILE, *LOADABLE} - {*texts}:
             remove(folder / name)
+        if deployment.loadable:
+            with replacing(folder / FILE) as temporary:
+                temporary.write_bytes(weight_set(deployment))
     return Exported(folder, deployment)
 
 
 def sources(deployment: Deployment) -> dict[str, str]:
-    """Names and contents of all files of an export."""
-    texts = {name: _filled(_template(name), deployment) for name in (*FIXED, *BUILD)}
+    """Names and contents of all text files of an export."""
+    names = (*FIXED, *BUILD, *(LOADABLE if deployment.loadable else ()))
+    texts = {name: _filled(_template(name), deployment) for name in names}
     texts["cfb_pilot.c"] = _filled(_template(PILOTS[deployment.flips]), deployment)
     texts["cfb_sizes.h"] = _sizes(deployment)
     texts["cfb_data.h"] = _header(deployment)
@@ -103,6 +112,7 @@ def _abilities(deployment: Deployment) -> set[str]:
     layout = deployment.holder.controller.layout
     return {
         "flip" if deployment.flips else "no flip",
+        "loadable" if deployment.loadable else "fixed",
         "gru" if deployment.holder.controller.recurrent else "no gru",
         "previews" if layout.preview_s else "hold",
         "card" if _cards(deployment) else "no card",
@@ -165,6 +175,9 @@ def _marks(deployment: Deployment) -> dict[str, str]:
         "LARGEST_BITS": f"{np.float32(LARGEST).view(np.uint32):#x}",
         "BLIND_MS": f"{BLIND_STEPS * step_ms:g}",
         "FLIP": "",
+        "HOLDER": "cfb_weights_network()" if deployment.loadable else "&cfb_holder",
+        "HOVER": "cfb_weights_hover()" if deployment.loadable else "hover",
+        "MORE_SOURCES": " cfb_weights.c" if deployment.loadable else "",
     }
     if not deployment.flips:
         return marks
@@ -246,6 +259,10 @@ def _header(deployment: Deployment) -> str:
         for name, key in (("SPEED", "speed_mps"), ("RATE", "rate_radps")):
             low, high = ranges[key]
             values |= {f"CFB_LEAST_{name}": literal(low), f"CFB_LARGEST_{name}": literal(high)}
+    if deployment.loadable:
+        names = ("MAGIC", "VERSION", "ARCHITECTURE", "COUNT", "CRC")
+        of_set = zip(names, HEADER.unpack_from(weight_set(deployment)), strict=True)
+        values |= {f"CFB_SET_{name}": f"{value:#x}u" for name, value in of_set}
     defines = "\n".join(f"#define {name} {value}" for name, value in values.items())
     networks = "\n".join(f"extern const cfb_network_t cfb_{name};" for name in deployment.policies)
     head = f"/* Generated for {deployment.name}: settings, and where the weights are. */"
@@ -256,24 +273,37 @@ def _data(deployment: Deployment) -> str:
     parts = [f'/* Generated for {deployment.name}: weights. */\n#include "cfb_data.h"\n\n#include <stddef.h>\n']
     for name, policy in deployment.policies.items():
         parts.append(_network(name, policy))
+    if deployment.loadable:
+        parts.append(_loaded(deployment.holder))
     return "\n".join(parts)
 
 
 def _network(name: str, policy: PolicyFile) -> str:
-    network, layout = policy.controller.network, policy.controller.layout
-    parts, layers = [f"/* weights_sha256 {policy.weights_sha256} */"], []
-    for i, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
-        # One row per output, so that the sums read memory in order.
-        parts += [
-            _array(f"{name}_weight_{i}", np.asarray(weight, np.float32).T),
-            _array(f"{name}_bias_{i}", np.asarray(bias, np.float32)),
-        ]
+    arrays, scales = weight_arrays(policy), policy.controller.layout.setpoint_scales
+    written = {key: _array(f"{name}_{key}", x) for key, x in arrays.items()}
+    if scales:
+        unit = {key: written.pop(key) for key in arrays if key.startswith("gru")}
+        written |= {"scales": _array(f"{name}_setpoint_scales", np.asarray(scales, np.float32))} | unit
+    parts = [f"/* weights_sha256 {policy.weights_sha256} */", *written.values()]
+    where = {key: f"{name}_{key}" for key in arrays}
+    return "\n\n".join([*parts, _structure(name, policy, where, f"{name}_setpoint_scales" if scales else "NULL")])
+
+
+def _loaded(policy: PolicyFile) -> str:
+    """The same network with the weights of the set in memory, which begins with four outputs of a hover."""
+    where, at = {}, 4
+    for key, x in weight_arrays(policy).items():
+        where[key] = f"cfb_written.numbers + {at}"
+        at += x.size
+    return '#include "cfb_weights.h"\n\n' + _structure("loaded", policy, where, "NULL")
+
+
+def _structure(name: str, policy: PolicyFile, where: Mapping[str, str], scales: str) -> str:
+    """A network whose arrays are at the C expressions ``where``."""
+    network, layout, layers = policy.controller.network, policy.controller.layout, []
+    for i, weight in enumerate(network.weights):
         inputs, outputs = weight.shape
-        layers.append(f"    {{{inputs}, {outputs}, {name}_weight_{i}, {name}_bias_{i}}},")
-    scales = "NULL"
-    if layout.setpoint_scales:
-        scales = f"{name}_setpoint_scales"
-        parts.append(_array(scales, np.asarray(layout.setpoint_scales, np.float32)))
+        layers.append(f"    {{{inputs}, {outputs}, {where[f'weight_{i}']}, {where[f'bias_{i}']}}},")
     fields = {
         "position": int(layout.position),
         "body_position": int(layout.body_position),
@@ -300,16 +330,13 @@ def _network(name: str, policy: PolicyFile) -> str:
         "layers": len(layers),
         "layer": f"{name}_layers",
     }
-    if (gru := network.gru) is not None:
+    if network.gru is not None:
         inputs, size = network.sizes[network.before]
-        arrays = [f"{name}_gru_{part}" for part in ("input_weight", "input_bias", "hidden_weight", "hidden_bias")]
-        values = (gru.input_weight.T, gru.input_bias, gru.hidden_weight.T, gru.hidden_bias)
-        parts += [_array(array, np.asarray(x, np.float32)) for array, x in zip(arrays, values, strict=True)]
-        fields |= {"before": network.before, "gru": f"{{{inputs}, {size}, {', '.join(arrays)}}}"}
-    parts.append(f"static const cfb_layer_t {name}_layers[] = {{\n" + "\n".join(layers) + "\n};")
+        arrays = ", ".join(value for key, value in where.items() if key.startswith("gru"))
+        fields |= {"before": network.before, "gru": f"{{{inputs}, {size}, {arrays}}}"}
+    table = f"static const cfb_layer_t {name}_layers[] = {{\n" + "\n".join(layers) + "\n};"
     body = "\n".join(f"    .{key} = {value}," for key, value in fields.items())
-    parts.append(f"const cfb_network_t cfb_{name} = {{\n{body}\n}};\n")
-    return "\n\n".join(parts)
+    return f"{table}\n\nconst cfb_network_t cfb_{name} = {{\n{body}\n}};\n"
 
 
 def _array(name: str, values: np.ndarray) -> str:

@@ -11,9 +11,14 @@
 //@previews
 #include "cfb_policy.h"
 //@end
+//@loadable
+#include "cfb_weights.h"
+//@end
 
 static cfb_memory_t memory;
+//@fixed
 static const float hover[4] = CFB_HOVER_OUTPUTS;
+//@end
 //@previews
 static float preview[3 * CFB_POLICY_PREVIEWS];
 static const float times[] = CFB_PREVIEW_TIMES;
@@ -29,15 +34,15 @@ void cfb_pilot_reset(void) {}
 //@end
 
 void cfb_pilot_start(const cfb_estimate_t *estimate) {
-  cfb_network_start(&cfb_holder, &memory, estimate, hover);
+  cfb_network_start(@HOLDER@, &memory, estimate, @HOVER@);
 }
 
 void cfb_pilot_command(const cfb_estimate_t *estimate, float command[4]) {
 //@previews
-  cfb_network_command(&cfb_holder, &memory, estimate, preview, command);
+  cfb_network_command(@HOLDER@, &memory, estimate, preview, command);
 //@end
 //@hold
-  cfb_network_command(&cfb_holder, &memory, estimate, NULL, command);
+  cfb_network_command(@HOLDER@, &memory, estimate, NULL, command);
 //@end
-  cfb_network_remember(&cfb_holder, &memory, estimate, command);
+  cfb_network_remember(@HOLDER@, &memory, estimate, command);
 }

@@ -21,10 +21,16 @@
 #include "attitude_controller.h"
 //@end
 #include "log.h"
+//@loadable
+#include "mem.h"
+//@end
 #include "param.h"
 #include "stabilizer_types.h"
 
 #include "cfb_policy.h"
+//@loadable
+#include "cfb_weights.h"
+//@end
 
 #define RADIANS 0.01745329252f
 //@loop
@@ -36,6 +42,10 @@ static uint32_t period, latest;
 static bool running;
 static float command[4];
 static uint8_t faultNow;
+//@loadable
+static uint8_t weightsLoaded, weightsStatus;
+static uint32_t weightsCrc = CFB_SET_CRC;
+//@end
 //@flip
 static uint8_t flip, phaseNow;
 static float flipSpeed = CFB_FLIP_SPEED_MPS, flipRate = CFB_FLIP_RATE_RADPS;
@@ -111,6 +121,34 @@ static void stop(control_t *control) {
   for (int motor = 0; motor < 4; motor++) control->normalizedForces[motor] = 0.0f;
 }
 
+//@loadable
+static uint32_t weightsSize(const uint8_t id) {
+  (void)id;
+  return sizeof(cfb_weights_t) + 1;
+}
+
+/* Called by the firmware's memory task: the set, and behind it one byte whose writing makes the set fly. */
+static bool weightsWrite(const uint8_t id, const uint32_t address, const uint8_t length, const uint8_t *bytes) {
+  (void)id;
+  const bool apply = address == sizeof(cfb_weights_t);
+  /* Slow, and flies nothing: the controller may interrupt it. */
+  if (apply) cfb_weights_check();
+  /* Whether it flies and which set it would fly, as one: afterwards, a flight that begins flies a set that is whole. */
+  taskENTER_CRITICAL();
+  const bool still = !running;
+  if (still && apply) cfb_weights_apply();
+  if (still && !apply) cfb_weights_unload();
+  taskEXIT_CRITICAL();
+  const bool done = still && (apply ? cfb_weights_loaded() : cfb_weights_write(address, bytes, length));
+  weightsLoaded = (uint8_t)cfb_weights_loaded();
+  weightsStatus = (uint8_t)cfb_weights_status();
+  weightsCrc = cfb_weights_crc();
+  return done;
+}
+
+static const MemoryHandlerDef_t weightsMemory = {.type = MEM_TYPE_APP, .getSize = weightsSize, .write = weightsWrite};
+
+//@end
 void appMain(void) {
   for (;;) vTaskDelay(M2T(2000));
 }
@@ -121,6 +159,12 @@ void controllerOutOfTreeInit(void) {
   cfb_policy_reset();
 //@loop
   controllerPidInit();
+//@end
+//@loadable
+  /* Once: it is called again whenever this controller is selected, when the firmware takes no more memories. */
+  static bool registered;
+  if (!registered) memoryRegisterHandler(&weightsMemory);
+  registered = true;
 //@end
 }
 
@@ -222,6 +266,13 @@ LOG_ADD(LOG_FLOAT, set4, &command[3])
 //@end
 /** 0: fine, 1: blind, 2: stopped. */
 LOG_ADD(LOG_UINT8, fault, &faultNow)
+//@loadable
+/** Weights that fly, 0: those in flash, 1: those that were loaded; and their CRC. */
+LOG_ADD(LOG_UINT8, loaded, &weightsLoaded)
+LOG_ADD(LOG_UINT32, crc, &weightsCrc)
+/** What became of the set that was written: cfb_weights_status_t. */
+LOG_ADD(LOG_UINT8, weights, &weightsStatus)
+//@end
 //@flip
 /** 0: hold, 1: climb, 2: turn, 3: catch. */
 LOG_ADD(LOG_UINT8, phase, &phaseNow)
