@@ -123,7 +123,7 @@ class Effect(eqx.Module):
         raise TypeError(f"{cls.__name__} must define neutral(), which returns the effect at values where it vanishes")
 
     @classmethod
-    def migrated(cls, values: Mapping[str, Any], parameters: Parameters | None) -> Mapping[str, Any]:
+    def migrated(cls, values: Mapping, parameters: Parameters | None) -> Mapping:
         """Translate the fields of an earlier version's model file into the present fields.
 
         Args:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from numbers import Real
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -46,7 +46,7 @@ class Gyroscopic(Effect):
         return cls(scale=0.0)
 
     @classmethod
-    def migrated(cls, values: Mapping[str, Any], parameters: Parameters | None) -> Mapping[str, Any]:
+    def migrated(cls, values: Mapping, parameters: Parameters | None) -> Mapping:
         if "rotor_inertia" not in values:
             return values
         values = dict(values)

@@ -15,7 +15,7 @@ file with a conductance and no ``felt`` also means 0, as in versions in which wi
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 from jaxtyping import Array, Float
@@ -64,7 +64,7 @@ class Wind(Effect):
         return cls(velocity=0.0, conductance=0.02)
 
     @classmethod
-    def migrated(cls, values: Mapping[str, Any], parameters: Parameters | None) -> Mapping[str, Any]:
+    def migrated(cls, values: Mapping, parameters: Parameters | None) -> Mapping:
         # In earlier versions winds were fitted as forces that no other effect felt.
         before = "felt" not in values and values.get("conductance", 0) != 0
         return {**values, "felt": 0.0} if before else values
