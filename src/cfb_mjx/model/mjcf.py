@@ -58,6 +58,8 @@ def compiled_scene(path: str) -> mujoco.MjModel:
     body = spec.body(BODY_NAME)
     if body is None or not (list(body.joints) or list(body.geoms)):
         _add_drone(spec, body)
+    # MuJoCo's shortcut for bodies with their centre of gravity at their origin; a drone's is where the parameters say.
+    not_none(spec.body(BODY_NAME)).simple = 0
     model = compiled(path, spec)
     body = model.body(BODY_NAME)
     if body.jntnum[0] != 1 or model.jnt_type[body.jntadr[0]] != mujoco.mjtJoint.mjJNT_FREE:
