@@ -223,7 +223,9 @@ class Scene:
 
     def _whole(self, places: tuple[np.ndarray, np.ndarray], own: Array, others: AnyArray) -> Array:
         """Numbers of the drone and of the others, in MuJoCo's order."""
-        return jnp.zeros(len(own) + len(others), own.dtype).at[places[0]].set(own).at[places[1]].set(others)
+        # Not by setting elements of an array: jaxlib 0.10 aborts while it fuses several of those, with the option of
+        # `cfb_mjx.runtime.XLA_CPU_FLAGS`.
+        return jnp.concatenate([own, others])[np.argsort(np.concatenate(places))]
 
     def __eq__(self, other) -> bool:
         return type(other) is Scene and (self.mjcf, self.engine) == (other.mjcf, other.engine)
