@@ -75,6 +75,7 @@ def fly(
     watch: Callable[[Any], Any] = lambda memory: None,
     targets: Float[Array, "steps 3"] | None = None,
     path: Way | None = None,
+    stop: Callable[[Any], Bool[Array, ""]] | None = None,
 ) -> Flight:
     """Fly to the origin once, on a drone drawn by the task. Use ``vmap`` over ``key`` (and ``state``) for many flights.
 
@@ -91,6 +92,7 @@ def fly(
         targets: target of every command. With it, positions are in the world, and ``watched`` is the target.
         path: path of the target instead; policies that were trained to see ahead of it do so. ``watched`` is the
             target after every command, which the position after it should have reached.
+        stop: function of the controller's memory: whether its motors stop, whatever it commands. Default: never.
     """
     dt = controller.control_dt_s
     if dt < nominal.dt:
@@ -120,7 +122,7 @@ def fly(
             episode = replace(episode, origin=target, target=target, estimate=seen)
         given = () if ahead is None else (ahead,)
         memory, command = controller.command(memory, episode.estimate, *given)
-        episode, outcome = step(task, episode, command)
+        episode, outcome = step(task, episode, command, stopped=None if stop is None else stop(memory))
         failed = failed | outcome.failed
         state = episode.state
         moving = (state.position, state.velocity, state.quaternion, state.body_rate)
