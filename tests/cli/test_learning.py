@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from cfb_mjx.logs import read_log
 from cfb_mjx.parameters import load_model_file, save_model_file
 from cfb_mjx.train.measuring import summary
 
@@ -95,6 +96,25 @@ def test_the_firmwares_pid_holds_hover_and_steps_slowly(cfb, tmp_path):
     # Its velocity limit is 1 m/s per axis, with a tenth on top.
     assert 0.9 < step["peak_speed_mps"] < 1.6
     assert step["arrival_s"] is None
+
+
+def test_the_firmwares_pid_lands(cfb, tmp_path):
+    """On two devices, which take turns with MuJoCo's floor."""
+    names = ("json", "figure", "log", "recording")
+    files = [tmp_path / f"landed.{end}" for end in ("json", "png", "mcap", "rrd")]
+    options = [word for name, path in zip(names, files, strict=True) for word in (f"--{name}", path)]
+    done = cfb("fly", "pid", "--task", "land", "--plants", 4, "--devices", 2, *options)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(files[0].read_text())
+    assert result["success_rate"] == 1
+    assert 0 < result["vertical_speed_mps"] < 0.3
+    assert result["quantiles"]["distance_mm"]["0.95"] < 100
+    assert "tilt [deg]" in done.stdout
+    assert all(path.stat().st_size > 10_000 for path in files[1:])
+    log = read_log(files[2])
+    assert log.position[0, 2] > 0.85
+    np.testing.assert_allclose(log.position[-1, 2], 0.014, atol=0.001)
+    np.testing.assert_array_equal(log.command[-100:], 0)
 
 
 def test_a_double_flip_by_its_name(cfb, tmp_path):
@@ -188,3 +208,17 @@ def test_a_drone_that_diverged_failed_and_is_in_no_mean():
     alone = summary("hover", {k: v[1:2] for k, v in measured.items()}, diverged=np.array([True]))
     assert alone == {"mean_distance_mm": None, "command_std": None, "failed": True, "diverged": 1}
     assert "diverged" not in summary("hover", {k: v[:1] for k, v in measured.items()})
+
+
+def test_a_landing_that_touched_nothing_is_in_no_mean():
+    touched = np.array([0.1, np.nan, 0.5])
+    measured = {key: touched for key in ("vertical_speed_mps", "horizontal_speed_mps", "tilt_deg")}
+    measured |= {"distance_m": np.array([0.01, 9.0, 0.03]), "failed": np.zeros(3, bool)}
+    found = summary("land", measured | {"landed": np.array([True, False, False])})
+    assert found["vertical_speed_mps"] == pytest.approx(0.3)
+    assert found["distance_mm"] == pytest.approx(20.0)
+    assert found["success_rate"] == pytest.approx(1 / 3)
+    assert found["quantiles"]["distance_mm"]["0.95"] == pytest.approx(10.0)
+    alone = summary("land", {k: v[1:2] for k, v in measured.items()} | {"landed": np.array([False])})
+    assert alone["landed"] is False
+    assert alone["tilt_deg"] is None

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from cfb_mjx.parameters import ModelFile
     from cfb_mjx.train.flying import Flight
 
-_UNITS = {"mm": "mm", "s": "s", "mps": "m/s", "m": "m", "radps": "rad/s"}
+_UNITS = {"mm": "mm", "s": "s", "mps": "m/s", "m": "m", "radps": "rad/s", "deg": "deg"}
 _FLOWN = ("controller", "task", "model", "plants", "magnitude", "gyro", "knobs", "path", "environment")
 """Keys of the results that say what was flown."""
 _ROUNDS = 20
@@ -67,6 +67,9 @@ class Fly(Command):
     - step: a step of the target by 6 m to one side.
     - recover: the drone starts thrown at 3 m/s and tilted by 60 deg.
     - track: follow a path from hover at its beginning; the first 4 s of the figure eight are not counted.
+    - land: from about 1 m above a pad and up to 1 m beside it, onto a floor whose cushion of air lifts the drone
+      (ground_effect, with published numbers unless the model has its own). The motors stop when the estimate says that
+      it has touched down. Landed: slower than 0.3 m/s at the first contact, and at rest on its feet within 10 cm.
     - flip, double-flip, triple-flip: climb, turn about the x axis, and return to the start. `cfb fly double-flip` is
       short for `cfb fly flip --task double-flip`.
 
@@ -111,7 +114,7 @@ class Fly(Command):
     """
 
     controller: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONTROLLER")]
-    task: Literal["hover", "step", "recover", "track", "flip", "double-flip", "triple-flip"] | None = None
+    task: Literal["hover", "step", "recover", "track", "land", "flip", "double-flip", "triple-flip"] | None = None
     model: Model = "cfb-guards"
     plants: int = 1
     magnitude: Annotated[float, Within(0)] = 0.0

@@ -195,7 +195,11 @@ def privileged(task: Task, nominal: Quadrotor, episode: Episode) -> Float[Array,
 
 
 def step(
-    task: Task, episode: Episode, command: Float[Array, "4"], prepared: Prepared | None = None
+    task: Task,
+    episode: Episode,
+    command: Float[Array, "4"],
+    prepared: Prepared | None = None,
+    stopped: Bool[Array, ""] | None = None,
 ) -> tuple[Episode, Outcome]:
     """Fly ``command`` [0 to 1] for one control step.
 
@@ -207,6 +211,7 @@ def step(
         command: outputs of the policy, commands of M1..M4 unless ``task.layout.action`` says otherwise; clipped to
             [0, 1].
         prepared: `prepare(episode.model)`, if it has been computed already.
+        stopped: whether the motors are switched off, whatever is commanded, and whatever the firmware's loop does.
 
     Returns:
         The episode after the step, and the outcome.
@@ -218,7 +223,8 @@ def step(
     hold, noise = task.hold(model), task.noise
     scale = jnp.array([noise.state_velocity_mps] * 3 + [noise.state_rate_radps] * 3, command.dtype)
     kicks = scale * jax.random.normal(of_state, (hold, 6), command.dtype)
-    row, center = Vec.unstack(command), prepared.parameters.center_of_gravity
+    on = 1.0 if stopped is None else jnp.where(stopped, 0.0, 1.0)
+    row, center = Vec.unstack(on * command), prepared.parameters.center_of_gravity
 
     def fly(carry: tuple[Components, tuple[InnerLoop, Array] | None], kick: Vec):
         at, beneath = carry
@@ -226,7 +232,8 @@ def step(
         if beneath is not None:
             # As arrays that XLA must not take apart again; see below.
             measured = jax.lax.optimization_barrier(stack(replace(at, memory=()), center))
-            beneath = follow(task.action, beneath[0], measured, command, episode.target)
+            loop, motors = follow(task.action, beneath[0], measured, command, episode.target)
+            beneath = loop, on * motors
             motors = Vec.unstack(jax.lax.optimization_barrier(beneath[1]))
         at = advance(prepared, at, motors)
         velocity, body_rate = at.velocity + Vec(*kick[:3]), at.body_rate + Vec(*kick[3:])
@@ -238,7 +245,7 @@ def step(
     beneath = None if episode.loop is None else (episode.loop, command)
     begun = unstack(episode.state, center), beneath
     (moved, beneath), (passed, commanded) = jax.lax.scan(fly, begun, Vec.unstack(kicks))
-    loop, motors = (None, command) if beneath is None else (beneath[0], jnp.mean(not_none(commanded), axis=0))
+    loop, motors = (None, on * command) if beneath is None else (beneath[0], jnp.mean(not_none(commanded), axis=0))
     state, poses = stack(moved, center), _pose(stack(passed, center))
     finite = _finite(state)
     state = choose(finite, state, episode.state)

@@ -273,7 +273,11 @@ class Scene:
 
     def _whole(self, places: tuple[np.ndarray, np.ndarray], own: Array, others: AnyArray) -> Array:
         """Numbers of the drone and of the others, in MuJoCo's order."""
-        return jnp.zeros(own.size + len(others), own.dtype).at[places[0]].set(own).at[places[1]].set(others)
+        # Not by setting elements of an array: jaxlib 0.10 aborts while it fuses several of those, with the option of
+        # `cfb_mjx.runtime.XLA_CPU_FLAGS`.
+        return jnp.concatenate([own.reshape(-1), others])[
+            np.argsort(np.concatenate([places[0].reshape(-1), places[1]]))
+        ]
 
     def __eq__(self, other) -> bool:
         return type(other) is Scene and self._key == other._key

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -136,9 +137,10 @@ def by_c(world: World, inputs: Inputs) -> Moved:
     model = compiled_scene(world)
 
     def step(rows: np.ndarray) -> np.ndarray:
-        worker = _worker(world, len(rows))
-        worker.take(_taken(world, rows))
-        return worker.step()
+        with _TURN:
+            worker = _worker(world, len(rows))
+            worker.take(_taken(world, rows))
+            return worker.step()
 
     ends = np.cumsum([model.nq, model.nv, model.na, model.nv])
     return Moved(*jnp.split(on_host(step, int(ends[-1]), _packed(inputs)), ends[:-1]))
@@ -150,10 +152,11 @@ def accelerations_by_c(world: World, inputs: Inputs) -> Float[AnyArray, " nv"]:
     model = compiled_scene(world)
 
     def accelerate(rows: np.ndarray) -> np.ndarray:
-        worker = _worker(world, len(rows))
-        worker.take(_taken(world, rows))
-        worker.batch.forward()
-        return worker.acceleration
+        with _TURN:
+            worker = _worker(world, len(rows))
+            worker.take(_taken(world, rows))
+            worker.batch.forward()
+            return worker.acceleration.copy()
 
     return on_host(accelerate, model.nv, _packed(inputs))
 
@@ -217,10 +220,12 @@ def cast_by_c(
     own, rays = _packed(inputs), directions.shape[0]
 
     def cast(rows: np.ndarray) -> np.ndarray:
-        worker, ray = _worker(world, len(rows)), rows[:, own.size :]
-        worker.take(_taken(world, rows))
+        ray = rows[:, own.size :]
         starts, ways = ray[:, None, :3], ray[:, 3:].reshape(len(rows), rays, 3)
-        return np.concatenate(worker.batch.ray(starts, ways, bodyexclude=unseen)[:2], axis=1)
+        with _TURN:
+            worker = _worker(world, len(rows))
+            worker.take(_taken(world, rows))
+            return np.concatenate(worker.batch.ray(starts, ways, bodyexclude=unseen)[:2], axis=1)
 
     found = on_host(cast, 2 * rays, jnp.concatenate([own, origin, directions.reshape(-1)]))
     return found[:rays], found[rays:].astype(jnp.int32)
@@ -264,6 +269,10 @@ class _Worker:
         """Advance all simulations by one step; return positions, velocities, activations and constraint forces."""
         self.batch.step()
         return np.concatenate([*self.state[:3], self.constraint], axis=1)
+
+
+_TURN = threading.Lock()
+"""Held while a worker is set, computes and is read: each device calls from a thread of its own."""
 
 
 @functools.lru_cache(maxsize=4)

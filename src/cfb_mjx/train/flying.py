@@ -99,6 +99,7 @@ def fly(
     targets: Float[Array, "steps 3"] | None = None,
     path: Way | Rows | None = None,
     between: Callable[[Episode, Rows], tuple[Episode, Rows]] | None = None,
+    stop: Callable[[Any], Bool[Array, ""]] | None = None,
 ) -> Flight:
     """Fly to the origin once, on a drone drawn by the task. Use ``vmap`` over ``key`` (and ``state``) for many flights.
 
@@ -117,6 +118,7 @@ def fly(
             target after every command, which the position after it should have reached.
         between: function that is called before every command, and may change the episode and the target. It is also
             called at the start, for the memory of effects that it adds to.
+        stop: function of the controller's memory: whether its motors stop, whatever it commands. Default: never.
     """
     dt = controller.control_dt_s
     if dt < nominal.dt:
@@ -145,7 +147,7 @@ def fly(
             episode = replace(episode, origin=target, target=target, estimate=seen)
         given = () if ahead is None else (ahead,)
         memory, command = controller.command(memory, episode.estimate, *given)
-        episode, outcome = step(task, episode, command)
+        episode, outcome = step(task, episode, command, stopped=None if stop is None else stop(memory))
         failed = failed | outcome.failed
         state = episode.state
         moving = (state.position, state.velocity, state.quaternion, state.body_rate)

@@ -18,6 +18,7 @@ from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.train.flips import FLIPS, flips
 from cfb_mjx.train.flying import Flight, hover, recovery, six_metres
+from cfb_mjx.train.landing import land
 from cfb_mjx.train.tracking import Course, track
 
 TESTS: dict[str, Callable[..., tuple[Any, Flight]]] = {
@@ -25,9 +26,12 @@ TESTS: dict[str, Callable[..., tuple[Any, Flight]]] = {
     "step": six_metres,
     "recover": recovery,
     "track": track,
+    "land": land,
 }
 """Tests by name; each takes controller, task, nominal drone and keys, and returns measurements and flights."""
 
+_ENDS = {"recover": "recovered", "land": "landed"}
+"""Words for the success of a single flight of a test."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
@@ -100,11 +104,16 @@ def summary(
     elif test == "recover":
         values = {key: numbers[key] for key in ("lost_height_m", "final_distance_m")}
         good = numbers["recovered"] & ~diverged
+    elif test == "land":
+        values = {key: numbers[key] for key in ("vertical_speed_mps", "horizontal_speed_mps", "tilt_deg")}
+        values |= {"distance_mm": 1e3 * numbers["distance_m"]}
+        good = numbers["landed"] & ~diverged
     else:
         values = {key: value for key, value in numbers.items() if key != "failed"}
         good = completed & ~diverged
-    # The numbers of a failed flip are meaningless, and some are infinite.
+    # The numbers of a failed flip are meaningless, and some are infinite; those of a contact that never was are NaN.
     counted = good if completed is not None and good.any() else ~diverged
+    counted = counted & ~np.isnan(numbers["tilt_deg"]) if test == "land" else counted
     result: dict[str, Any] = {
         key: _finite(np.mean(value[counted])) if counted.any() else None for key, value in values.items()
     }
@@ -117,8 +126,8 @@ def summary(
             key: {f"{q:g}": _finite(np.quantile(value[good], q)) if good.any() else None for q in QUANTILES}
             for key, value in values.items()
         }
-    elif test == "recover":
-        result["recovered"] = bool(good[0])
+    elif test in _ENDS:
+        result[_ENDS[test]] = bool(good[0])
     elif completed is not None:
         result["completed"] = bool(good[0])
     return result

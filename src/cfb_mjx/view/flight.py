@@ -95,6 +95,39 @@ def track_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
         save(figure, path)
 
 
+def land_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
+    """Draw landings: from the side, and height, vertical speed and command over time.
+
+    Args:
+        flown: a `cfb_mjx.train.flying.Flight` from `cfb_mjx.train.landing.land`, axes (drones, steps).
+        dt: time between two commands, s.
+        path: figure to write.
+        title: title of the figure.
+    """
+    path = check_path(path)
+    position, target = (np.asarray(x)[:_SHOWN] for x in (flown.position, flown.watched))
+    time, count = dt * (1 + np.arange(position.shape[1])), len(flown.position)
+    fade = 1.0 if count == 1 else 0.3
+    with context():
+        figure = new_figure(8.4, 4.2)
+        grid = figure.add_gridspec(3, 2, width_ratios=(1.15, 1))
+        side = figure.add_subplot(grid[:, 0])
+        for ways, label, colour, style in ((position, "flown", _BLUE, "-"), (target, "target", _RED, "--")):
+            away = np.linalg.norm(ways[..., :2], axis=-1)
+            side.plot(away.T, ways[..., 2].T, colour, linestyle=style, linewidth=0.8, alpha=fade)[0].set_label(label)
+        side.axhline(0.0, color=MEASURED, linewidth=0.8)
+        side.set(xlabel="horizontal distance from the pad, m", ylabel="height, m")
+        side.legend(loc="best")
+        rows = (
+            ("height, m", position[..., 2]),
+            ("vertical speed, m/s", np.asarray(flown.velocity)[:_SHOWN, :, 2]),
+            ("command, M1", np.asarray(flown.command)[:_SHOWN, :, 0]),
+        )
+        _over_time(figure, grid, time, rows, time[-1], fade)
+        _finish(figure, title, count)
+        save(figure, path)
+
+
 def _over_time(figure, grid, time: np.ndarray, rows, until: float, fade: float) -> list:
     """Draw values over time below each other, to the right of what a figure shows in a plane; return the axes.
 
@@ -263,7 +296,7 @@ def _entity(name: str) -> str:
 
 
 HEIGHT_M = 1.0
-"""Height of the target above the floor of a film, m; flips are shown `FLOOR_M` above it."""
+"""Height of the target above the floor of a film, m; flips are shown `FLOOR_M` above it, landings at 0."""
 
 
 def write_flights(
@@ -284,7 +317,7 @@ def write_flights(
         dt: time between two commands, s.
         nominal: model whose thrust curve gives the thrust arrows.
         title: title of the figure.
-        kind: what was flown: ``flip`` and ``track`` have figures of their own.
+        kind: what was flown: ``flip``, ``track`` and ``land`` have figures of their own.
         figure: file of the figure; None writes none.
         recording: file of the rerun recording; None writes none.
         video: file of a film of the first flight; None writes none.
@@ -295,14 +328,15 @@ def write_flights(
     """
     parameters = nominal.changed_parameters()
     if figure is not None:
-        draw = {"flip": flip_figure, "track": track_figure}.get(kind, flight_figure)
+        draw = {"flip": flip_figure, "track": track_figure, "land": land_figure}.get(kind, flight_figure)
         draw(flown, dt, figure, title)
     if recording is not None:
         thrust = np.asarray(rotors.thrust(parameters, flown.rotor_speed[:1]))
-        write_flight_recording(recording, flown, dt, thrust, np.asarray(flown.watched)[0] if kind == "track" else None)
+        moving = kind in ("track", "land")
+        write_flight_recording(recording, flown, dt, thrust, np.asarray(flown.watched)[0] if moving else None)
     if video is not None:
         thrust = np.asarray(rotors.thrust(parameters, flown.rotor_speed[0]))
-        write_film(video, _first(flown, dt, thrust, FLOOR_M if kind == "flip" else HEIGHT_M))
+        write_film(video, _first(flown, dt, thrust, {"flip": FLOOR_M, "land": 0.0}.get(kind, HEIGHT_M)))
     if log is not None:
         write_mcap(flight_log(flown, dt, log.stem, float(parameters.gravity)), log)
 
