@@ -73,7 +73,8 @@ def compiled_scene(world: World) -> mujoco.MjModel:
         body = spec.body(name)
         if body is None or not (list(body.joints) or list(body.geoms)):
             _add_drone(spec, name, body)
-        # MuJoCo's shortcut for bodies with their centre of gravity at their origin; a drone's is where the parameters say.
+        # MuJoCo's shortcut for bodies with their centre of gravity at their origin; a drone's is where its parameters
+        # say.
         not_none(spec.body(name)).simple = 0
     if world.drones > 1 and spec.numeric("max_geom_pairs") is None:
         # Of each kind of pairs MJX looks at the nearest only; the number of all grows with the square of the drones.

@@ -28,7 +28,7 @@ WARM_UP = 0.3
 """Time after the start and after every gap in which rotor speeds are not yet known from commands, s: six motor lags."""
 MEASURED_SHARE = 0.98
 """Rotor speeds are used if every motor has at least this share of valid readings."""
-_AROUND = np.linspace(-0.6, 0.5, 23)
+_AROUND = np.linspace(-1.0, 0.5, 31)
 """Times around a row to which the other drone's path is fitted, s."""
 _VOLTAGE_SMOOTHING = 0.02
 """Time constant of the voltage's low-pass filter, s. It is short, because smoothing the dips under load would make

@@ -22,7 +22,7 @@ from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.envs.task import with_room
 from cfb_mjx.files import shipped
 from cfb_mjx.model.effects import GroundEffect
-from cfb_mjx.model.mjcf import BODY_NAME, compiled_scene
+from cfb_mjx.model.mjcf import BODY_NAME, World, compiled_scene
 from cfb_mjx.model.mujoco_body import MujocoBody
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import AnyArray
@@ -151,7 +151,7 @@ def clearance(position: Float[AnyArray, "*batch 3"], quaternion: Float[AnyArray,
         position: of the rotors' centre, m.
         quaternion: attitude, body to world.
     """
-    model = compiled_scene(str(shipped("assets", "cfb.xml")))
+    model = compiled_scene(World(str(shipped("assets", "cfb.xml"))))
     floor = model.geom("floor")
     meets = (model.geom_contype & floor.conaffinity) | (floor.contype & model.geom_conaffinity)
     own = (model.geom_bodyid == model.body(BODY_NAME).id) & (meets > 0)

@@ -37,7 +37,7 @@ AIR_DENSITY = 1.2
 """kg/m^3."""
 MOMENTUM = 0.805 * math.pi * AIR_DENSITY
 """Momentum flux of the jet over the square of w, kg/m^3."""
-LONGEST_S = 0.6
+LONGEST_S = 1.0
 """Greatest age of a wake, s. Older ones, more than about a metre below, are taken to be of this age."""
 ROUNDS = 3
 """Evaluations of where the other drone was when the air left it; each uses the age that follows from the one before."""
