@@ -27,7 +27,7 @@ from cfb_mjx.files import write_json
 from cfb_mjx.model import Quadrotor, Scene, State
 from cfb_mjx.model.scene import SceneState
 from cfb_mjx.runtime import configure_jax, environment
-from cfb_mjx.train.flying import Flight
+from cfb_mjx.train.flight import Flight
 from cfb_mjx.train.landing import LANDING_S, Lander, drawn, touch_down
 
 PLATFORM = Path(__file__).with_name("platform.xml")

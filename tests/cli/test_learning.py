@@ -117,6 +117,22 @@ def test_the_firmwares_pid_lands(cfb, tmp_path):
     np.testing.assert_array_equal(log.command[-100:], 0)
 
 
+@pytest.mark.parametrize(("task", "more"), [("cross", ()), ("follow", ("--timescale", "6"))])
+def test_two_drones_fly_together(cfb, tmp_path, task, more):
+    files = ("--json", tmp_path / "t.json", "--figure", tmp_path / "t.png", "--log", tmp_path / "t.mcap")
+    done = cfb("fly", "track", "--task", task, *more, *files)
+    assert done.returncode == 0, done.stderr
+    result = json.loads((tmp_path / "t.json").read_text())
+    assert 0.5 < result["mean_distance_mm"] < 15
+    assert 285 < result["closest_mm"] < 305
+    assert ("path" in result) == (task == "follow")
+    assert "closest [mm]" in done.stdout
+    assert read_log(tmp_path / "t.mcap").position[:, 2].max() < 0.02
+    done = cfb("fly", "track", "--task", "cross", "--timescale", "2")
+    assert done.returncode == 1
+    assert "--path and --timescale are for --task track and follow, not for cross" in done.stderr
+
+
 def test_a_double_flip_by_its_name(cfb, tmp_path):
     outputs = ("--json", tmp_path / "f.json", "--figure", tmp_path / "f.png", "--recording", tmp_path / "f.rrd")
     done = cfb("fly", "double-flip", "--keep", tmp_path / "k.yaml", *outputs)

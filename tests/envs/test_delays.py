@@ -18,7 +18,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.parameters import Randomisation
 from cfb_mjx.parameters.randomisation import Range
-from cfb_mjx.train.flying import fly
+from cfb_mjx.train.flight import fly
 
 pytestmark = pytest.mark.haste
 

@@ -35,7 +35,7 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.firmware.actions import ACTIONS
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.train.config import load_config
-from cfb_mjx.train.flying import fly
+from cfb_mjx.train.flight import fly
 from cfb_mjx.train.tracking import find_course, track
 
 DRONE = Quadrotor.from_file("cfb-guards")

@@ -18,8 +18,8 @@ from cfb_mjx.logs.gate import judge
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.parameters import load_randomisation
 from cfb_mjx.train.config import FlipTrainingConfig, config_from, load_config
+from cfb_mjx.train.flight import Flight, flight_log, fly
 from cfb_mjx.train.flips import FLIP_S, FLIPS, Goal, bounds, flips, measure, replay, search, shortfall
-from cfb_mjx.train.flying import Flight, flight_log, fly
 from cfb_mjx.train.run import POLICY, Training, train
 from tests import helpers
 

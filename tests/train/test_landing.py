@@ -19,7 +19,7 @@ from cfb_mjx.model import Quadrotor, State
 from cfb_mjx.model.effects import GroundEffect
 from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import load_randomisation
-from cfb_mjx.train.flying import fly
+from cfb_mjx.train.flight import fly
 from cfb_mjx.train.landing import (
     BELOW_M,
     CRAWL_M,

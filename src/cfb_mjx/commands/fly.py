@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from cfb_mjx.commands.command import Command, Devices, Figure, File, Model, Pairs, Result, Within, command, lines_of
+from cfb_mjx.commands.command import Command, Devices, Figure, File, Model, Pairs, Within, command
+from cfb_mjx.commands.flown import Flown
 from cfb_mjx.documents import require_seed
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import require_folder, together, write_json
@@ -21,40 +22,9 @@ if TYPE_CHECKING:
     from cfb_mjx.envs import TargetTask
     from cfb_mjx.model import Quadrotor
     from cfb_mjx.parameters import ModelFile
-    from cfb_mjx.train.flying import Flight
+    from cfb_mjx.train.flight import Flight
 
-_UNITS = {"mm": "mm", "s": "s", "mps": "m/s", "m": "m", "radps": "rad/s", "deg": "deg"}
-_FLOWN = ("controller", "task", "model", "plants", "magnitude", "gyro", "knobs", "path", "environment")
-"""Keys of the results that say what was flown."""
 _ROUNDS = 20
-
-
-@dataclass(frozen=True)
-class Flown(Result):
-    """How well a controller flew.
-
-    Attributes:
-        numbers: the results as ``--json`` writes them, for instance ``numbers["mean_distance_mm"]`` and
-            ``numbers["success_rate"]``. For a set of drones they are in ``numbers["on"]``, by the names of the drones.
-        files: paths of the files written, by kind; None for a file that was not asked for.
-        searched: whether the settings of a flip (``numbers["knobs"]``) were found by a search.
-    """
-
-    numbers: Mapping[str, Any]
-    files: Mapping[str, Path | None]
-    searched: bool = False
-
-    def __str__(self) -> str:
-        lines = []
-        if self.searched:
-            lines.append("knobs: " + ", ".join(f"{name} {x:.4g}" for name, x in self.numbers["knobs"].items()))
-        lines += lines_of({"knobs": self.files["knobs"]})
-        if "on" in self.numbers:
-            width = max(map(len, self.numbers["on"]))
-            lines += [_row(name, measured, width) for name, measured in self.numbers["on"].items()]
-        else:
-            lines += _table(self.numbers)
-        return "\n".join([*lines, *lines_of({what: path for what, path in self.files.items() if what != "knobs"})])
 
 
 @command
@@ -70,6 +40,10 @@ class Fly(Command):
     - land: from about 1 m above a pad and up to 1 m beside it, onto a floor whose cushion of air lifts the drone
       (ground_effect, with published numbers unless the model has its own). The motors stop when the estimate says that
       it has touched down. Landed: slower than 0.3 m/s at the first contact, and at rest on its feet within 10 cm.
+    - cross: two drones exchange places four times, 1.2 m apart in 2.5 s, the second 0.3 m below the first and in its
+      wake (downwash, with a published strength unless the model has its own). Measured is the second drone.
+    - follow: a drone follows another, 0.3 m below it and in its wake, along a figure eight of 2 m by 1 m in 8 s. It is
+      sent the position, velocity and acceleration of the leader.
     - flip, double-flip, triple-flip: climb, turn about the x axis, and return to the start. `cfb fly double-flip` is
       short for `cfb fly flip --task double-flip`.
 
@@ -103,9 +77,9 @@ class Fly(Command):
             The model itself then keeps within 1.8 m.
             within: most randomised drones that complete the flip within 1.8 m.
         keep: YAML file for the settings of the flip that were flown, for --knobs.
-        path: path of --task track: figure-eight (2 m by 1 m in 2 s), random (through random points of --seed), or a
-            trajectory file (.csv: durations and polynomials as in uav_trajectories, which the firmware also flies).
-            Default: figure-eight.
+        path: path of --task track, and of the leader in --task follow: figure-eight (2 m by 1 m in 2 s), random
+            (through random points of --seed), or a trajectory file (.csv: durations and polynomials as in
+            uav_trajectories, which the firmware also flies). Default: figure-eight.
         timescale: factor on all times of the path, as in the firmware: 2 is half as fast.
         devices: number of devices of this machine over which the flights are divided.
         gyro: delay of the gyro. late: as late as the pose, by the model's pose_delay, as in the paper.
@@ -114,7 +88,10 @@ class Fly(Command):
     """
 
     controller: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="CONTROLLER")]
-    task: Literal["hover", "step", "recover", "track", "land", "flip", "double-flip", "triple-flip"] | None = None
+    task: (
+        Literal["hover", "step", "recover", "track", "land", "cross", "follow", "flip", "double-flip", "triple-flip"]
+        | None
+    ) = None
     model: Model = "cfb-guards"
     plants: int = 1
     magnitude: Annotated[float, Within(0)] = 0.0
@@ -133,7 +110,7 @@ class Fly(Command):
     search: Literal["height", "margin", "within"] | None = None
     keep: File = None
     path: Annotated[str | None, tyro.conf.arg(metavar="PATH")] = None
-    timescale: float = 1.0
+    timescale: float | None = None
     devices: Devices = 1
     gyro: Literal["late", "local"] | None = None
 
@@ -189,15 +166,18 @@ class Fly(Command):
                 raise CfbError(f"{name}: is a flip policy and cannot fly --task {task}; fly flip or double-flip.")
             if any((self.knobs, self.set, self.holder, self.search, self.keep)):
                 raise CfbError(f"--knobs, --set, --holder, --search and --keep are for flips, not for --task {task}.")
-        if task != "track" and (self.path is not None or self.timescale != 1):
-            raise CfbError(f"--path and --timescale are for --task track, not for {task}.")
-        way = find_course(self.path or "figure-eight", self.seed, self.timescale) if task == "track" else None
+        along = task in ("track", "follow")
+        if not along and (self.path is not None or self.timescale is not None):
+            raise CfbError(f"--path and --timescale are for --task track and follow, not for {task}.")
+        way, timescale = None, 1.0 if self.timescale is None else self.timescale
+        if task == "track" or self.path is not None or self.timescale is not None:
+            way = find_course(self.path or "figure-eight", self.seed, timescale)
         keys = jax.random.split(jax.random.PRNGKey(self.seed), self.plants)
         fly = measured(task, controller, with_room(course, nominal), keys, Devices.take(self.devices), way)
         numbers = {"controller": name, "task": task, "model": self.model, "plants": self.plants}
         numbers |= {"magnitude": self.magnitude, "gyro": "late" if course.lumped_delay else "local"}
         if way is not None:
-            numbers["path"] = {"name": self.path or "figure-eight", "timescale": self.timescale, **demanded(way)}
+            numbers["path"] = {"name": self.path or "figure-eight", "timescale": timescale, **demanded(way)}
             _warn_if_infeasible(numbers["path"], nominal)
         if manoeuvre is not None:
             numbers["knobs"] = {name: float(x) for name, x in manoeuvre.knobs._asdict().items() if np.isfinite(x)}
@@ -321,48 +301,3 @@ def _warn_if_infeasible(path: Mapping[str, Any], nominal: Quadrotor) -> None:
             CfbWarning,
             stacklevel=2,
         )
-
-
-def _table(numbers: Mapping[str, Any]) -> list[str]:
-    """The results on one model, a line for each number."""
-    drones = "drone" if numbers["plants"] == 1 else "drones"
-    gyro = "gyro as late as the pose" if numbers["gyro"] == "late" else "gyro on the drone"
-    lines = [f"{numbers['controller']}, {numbers['task']}: {numbers['plants']} {drones}, {numbers['model']}, {gyro}"]
-    if path := numbers.get("path"):
-        lines.append(
-            f"  {path['name']}: up to {path['speed_mps']:.3g} m/s, {path['thrust_to_weight']:.3g} times the weight, "
-            f"{path['rate_radps']:.3g} rad/s"
-        )
-    for key, value in numbers.items():
-        if key in (*_FLOWN, "quantiles", "diverged"):
-            continue
-        shown = value if isinstance(value, bool) else "never" if value is None else f"{value:.4g}"
-        spread = numbers.get("quantiles", {}).get(key)
-        more = (
-            "" if not spread or spread["0.5"] is None else f"   median {spread['0.5']:.4g}, 95 % {spread['0.95']:.4g}"
-        )
-        lines.append(f"  {_label(key):<24}{shown}{more}")
-    return lines + ([f"  {_diverged(numbers)}"] if "diverged" in numbers else [])
-
-
-def _row(name: str, measured: Mapping[str, Any], width: int) -> str:
-    """The results on one drone of a set, in one line."""
-    shown = [
-        f"{_label(key)} {value:.4g}"
-        for key, value in measured.items()
-        if isinstance(value, float) and key not in ("failure_rate", "success_rate")
-    ]
-    lost = "   failed" if measured["failed"] and "failure_rate" not in measured else ""
-    if measured.get("failure_rate"):
-        lost = f"   {measured['failure_rate']:.0%} failed"
-    lost += f"   {_diverged(measured)}" if "diverged" in measured else ""
-    return f"  {name:<{width}}  {'   '.join(shown)}{lost}"
-
-
-def _diverged(measured: Mapping[str, Any]) -> str:
-    return f"{measured['diverged']} diverged (states not finite): they count as failed and are left out of the means"
-
-
-def _label(key: str) -> str:
-    name, _, unit = key.rpartition("_")
-    return (f"{name} [{_UNITS[unit]}]" if unit in _UNITS else key).replace("_", " ")

@@ -106,7 +106,7 @@ def require_motor_commands(controller: Controller, what: str) -> None:
     if action != "motors":
         raise CfbError(
             f"{what} needs a controller that commands the motors, not {action}; fly this policy with cfb fly, "
-            "cfb_mjx.train.flying.fly or an environment, which have the firmware's loops."
+            "cfb_mjx.train.flight.fly or an environment, which have the firmware's loops."
         )
 
 

@@ -27,7 +27,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rollout import rollout
 from cfb_mjx.model.rotors import thrust
-from cfb_mjx.train.flying import CAUGHT_M, Flight, fly, nominal_task
+from cfb_mjx.train.flight import Flight, fly
+from cfb_mjx.train.flying import CAUGHT_M, nominal_task
 
 FLIPS = {"flip": 1, "double-flip": 2, "triple-flip": 3}
 """Number of rotations of each manoeuvre."""

@@ -26,7 +26,7 @@ from cfb_mjx.model.mjcf import BODY_NAME, World, compiled_scene
 from cfb_mjx.model.mujoco_body import MujocoBody
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import AnyArray
-from cfb_mjx.train.flying import Flight, fly
+from cfb_mjx.train.flight import Flight, fly
 
 DESCENT_MPS, CRAWL_MPS, CRAWL_M = 0.3, 0.1, 0.2
 """Speed of the descent, and the speed from `CRAWL_M` above the pad on. There the rotors' thrust grows with every

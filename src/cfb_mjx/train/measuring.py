@@ -16,9 +16,11 @@ from cfb_mjx.control.controllers import Controller
 from cfb_mjx.devices import Devices
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.model.quadrotor import Quadrotor
+from cfb_mjx.train.flight import Flight
 from cfb_mjx.train.flips import FLIPS, flips
-from cfb_mjx.train.flying import Flight, hover, recovery, six_metres
+from cfb_mjx.train.flying import hover, recovery, six_metres
 from cfb_mjx.train.landing import land
+from cfb_mjx.train.together import cross, follow
 from cfb_mjx.train.tracking import Course, track
 
 TESTS: dict[str, Callable[..., tuple[Any, Flight]]] = {
@@ -27,6 +29,8 @@ TESTS: dict[str, Callable[..., tuple[Any, Flight]]] = {
     "recover": recovery,
     "track": track,
     "land": land,
+    "cross": cross,
+    "follow": follow,
 }
 """Tests by name; each takes controller, task, nominal drone and keys, and returns measurements and flights."""
 
@@ -51,7 +55,7 @@ def measured(
         task: determines the drones and the noise; with room for its delays (`cfb_mjx.envs.task.with_room`).
         keys: one key per flight.
         over: devices that share the flights.
-        course: what to track, for the test ``track``; default: a figure eight.
+        course: what to track, for the tests ``track`` and ``follow``; default: a figure eight.
 
     Returns:
         A function of the nominal drone that returns the `summary` and the flights, axes (drones, steps).
@@ -101,6 +105,9 @@ def summary(
     elif test == "track":
         lengths = {f"{key}_mm": 1e3 * numbers[f"{key}_m"] for key in ("mean_distance", "largest_distance")}
         values, good = lengths | {"peak_speed_mps": numbers["peak_speed_mps"]}, ~failed
+    elif test in ("cross", "follow"):
+        values = {f"{key}_mm": 1e3 * numbers[f"{key}_m"] for key in ("mean_distance", "largest_distance", "closest")}
+        good = ~failed
     elif test == "recover":
         values = {key: numbers[key] for key in ("lost_height_m", "final_distance_m")}
         good = numbers["recovered"] & ~diverged

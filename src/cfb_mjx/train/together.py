@@ -13,20 +13,24 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from cfb_mjx.control.controllers import Controller
 from cfb_mjx.envs.episode import Episode
 from cfb_mjx.envs.path import Path as Way
+from cfb_mjx.envs.path import figure_eight, through
 from cfb_mjx.envs.target import TargetTask
+from cfb_mjx.envs.task import with_room
 from cfb_mjx.errors import CfbError
+from cfb_mjx.model.effects import Downwash
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.state import stacked, unstack
 from cfb_mjx.model.wakes import interact, seen_by, sensing, wake_of
-from cfb_mjx.train.flying import Flight, Rows, fly, rows_along
+from cfb_mjx.train.flight import Flight, Rows, fly, rows_along
 
 _AXIS = "drones that fly together"
 
@@ -108,6 +112,86 @@ def fly_together(
 def _of_leader(ways: Sequence[Way | Follow], number: int) -> Way:
     way = ways[number]
     return _of_leader(ways, way.leader) if isinstance(way, Follow) else way
+
+
+class Together(NamedTuple):
+    """Measurements of the second of two drones that fly together, per flight."""
+
+    mean_distance_m: Float[Array, "*flights"]
+    """Mean distance from its target."""
+    largest_distance_m: Float[Array, "*flights"]
+    closest_m: Float[Array, "*flights"]
+    """Least distance between the two drones."""
+    failed: Bool[Array, "*flights"]
+    """Whether one of the two exceeded a limit."""
+
+
+BELOW_M, ACROSS_M, SWAP_S, SWAPS = 0.3, 1.2, 2.5, 4
+"""The second drone flies so far below the first. They exchange places at such a distance, in such a time, so often."""
+LAP_S, FOLLOWED_S, GATHERED_S = 8.0, 16.0, 4.0
+"""Lap of the leader's figure eight, duration of the flight, and initial time that is not counted, s."""
+WAKE = 0.004
+"""Coefficient of the `Downwash` of a model that has none, N s^2/m^2. It agrees within about a factor of two with the
+force on a Crazyflie 2.1 below another in the flights of G. Shi, W. Honig, Y. Yue, S.-J. Chung, Neural-Swarm, ICRA 2020.
+"""
+
+
+def with_wake(drone: Quadrotor) -> Quadrotor:
+    """The drone with a wake (`WAKE`, if its model has none)."""
+    return drone if interact(drone) else replace(drone, effects=(*drone.effects, Downwash(coefficient=WAKE)))
+
+
+def cross(controller: Controller, task: TargetTask, nominal: Quadrotor, keys: PRNGKeyArray) -> tuple[Together, Flight]:
+    """Let two drones exchange places again and again, the second `BELOW_M` below the first.
+
+    Args:
+        controller: the controller of both.
+        task: determines the drones and the noise.
+        nominal: the nominal drone; it is flown `with_wake`.
+        keys: one key per flight.
+
+    Returns:
+        The measurements and the flights of the second drone.
+    """
+    times = SWAP_S * np.arange(SWAPS + 1)
+    sides = ACROSS_M / 2 * (-1.0) ** np.arange(SWAPS + 1)
+    ways = [through(np.stack([x, 0 * x, 0 * x + z], axis=1), times) for x, z in ((sides, BELOW_M), (-sides, 0.0))]
+    return _measured(controller, with_room(task, nominal), with_wake(nominal), keys, ways, SWAPS * SWAP_S, 0.0)
+
+
+def follow(
+    controller: Controller,
+    task: TargetTask,
+    nominal: Quadrotor,
+    keys: PRNGKeyArray,
+    path: Way | None = None,
+    seconds: float = FOLLOWED_S,
+    settled_s: float = GATHERED_S,
+) -> tuple[Together, Flight]:
+    """Let a drone lead along a path, and another follow `BELOW_M` below it; other arguments as for `cross`.
+
+    Args:
+        path: the leader's path; default: a figure eight, 2 m by 1 m in `LAP_S`.
+        seconds: duration, s.
+        settled_s: initial time that is not counted, s.
+    """
+    path = figure_eight(lap_s=LAP_S) if path is None else path
+    ways = [path, Follow(0, (0.0, 0.0, -BELOW_M))]
+    return _measured(controller, with_room(task, nominal), with_wake(nominal), keys, ways, seconds, settled_s)
+
+
+@eqx.filter_jit
+def _measured(controller, task, nominal, keys, ways, seconds, settled_s):
+    flown = jax.vmap(lambda key: fly_together(controller, task, nominal, key, ways, seconds))(keys)
+    second = jax.tree.map(lambda x: x[:, 1], flown)
+    if isinstance(ways[1], Follow):
+        # Where the leader was after the command, not before it.
+        second = second._replace(watched=flown.position[:, 0] + jnp.asarray(ways[1].offset))
+    distance = jnp.linalg.norm(second.position - second.watched, axis=-1)[
+        :, round(settled_s / controller.control_dt_s) :
+    ]
+    failed = flown.failed[..., -1].any(axis=1)
+    return Together(distance.mean(axis=1), distance.max(axis=1), closest_m(flown), failed), second
 
 
 def closest_m(flown: Flight) -> Float[Array, "*flights"]:

@@ -18,7 +18,7 @@ from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.envs.task import with_room
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
-from cfb_mjx.train.flying import Flight, fly
+from cfb_mjx.train.flight import Flight, fly
 
 
 class Tracking(NamedTuple):

@@ -14,8 +14,8 @@ import numpy as np
 from cfb_mjx.control.manoeuvre import TURN, roll_angle, unwrapped
 from cfb_mjx.logs import write_mcap
 from cfb_mjx.model import Quadrotor, rotors
+from cfb_mjx.train.flight import Flight, flight_log, steps_flown
 from cfb_mjx.train.flips import FLOOR_M
-from cfb_mjx.train.flying import Flight, flight_log, steps_flown
 from cfb_mjx.view.film import Path3D, write_film
 from cfb_mjx.view.recorder import Plot, Tab, recording
 from cfb_mjx.view.style import COLOURS, MEASURED, check_path, context, new_figure, save
@@ -28,7 +28,7 @@ def flight_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
     """Draw flights over time.
 
     Args:
-        flown: a `cfb_mjx.train.flying.Flight` with axes (drones, steps).
+        flown: a `cfb_mjx.train.flight.Flight` with axes (drones, steps).
         dt: time between two commands, s.
         path: figure to write.
         title: title of the figure.
@@ -61,11 +61,15 @@ def flight_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
         save(figure, path)
 
 
+TRACKED = ("track", "cross", "follow")
+"""Tests in which a target moves."""
+
+
 def track_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
     """Draw the tracking of a path: from above, and its errors and commands over time.
 
     Args:
-        flown: a `cfb_mjx.train.flying.Flight` from `cfb_mjx.train.flying.track`, axes (drones, steps).
+        flown: a `cfb_mjx.train.flight.Flight` from `cfb_mjx.train.tracking.track`, axes (drones, steps).
         dt: time between two commands, s.
         path: figure to write.
         title: title of the figure.
@@ -99,7 +103,7 @@ def land_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
     """Draw landings: from the side, and height, vertical speed and command over time.
 
     Args:
-        flown: a `cfb_mjx.train.flying.Flight` from `cfb_mjx.train.landing.land`, axes (drones, steps).
+        flown: a `cfb_mjx.train.flight.Flight` from `cfb_mjx.train.landing.land`, axes (drones, steps).
         dt: time between two commands, s.
         path: figure to write.
         title: title of the figure.
@@ -167,7 +171,7 @@ def flip_figure(flown, dt: float, path: str | Path, title: str = "") -> None:
     """Draw flips.
 
     Args:
-        flown: a `cfb_mjx.train.flying.Flight` from `cfb_mjx.train.flips.flips`, axes (drones, steps).
+        flown: a `cfb_mjx.train.flight.Flight` from `cfb_mjx.train.flips.flips`, axes (drones, steps).
         dt: time between two commands, s.
         path: figure to write.
         title: title of the figure.
@@ -258,7 +262,7 @@ def write_flight_recording(path: str | Path, flown, dt: float, thrust=None, targ
 
     Args:
         path: file to write, ``.rrd``.
-        flown: a `cfb_mjx.train.flying.Flight` with axes (drones, steps).
+        flown: a `cfb_mjx.train.flight.Flight` with axes (drones, steps).
         dt: time between two commands, s.
         thrust: (drones, steps, 4) N, drawn as arrows on the first drone; None: no arrows.
         target: (steps, 3) m, a target that moves; None: the origin.
@@ -317,7 +321,7 @@ def write_flights(
         dt: time between two commands, s.
         nominal: model whose thrust curve gives the thrust arrows.
         title: title of the figure.
-        kind: what was flown: ``flip``, ``track`` and ``land`` have figures of their own.
+        kind: what was flown: ``flip``, ``land`` and those in `TRACKED` have figures of their own.
         figure: file of the figure; None writes none.
         recording: file of the rerun recording; None writes none.
         video: file of a film of the first flight; None writes none.
@@ -328,11 +332,11 @@ def write_flights(
     """
     parameters = nominal.changed_parameters()
     if figure is not None:
-        draw = {"flip": flip_figure, "track": track_figure, "land": land_figure}.get(kind, flight_figure)
+        draw = {"flip": flip_figure, "land": land_figure}.get(kind, track_figure if kind in TRACKED else flight_figure)
         draw(flown, dt, figure, title)
     if recording is not None:
         thrust = np.asarray(rotors.thrust(parameters, flown.rotor_speed[:1]))
-        moving = kind in ("track", "land")
+        moving = kind == "land" or kind in TRACKED
         write_flight_recording(recording, flown, dt, thrust, np.asarray(flown.watched)[0] if moving else None)
     if video is not None:
         thrust = np.asarray(rotors.thrust(parameters, flown.rotor_speed[0]))
