@@ -13,6 +13,7 @@ import json
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -43,6 +44,7 @@ WORLDS = {
         '<geom size="0.01" mass="0.006" contype="0" conaffinity="0" group="3"/><site name="eye"/></body>'
     ),
 }
+SWARMS = {"two drones and a floor": 2, "eight drones and a floor": 8}
 CABLE = '<tendon><spatial limited="true" range="0 0.2"><site site="hook"/><site site="eye"/></spatial></tendon>'
 
 
@@ -92,20 +94,30 @@ def _rollout(drone, count: int):
 
 
 def _flown(scene, drone, count: int):
-    commands = jnp.tile(drone.hover_command(), (STEPS, 1))
-    state = scene.begin(drone, drone.hover_state())
+    """Hover of so many drones in all."""
+    commands, start = jnp.tile(drone.hover_command(), (STEPS, 1)), drone.hover_state()
+    if scene.drones:
+        count //= scene.drones
+        commands = jnp.repeat(commands[:, None], scene.drones, axis=1)
+        places = jnp.stack([jnp.array([0.5 * i, 0.0, 1.0]) for i in range(scene.drones)])
+        start = jax.vmap(drone.hover_state)(places)
+        drone = jax.tree.map(lambda x: jnp.stack([x] * scene.drones), drone)
+    state = scene.begin(drone, start)
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), state)
     fly = jax.jit(jax.vmap(lambda state: scene.rollout(drone, state, commands, every=STEPS)))
     return lambda: jax.block_until_ready(fly(states))
 
 
-def _alone(model, count: int):
-    """`mujoco.batch` alone: hover under a constant force, all steps in one call."""
+def _alone(model, count: int, bodies: Sequence[str] = ("cfb",)):
+    """`mujoco.batch` alone: hover of so many drones in all under a constant force, all steps in one call."""
     from mujoco.batch import Batch
 
-    batch, joint = Batch(model, count), int(model.body("cfb").jntadr[0])
-    batch.bind("qpos")[:, model.jnt_qposadr[joint] + 2] = 1.0
-    batch.bind("qfrc_applied")[:, model.jnt_dofadr[joint] + 2] = 9.81 * model.body("cfb").mass[0]
+    batch = Batch(model, count // len(bodies))
+    for i, body in enumerate(bodies):
+        joint = int(model.body(body).jntadr[0])
+        first = model.jnt_qposadr[joint]
+        batch.bind("qpos")[:, first : first + 3] = (0.5 * i, 0.0, 1.0)
+        batch.bind("qfrc_applied")[:, model.jnt_dofadr[joint] + 2] = 9.81 * model.body(body).mass[0]
     return lambda: batch.step(nstep=STEPS)
 
 
@@ -132,13 +144,15 @@ def worlds() -> dict:
     found, counts = {}, {"mjx": 128, "c": 1024, "mujoco.batch alone": 1024}
     drone = Quadrotor.from_file("cfb-guards")
     with scratch("cfb-scenes-") as folder:
-        for name, inside in WORLDS.items():
+        for name, inside in (WORLDS | dict.fromkeys(SWARMS, WORLDS["floor"])).items():
             say(name)
             path = Path(folder) / f"{name.replace(' ', '-')}.xml"
             cable = CABLE if "cable" in name else ""
             path.write_text(f"<mujoco><worldbody>{inside}</worldbody>{cable}</mujoco>")
-            functions = {engine: _flown(Scene(path, engine), drone, counts[engine]) for engine in ("mjx", "c")}
-            functions["mujoco.batch alone"] = _alone(Scene(path, "c").mujoco_model, counts["mujoco.batch alone"])
+            scenes = {engine: Scene(path, engine, drones=SWARMS.get(name)) for engine in ("mjx", "c")}
+            functions = {engine: _flown(scene, drone, counts[engine]) for engine, scene in scenes.items()}
+            alone = counts["mujoco.batch alone"]
+            functions["mujoco.batch alone"] = _alone(scenes["c"].mujoco_model, alone, scenes["c"].world.bodies)
             found[name] = _rates(functions, {key: counts[key] * STEPS for key in functions})
     return {"counts": counts, "rates": found}
 
@@ -295,6 +309,8 @@ print(f"stopped at {{farthest:.2f}} m; the ball has fallen to {{ball:.2f}} m")
 - **State**: `SceneState` has the drone's `State`, the positions and velocities of all other joints, the controls of
   the scene's own actuators, and the poses of mocap bodies; replace these to move them. `constraint` is the force of
   contacts and cables on the drone: zero if nothing was touched.
+- **Several drones**: `Scene(mjcf, engine, drones=N)` has N, which collide; models, states and commands have an axis
+  of drones ([an example, and their wakes](swarms.md)).
 - **Cables** are spatial tendons with a limit, between a site on the drone and one on the load.
 - **Engines**: `mjx` runs on any device and has forward-mode derivatives; `c` is `mujoco.batch`, on the CPU alone,
   without derivatives. Both fly randomised drones under `vmap`.
@@ -340,6 +356,8 @@ limit for the engine `c`, which hands over the state after every step.
 {bodies}
 
 `MujocoBody` has the interface of `MjxBody`, so that every rollout, task and training can use it.
+
+Drone steps, where there are several:
 
 | world | `mjx`, {counts[mjx]} drones | `c`, {counts[c]} drones | `mujoco.batch` alone | `c` of it | `c` over `mjx` |
 |---|---|---|---|---|---|

@@ -283,9 +283,8 @@ A load between two drones is a body with a cable to a site in each of the bodies
 
 Drone steps per second ({steps} steps of 4 ms, {drones} drones with their own commands, float32), in turn with as many
 drones that fly alone without effects, and with a quarter as many swarms in a scene (engine `c`, 50 steps). A pair flies
-at {ratio:.2f} times the speed of two drones alone; a scene at no less than {mujoco:.2f} M drone steps/s in any size. The
-engine `mjx` is for few drones: its cost grows with more than the square of their number
-([measured](scenes.md#speed)).
+at {ratio:.2f} times the speed of two drones alone; a scene at no less than {mujoco:.2f} M drone steps/s in any size.
+The engine `mjx` is for few drones: its cost grows faster than their number ([measured](scenes.md#speed)).
 
 | drones per swarm | swarms | in swarms | alone | ratio | neglected, m/s | in a scene |
 |---|---|---|---|---|---|---|

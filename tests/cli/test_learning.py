@@ -129,7 +129,7 @@ def test_two_drones_fly_together(cfb, tmp_path, task, more):
     assert "closest [mm]" in done.stdout
     assert read_log(tmp_path / "t.mcap").position[:, 2].max() < 0.02
     done = cfb("fly", "track", "--task", "cross", "--timescale", "2")
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "--path and --timescale are for --task track and follow, not for cross" in done.stderr
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array
 
@@ -46,3 +47,18 @@ def one_kernel(function: Callable[..., Any], *arrays: Array) -> Any:
     arrays = jax.lax.optimization_barrier(arrays)
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
         return jax.jit(inner)(*arrays)
+
+
+def apart(function: Callable[[], Any]) -> Any:
+    """``function()`` as arrays that XLA's CPU compiler does not join with what is made of them.
+
+    With `cfb_mjx.runtime.XLA_CPU_FLAGS` it computes a function once for every number of an array that is put together
+    from its results: up to a thousand times slower. Barriers and loops of one step are gone before it does that; a
+    loop stays whose number of steps it does not know. Without derivatives in reverse mode.
+
+    Args:
+        function: function that closes over its arrays.
+    """
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(function))
+    once = jax.lax.optimization_barrier(jnp.asarray(1))
+    return jax.lax.while_loop(lambda at: at[0] < once, lambda at: (at[0] + 1, function()), (0, nothing))[1]

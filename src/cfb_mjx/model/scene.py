@@ -29,6 +29,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from cfb_mjx.engine.cpu_kernel import apart
 from cfb_mjx.errors import CfbError, CfbWarning
 from cfb_mjx.model import rotors, wakes
 from cfb_mjx.model.effects.base import Condition
@@ -211,10 +212,14 @@ class Scene:
         return state
 
     def _integrated(self, prepared: Prepared, state: SceneState, command: Array, near) -> SceneState:
-        at = self.each(_components)(prepared, state.drone)
-        if near is not None:
-            at = wakes.sense(prepared, at, near)
-        at, felt, speed, force = self.each(_driven)(prepared, at, command)
+        def drive():
+            at = self.each(_components)(prepared, state.drone)
+            if near is not None:
+                at = wakes.sense(prepared, at, near)
+            return self.each(_driven)(prepared, at, command)
+
+        at, felt, speed, wrench = apart(drive) if self.engine == "c" else drive()
+        force = jnp.concatenate(wrench, axis=-1)
         moved = ENGINES[self.engine](self.world, self.inputs(prepared, state, force))
         pose, twist = moved.positions[self._positions[0]], moved.velocities[self._velocities[0]]
         after = self.each(_moved)(prepared, at, felt, speed, pose, twist)
@@ -298,10 +303,12 @@ def _components(prepared: Prepared, state: State) -> Components:
     return unstack(state, Vec.unstack(prepared.parameters.center_of_gravity))
 
 
-def _driven(prepared: Prepared, at: Components, command: Array) -> tuple[Components, tuple[Condition, ...], Vec, Array]:
-    """Advance the rotors; return what every effect feels, the rotors' speeds after the step, and the force.
+def _driven(
+    prepared: Prepared, at: Components, command: Array
+) -> tuple[Components, tuple[Condition, ...], Vec, tuple[Array, Array]]:
+    """Advance the rotors; return what every effect feels, the rotors' speeds after the step, and the wrench.
 
-    The force [N, world] and the torque [N m, body] are those of rotors and effects about the rotors' centre.
+    That is the force [N, world] and the torque [N m, body] of rotors and effects about the rotors' centre.
     """
     path, memory = commanded_path(prepared, at.rotor_speed, at.memory, Vec.unstack(command))
     at = remembering(at, memory)
@@ -310,8 +317,7 @@ def _driven(prepared: Prepared, at: Components, command: Array) -> tuple[Compone
         loads = rotors.loads_at(prepared.rotors, path.start, path.rate_start)
     felt = conditions(prepared, at, path.start)
     wrench = loaded(prepared.model, prepared.parameters, loads, felt)
-    force = jnp.concatenate([rotate(at.quaternion, wrench.force).stack(), wrench.torque.stack()])
-    return at, felt, path.end, force
+    return at, felt, path.end, (rotate(at.quaternion, wrench.force).stack(), wrench.torque.stack())
 
 
 def _moved(
