@@ -130,10 +130,9 @@ BELOW_M, ACROSS_M, SWAP_S, SWAPS = 0.3, 1.2, 2.5, 4
 """The second drone flies so far below the first. They exchange places at such a distance, in such a time, so often."""
 LAP_S, FOLLOWED_S, GATHERED_S = 8.0, 16.0, 4.0
 """Lap of the leader's figure eight, duration of the flight, and initial time that is not counted, s."""
-WAKE = 0.004
-"""Coefficient of the `Downwash` of a model that has none, N s^2/m^2. It agrees within about a factor of two with the
-force on a Crazyflie 2.1 below another in the flights of G. Shi, W. Honig, Y. Yue, S.-J. Chung, Neural-Swarm, ICRA 2020.
-"""
+WAKE = 0.008
+"""Coefficient of the `Downwash` of a model that has none, N s^2/m^2: least squares to the force on a Crazyflie 2.1 that
+crosses below another, in the flights published with G. Shi, W. Honig, Y. Yue, S.-J. Chung, Neural-Swarm, ICRA 2020."""
 
 
 def with_wake(drone: Quadrotor) -> Quadrotor:
