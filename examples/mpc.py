@@ -1,11 +1,11 @@
-"""Model predictive control through the differentiable model, on a figure eight.
+"""Model-predictive control through the differentiable model, on a figure eight.
 
     python examples/mpc.py [--lap-s 2] [--flights 2] [--model cfb-guards] [--write FILE.json]
 
 Every 16 ms, `Mpc` finds the commands of the next third of a second with which the model follows the path best:
 nonlinear least squares by optimistix, whose Jacobian is that of the simulator. It sees what policies see (late, noisy
 estimates), and knows the model exactly, so it is a baseline for them. Give ``--model`` a model of your own, fitted to
-your drone.
+your drone. Without a path it flies to its target: docs/controllers.md compares it with other controllers.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
@@ -31,6 +32,8 @@ from cfb_mjx.train.tracking import track
 
 DT_S, STEPS = 0.016, 20
 """Time between two commands, and number of commands that are planned."""
+ACCELERATION_MPS2, BRAKING_MPS2, SETTLING_S = 10.0, 5.0, 0.1
+"""Of the way to a target at rest: accelerations, and the time constant of its end."""
 
 
 class Plan(NamedTuple):
@@ -77,11 +80,15 @@ class Mpc(eqx.Module):
         self, memory: Plan, estimate: StateEstimate, ahead: Float[Array, " shown"] | None = None
     ) -> tuple[Plan, Float[Array, "4"]]:
         """Return the new memory and the first command of the best plan."""
-        wanted = jnp.zeros((STEPS, 3)) if ahead is None else ahead.reshape(STEPS, 3)
         seen = State(estimate.position, estimate.velocity, estimate.quaternion, estimate.body_rate, memory.rotor_speed)
         # The estimate is late; meanwhile the last command was flown.
         past = rollout_final(self.model, seen, jnp.tile(memory.last, (self.late, 1)))
         now = replace(past, rotor_speed=memory.rotor_speed)
+        wanted = (
+            _approach(jnp.asarray(now.position), jnp.asarray(now.velocity))
+            if ahead is None
+            else ahead.reshape(STEPS, 3)
+        )
         hold = self.model.steps_per_command(DT_S)
 
         def residuals(change, plan):
@@ -92,13 +99,30 @@ class Mpc(eqx.Module):
             heading = flown.quaternion[:, 3]
             return (flown.position - wanted) / 0.02, 0.02 * flown.body_rate, heading, 4.0 * steps, 20.0 * outside
 
-        solver = optx.LevenbergMarquardt(rtol=1e-2, atol=1e-2)
+        # The default, a QR of the Jacobian, needs twice the operations; the flights are the same.
+        solver = optx.LevenbergMarquardt(rtol=1e-2, atol=1e-2, linear_solver=lx.Normal(lx.Cholesky()))
         zero = jnp.zeros_like(memory.commands)
-        found = optx.least_squares(residuals, solver, zero, args=memory.commands, max_steps=4, throw=False)
+        found = optx.least_squares(residuals, solver, zero, args=memory.commands, max_steps=10, throw=False)
         commands = jnp.clip(memory.commands + found.value, 0.0, 1.0)
         after = rollout_final(self.model, now, commands[:1], hold=hold)
         plan = jnp.concatenate([commands[1:], commands[-1:]])
         return Plan(plan, after.rotor_speed, commands[0]), commands[0]
+
+
+def _approach(position: Float[Array, "3"], velocity: Float[Array, "3"]) -> Float[Array, "steps 3"]:
+    """Where a drone should be after each command on its way to a target at rest, which it can brake in time for."""
+
+    def one(moving, _):
+        position, velocity = moving
+        distance = jnp.linalg.norm(position)
+        speed = jnp.minimum(jnp.sqrt(2 * BRAKING_MPS2 * distance), distance / SETTLING_S)
+        change = -speed * position / jnp.maximum(distance, 1e-6) - velocity
+        most = ACCELERATION_MPS2 * DT_S
+        velocity = velocity + change * jnp.minimum(1.0, most / jnp.maximum(jnp.linalg.norm(change), 1e-6))
+        position = position + DT_S * velocity
+        return (position, velocity), position
+
+    return jax.lax.scan(one, (position, velocity), None, length=STEPS)[1]
 
 
 def main() -> None:

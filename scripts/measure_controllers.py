@@ -4,7 +4,8 @@
 
 A controller takes about a minute. `--controllers` without a name only writes the page. Results of controllers that are
 not measured again stay as they are in benchmarks/controllers.json. The page also lists the paper's numbers, which were
-measured on the real drone. `raptor` is RAPTOR's published policy (`pip install foundation-policy`).
+measured on the real drone. `raptor` is RAPTOR's published policy (`pip install foundation-policy`). `mpc` is
+examples/mpc.py; it takes five minutes, although it flies fewer flights and no randomised drones.
 """
 
 import argparse
@@ -13,6 +14,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 from campaign import ROOT, facts_line
+from mpc_baseline import IDSIA, about_mpc, cell, own_model, planned
 
 from cfb_mjx.reproduce.controllers import PAPER_FIRMWARE, PAPER_HOVER
 from cfb_mjx.runtime import configure_jax, environment, say
@@ -25,9 +27,8 @@ RAPTOR = [
     "The shipped policies were trained on this type of drone and its delay.",
     "",
 ]
-IDSIA = "cfb-idsia"
 STRENGTHS = (1.2, 1.4, 1.6)
-CONTROLLERS = ["target", "target-analytic", "target-adaptive", "pid", "mellinger", "raptor"]
+CONTROLLERS = ["target", "target-analytic", "target-adaptive", "pid", "mellinger", "raptor", "mpc"]
 RESULTS = ROOT / "benchmarks" / "controllers.json"
 PAPER_OF = {"target": PAPER_HOVER[1.0], **PAPER_FIRMWARE}
 
@@ -55,9 +56,17 @@ def main() -> None:
     few, many = judge.few, judge.many
     drones = jax.jit(jax.vmap(lambda key: reset(judge.wild, nominal, key).model.parameters))(many)
     results = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    results = {name: r for name, r in results.items() if name in CONTROLLERS and r["drones"] == arguments.plants}
+    results = {
+        name: r
+        for name, r in results.items()
+        if name in CONTROLLERS and r.get("drones", arguments.plants) == arguments.plants
+    }
     for name in arguments.controllers:
         say(name)
+        if name == "mpc":
+            results[name] = {"environment": environment(), **planned(judge)}
+            write_json(RESULTS, results)
+            continue
         controller = RaptorController.published() if name == "raptor" else find_controller(name, nominal)
         # RAPTOR reads the gyro on the drone, as the firmware's controllers do.
         lumped = name != "raptor" and has_lumped_delay(name)
@@ -110,13 +119,6 @@ def _by_strength(thrown) -> dict[str, list]:
     return {name: [int((band == i).sum()), float(well[band == i].mean())] for i, name in enumerate(names)}
 
 
-def _cell(there: dict) -> str:
-    if there["hover_mm"] is None:
-        return "all failed"
-    lost = f", {there['failed']:.2%} failed" if there["failed"] else ""
-    return f"{there['hover_mm']:.0f} ({there['command_std']:.3f}){lost}"
-
-
 def _factors(drones, nominal, distance, well) -> dict[str, dict[str, float]]:
     """Dependence of the hover error on each factor of the randomisation.
 
@@ -163,23 +165,29 @@ def page(results: dict, plants: int, described) -> str:
     """The Markdown page."""
     from cfb_mjx.model import balanced_thrust_to_weight
 
-    names, nominal = list(results), float(balanced_thrust_to_weight(described.parameters()))
+    names = [name for name in results if name != "mpc"]
+    nominal = float(balanced_thrust_to_weight(described.parameters()))
+    mpc = results.get("mpc")
+    here = [*names, "mpc"] if mpc else names
     lines = [
         "# Controllers, measured",
         "",
-        "This page compares the shipped policies, the firmware's PID and Mellinger controllers, and RAPTOR in the same "
-        "tests. Use it to choose a controller. `cfb fly` runs the tests with any policy:",
+        "This page compares the shipped policies, the firmware's PID and Mellinger controllers, RAPTOR and "
+        "model-predictive control in the same tests. Use it to choose a controller. `cfb fly` runs the tests with any "
+        "policy:",
         "",
         "```sh",
         "cfb fly target-adaptive --plants 4096 --magnitude 1        # hover on randomised drones",
         "```",
         "",
-        f"{facts_line('python scripts/measure_controllers.py', list(results.values()), 'measured')} All results are "
+        facts_line("python scripts/measure_controllers.py", [results[name] for name in names], "measured")
+        + " All results are "
         f"simulated with the model `{described.name}`. Estimates are 8 ms late and noisy. The gyro is equally late, "
         "except for the firmware's controllers and RAPTOR, which read it on the drone. The noise of the state is that "
         "of the paper. The paper's numbers were measured on its real drone.",
         "",
         *(RAPTOR if "raptor" in names else []),
+        *(about_mpc(mpc) if mpc else []),
         "## On the nominal drone",
         "",
         "Hover: mean distance to the target over 6 s without the first second, mean of 64 flights. Command std: "
@@ -189,7 +197,7 @@ def page(results: dict, plants: int, described) -> str:
         "| controller | hover, mm | command std | paper, mm | paper, std | arrival, s | peak, m/s | overshoot, m |",
         "|---|---|---|---|---|---|---|---|",
     ]
-    for name in names:
+    for name in here:
         r = results[name]
         paper = [f"{x:g}" for x in PAPER_OF.get(name, ())] or ["", ""]
         # An infinite time is null in the file.
@@ -213,6 +221,8 @@ def page(results: dict, plants: int, described) -> str:
         cells = [name, *(f"{v:.0f}" for v in r["random_hover_mm"].values()), f"{r['random_command_std']:.4f}"]
         cells += [f"{r['random_failed']:.2%}", f"{r['random_recovered']:.2%}", f"{r['recovered']:.2%}"]
         lines.append("| " + " | ".join(cells) + " |")
+    if mpc:
+        lines.append("| mpc |" + " |" * 7 + f" {mpc['recovered']:.2%} |")
     bands = list(results[names[0]]["recovered_by_strength"])
     lines += [
         "",
@@ -254,8 +264,8 @@ def page(results: dict, plants: int, described) -> str:
         "|---|" + "---|" * len(names),
     ]
     for what in results[names[0]]["sensors"]:
-        lines.append(f"| {what} | " + " | ".join(_cell(results[name]["sensors"][what]) for name in names) + " |")
-    lines.append(f"| `{IDSIA}`, randomised | " + " | ".join(_cell(results[name][IDSIA]) for name in names) + " |")
+        lines.append(f"| {what} | " + " | ".join(cell(results[name]["sensors"][what]) for name in names) + " |")
+    lines.append(f"| `{IDSIA}`, randomised | " + " | ".join(cell(results[name][IDSIA]) for name in names) + " |")
     lines += [
         "",
         "## On drones with effects outside every training",
@@ -263,13 +273,13 @@ def page(results: dict, plants: int, described) -> str:
         "Each row adds effects of the catalogue to the nominal drone; `configs/plants/off-nominal.yaml` gives their "
         "constants and the reason for each. Hover error, mm, and the command std in brackets, mean of 64 flights.",
         "",
-        "| plant | " + " | ".join(names) + " |",
-        "|---|" + "---|" * len(names),
+        "| plant | " + " | ".join(here) + " |",
+        "|---|" + "---|" * len(here),
     ]
     for plant in results[names[0]]["plants"]:
-        cells = [_cell(results[name]["plants"][plant]) for name in names]
+        cells = [cell(results[name]["plants"][plant]) for name in here]
         lines.append(f"| {plant} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *(own_model(mpc) if mpc else [])]) + "\n"
 
 
 if __name__ == "__main__":

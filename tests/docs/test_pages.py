@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import json
 import re
 import shlex
 import sys
@@ -16,6 +17,7 @@ from cfb_mjx.cli import main
 from cfb_mjx.commands import COMMANDS, line
 from cfb_mjx.commands.command import Command, Written
 from cfb_mjx.control.policy_file import load_policy, shipped_policies
+from cfb_mjx.parameters import load_model_file
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -154,6 +156,14 @@ def test_cards_of_policies_say_what_was_measured():
     for name, path in shipped_policies().items():
         assert path.with_name("card.md").read_text() == cards.card(path.parent), name
         assert load_policy(path).card == path.with_name("card.md").read_text(), f"{name}: the file has another card"
+
+
+def test_the_page_of_controllers_says_what_was_measured(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "scripts"))
+    measured = json.loads((ROOT / "benchmarks" / "controllers.json").read_text())
+    plants = measured["target"]["drones"]
+    written = _script("measure_controllers").page(measured, plants, load_model_file("cfb-guards"))
+    assert written == (DOCS / "controllers.md").read_text()
 
 
 def test_pages_speak_of_the_project_only():
