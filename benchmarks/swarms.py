@@ -309,8 +309,8 @@ cfb fly track --task follow --path random   # one follows another, 0.3 m below i
 sends its position, velocity and acceleration. A policy that sees ahead continues the leader's motion with these.
 
 Mean distance of the lower drone from its target, mm, mean of 16 flights, with no wake, with one of half the commands'
-default of {wake:g} N s²/m², and with the default. The controllers that do not see ahead lag behind a target that moves. In all
-flights the two stayed at least {least:.1f} cm apart.
+default of {wake:g} N s²/m², and with the default. The controllers that do not see ahead lag behind a target that moves.
+In all flights the two stayed at least {least:.1f} cm apart.
 
 | controller | cross: no wake | half | whole | follow: no wake | half | whole |
 |---|---|---|---|---|---|---|
@@ -344,10 +344,10 @@ of a perfect model, and the share of the achievable improvement that is reached 
 - Wakes older than 1 s, more than about one and a half metres below, are taken to be of that age.
 - A drone that sinks as fast as its own wake flies in it, which the model leaves out.
 - Within 2.5 motor distances (25 cm) the four jets have not merged.
-- The force agrees with the force on a Crazyflie 2.1 in four crossings of the flights published with Neural-Swarm
-  (2020), within their scatter. The torque does not: before the axis it is about twice the model's, which is more than
-  downward forces at the hubs can give; behind it the flights cannot tell, because their motors saturate. Fit the
-  coefficient to your drones, and do not rely on the torque.
+- Beside four crossings of two Crazyflies 2.1, in the flights published with Neural-Swarm (2020): the force has the
+  model's height and width, but is shifted along the way by one or two centimetres (perhaps by the clocks). Before the
+  axis the torque is about twice that of the model with `lever=1`, more than downward forces at the hubs can give;
+  behind it the flights cannot tell, because their motors saturate. Fit both numbers to your drones.
 - The downwash of gym-pybullet-drones (2021) is several times larger.
 """.replace("{steps}", str(STEPS)).replace("{drones}", str(DRONES))
 

@@ -117,7 +117,7 @@ def test_the_firmwares_pid_lands(cfb, tmp_path):
     np.testing.assert_array_equal(log.command[-100:], 0)
 
 
-@pytest.mark.parametrize(("task", "more"), [("cross", ()), ("follow", ("--timescale", "6"))])
+@pytest.mark.parametrize(("task", "more"), [("cross", ()), ("follow", ("--timescale", "1.5"))])
 def test_two_drones_fly_together(cfb, tmp_path, task, more):
     files = ("--json", tmp_path / "t.json", "--figure", tmp_path / "t.png", "--log", tmp_path / "t.mcap")
     done = cfb("fly", "track", "--task", task, *more, *files)

@@ -280,6 +280,19 @@ def test_a_drone_sees_another(write, drone):
         assert float(seen.depth[1, 1]) == pytest.approx(0.67 - 0.067, abs=0.006)
 
 
+@mjx
+@pytest.mark.parametrize("engine", ENGINES)
+def test_several_drones_meet_every_shape_of_the_world(write, drone, engine):
+    """MJX looked at the nearest pairs only, by their bounding spheres: a large box was nearer than all others."""
+    floor = '<geom type="box" pos="0 0 -0.1" size="10 10 0.1"/><geom type="box" pos="0 0 0.5" size="0.1 0.1 0.1"/>'
+    scene = Scene(write(f"<mujoco><worldbody>{floor}</worldbody></mujoco>", "boxes.xml"), engine, drones=2)
+    drones, start = _side_by_side(drone, [[0.0, 0.0, 0.63], [2.0, 0.0, 1.0]])
+    start = replace(start, rotor_speed=jnp.zeros((2, 4)))
+    commands = jnp.zeros((100, 2, 4))
+    fly = jax.jit(lambda state: scene.rollout(drones, state, commands, every=100), compiler_options=QUICK)
+    assert float(fly(scene.begin(drones, start)).drone.position[-1, 0, 2]) == pytest.approx(0.614, abs=0.003)
+
+
 def test_drones_that_do_not_fit_a_scene_are_refused(write, drone):
     scene = Scene(write("<mujoco/>", "empty.xml"), "c", drones=3)
     drones, start = _side_by_side(drone, [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]])
@@ -291,6 +304,15 @@ def test_drones_that_do_not_fit_a_scene_are_refused(write, drone):
         scene.begin(uneven, start)
     with pytest.raises(CfbError, match="at least 1, found 0"):
         Scene(write("<mujoco/>", "empty.xml"), "c", drones=0)
+    with pytest.raises(CfbError, match=r"its 2 drones; the position has shape \(1, 3\)"):
+        scene.begin(drones, jax.tree.map(lambda x: x[:1], start))
+    with pytest.raises(CfbError, match="repeated name 'foot11'"):
+        Scene(write('<mujoco><worldbody><geom name="foot11" size="1"/></worldbody></mujoco>', "foot.xml"), drones=2)
+    # A copy of assets/cfb.xml from before drones met each other.
+    before = shipped("assets", "cfb.xml").read_text(encoding="utf-8")
+    before = before.replace('contype="8" conaffinity="9"', 'contype="0" conaffinity="1"')
+    with pytest.warns(CfbWarning, match="the drones fly through each other"):
+        Scene(write(before, "before.xml"), "c", drones=2)
     ghosts = "".join(f'<body name="{n}"><freejoint/><geom size="0.05" mass="1"/></body>' for n in ("cfb", "cfb1"))
     ghosts = ghosts.replace("<geom", '<geom contype="0" conaffinity="0"')
     with pytest.warns(CfbWarning, match="the drones fly through each other"):

@@ -81,7 +81,7 @@ def test_a_follower_stays_beside_its_leader(drone, track):
     together = flown(track, task, drone, ways, 4.0)
     away = np.asarray(together.position[0] - together.position[1]) - np.array(offset)
     assert np.linalg.norm(away, axis=1).max() < 0.02
-    np.testing.assert_allclose(together.watched[0, 1:], together.position[1, :-1] + jnp.array(offset), atol=1e-6)
+    np.testing.assert_allclose(together.watched[0], together.position[1] + jnp.array(offset), atol=1e-6)
     assert float(closest_m(together)) == pytest.approx(np.hypot(0.4, 0.2), abs=0.02)
 
 
@@ -99,6 +99,13 @@ def test_a_follower_stays_beside_its_leader(drone, track):
 def test_leaders_that_cannot_be_are_refused(drone, track, ways, said):
     with pytest.raises(CfbError, match=said):
         fly_together(track, with_room(TargetTask(), drone), drone, KEY, ways, 1.0)
+
+
+def test_one_drone_alone_is_near_to_none(drone, track):
+    task = with_room(TargetTask(noise=QUIET), drone)
+    assert np.isinf(closest_m(flown(track, task, with_wake(drone), [at([0.0, 0.0, 1.0])], 0.1)))
+    with pytest.raises(CfbError, match="nothing flies"):
+        fly_together(track, task, drone, KEY, [], 1.0)
 
 
 def test_a_stronger_wake_pushes_the_lower_drone_further(drone, track):

@@ -74,6 +74,9 @@ def _row(name: str, measured: Mapping[str, Any], width: int) -> str:
     lost = "   failed" if measured["failed"] and "failure_rate" not in measured else ""
     if measured.get("failure_rate"):
         lost = f"   {measured['failure_rate']:.0%} failed"
+    if measured.get("success_rate", 1.0) < 1:
+        lost += f"   {measured['success_rate']:.0%} succeeded"
+    lost += "".join(f"   not {end}" for end in ("recovered", "landed", "completed") if measured.get(end) is False)
     lost += f"   {_diverged(measured)}" if "diverged" in measured else ""
     return f"  {name:<{width}}  {'   '.join(shown)}{lost}"
 

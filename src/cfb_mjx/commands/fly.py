@@ -43,7 +43,8 @@ class Fly(Command):
     - cross: two drones exchange places four times, 1.2 m apart in 2.5 s, the second 0.3 m below the first and in its
       wake (downwash, with a published strength unless the model has its own). Measured is the second drone.
     - follow: a drone follows another, 0.3 m below it and in its wake, along a figure eight of 2 m by 1 m in 8 s. It is
-      sent the position, velocity and acceleration of the leader.
+      sent the position, velocity and acceleration of the leader, which is not measured. Here and in cross, figures and
+      logs show the second drone.
     - flip, double-flip, triple-flip: climb, turn about the x axis, and return to the start. `cfb fly double-flip` is
       short for `cfb fly flip --task double-flip`.
 
@@ -79,7 +80,7 @@ class Fly(Command):
         keep: YAML file for the settings of the flip that were flown, for --knobs.
         path: path of --task track, and of the leader in --task follow: figure-eight (2 m by 1 m in 2 s), random
             (through random points of --seed), or a trajectory file (.csv: durations and polynomials as in
-            uav_trajectories, which the firmware also flies). Default: figure-eight.
+            uav_trajectories, which the firmware also flies). Default: figure-eight; for follow in 8 s.
         timescale: factor on all times of the path, as in the firmware: 2 is half as fast.
         devices: number of devices of this machine over which the flights are divided.
         gyro: delay of the gyro. late: as late as the pose, by the model's pose_delay, as in the paper.
@@ -110,7 +111,7 @@ class Fly(Command):
     search: Literal["height", "margin", "within"] | None = None
     keep: File = None
     path: Annotated[str | None, tyro.conf.arg(metavar="PATH")] = None
-    timescale: float | None = None
+    timescale: float = 1.0
     devices: Devices = 1
     gyro: Literal["late", "local"] | None = None
 
@@ -136,6 +137,7 @@ class Fly(Command):
         from cfb_mjx.parameters import load_model_file, load_randomisation
         from cfb_mjx.train.flips import FLIPS
         from cfb_mjx.train.measuring import measured
+        from cfb_mjx.train.together import led
         from cfb_mjx.train.tracking import demanded, find_course
 
         name, task = self.controller, self.task
@@ -167,17 +169,19 @@ class Fly(Command):
             if any((self.knobs, self.set, self.holder, self.search, self.keep)):
                 raise CfbError(f"--knobs, --set, --holder, --search and --keep are for flips, not for --task {task}.")
         along = task in ("track", "follow")
-        if not along and (self.path is not None or self.timescale is not None):
+        if not along and (self.path is not None or self.timescale != 1):
             raise CfbError(f"--path and --timescale are for --task track and follow, not for {task}.")
-        way, timescale = None, 1.0 if self.timescale is None else self.timescale
-        if task == "track" or self.path is not None or self.timescale is not None:
-            way = find_course(self.path or "figure-eight", self.seed, timescale)
+        way = None
+        if task == "follow" and self.path is None:
+            way = led(self.timescale)
+        elif along:
+            way = find_course(self.path or "figure-eight", self.seed, self.timescale)
         keys = jax.random.split(jax.random.PRNGKey(self.seed), self.plants)
         fly = measured(task, controller, with_room(course, nominal), keys, Devices.take(self.devices), way)
         numbers = {"controller": name, "task": task, "model": self.model, "plants": self.plants}
         numbers |= {"magnitude": self.magnitude, "gyro": "late" if course.lumped_delay else "local"}
         if way is not None:
-            numbers["path"] = {"name": self.path or "figure-eight", "timescale": timescale, **demanded(way)}
+            numbers["path"] = {"name": self.path or "figure-eight", "timescale": self.timescale, **demanded(way)}
             _warn_if_infeasible(numbers["path"], nominal)
         if manoeuvre is not None:
             numbers["knobs"] = {name: float(x) for name, x in manoeuvre.knobs._asdict().items() if np.isfinite(x)}

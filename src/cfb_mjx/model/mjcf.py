@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -72,14 +73,20 @@ def compiled_scene(world: World) -> mujoco.MjModel:
     for name in world.bodies:
         body = spec.body(name)
         if body is None or not (list(body.joints) or list(body.geoms)):
-            _add_drone(spec, name, body)
+            try:
+                _add_drone(spec, name, body)
+            except ValueError as error:
+                raise _uncompiled(path, error) from None
         # MuJoCo's shortcut for bodies with their centre of gravity at their origin; a drone's is where its parameters
         # say.
         not_none(spec.body(name)).simple = 0
-    if world.drones > 1 and spec.numeric("max_geom_pairs") is None:
-        # Of each kind of pairs MJX looks at the nearest only; the number of all grows with the square of the drones.
-        spec.add_numeric(name="max_geom_pairs", size=1, data=[4 * world.drones])
     model = compiled(path, spec)
+    if world.drones > 1 and spec.numeric("max_geom_pairs") is None:
+        # MJX looks closer at so many of the pairs of two shapes: at all of drones with the world, but not at all of
+        # drones with drones, whose number grows with the square of theirs.
+        most = 4 * world.drones + _most_pairs(model, world.bodies)
+        spec.add_numeric(name="max_geom_pairs", size=1, data=[most])
+        model = compiled(path, spec)
     for name in world.bodies:
         body = model.body(name)
         if body.jntnum[0] != 1 or model.jnt_type[body.jntadr[0]] != mujoco.mjtJoint.mjJNT_FREE:
@@ -131,7 +138,10 @@ def warn_of_untouched(path: str | Path, model: mujoco.MjModel, drones: Sequence[
             CfbWarning,
             stacklevel=4,
         )
-    if not all(_touch(model, first, model.geom_bodyid == body) for body in bodies[1:]):
+    # Not by their feet alone, which touch every outline.
+    solid = (model.geom_contype & model.geom_conaffinity) != 0
+    drone_geoms = [solid & (model.geom_bodyid == body) for body in bodies]
+    if not all(_touch(model, a, b) for a, b in itertools.combinations(drone_geoms, 2)):
         warnings.warn(
             f"{path}: the drones fly through each other; leave their geoms out, so that those of assets/cfb.xml are "
             "added, or copy the geoms of class outline from there.",
@@ -145,3 +155,13 @@ def _touch(model: mujoco.MjModel, some, others) -> bool:
     kinds, affinities = model.geom_contype, model.geom_conaffinity
     met = kinds[some][:, None] & affinities[others] | affinities[some][:, None] & kinds[others]
     return bool(met.any())
+
+
+def _most_pairs(model: mujoco.MjModel, drones: Sequence[str]) -> int:
+    """Largest number of pairs of the same two shapes that can touch, without those of two drones."""
+    kinds, affinities, bodies = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
+    drone = np.isin(bodies, [model.body(name).id for name in drones])
+    met = (kinds[:, None] & affinities) | (affinities[:, None] & kinds)
+    first, second = np.nonzero(np.triu(met) * (bodies[:, None] != bodies) * ~(drone[:, None] & drone))
+    shapes = np.sort(np.stack([model.geom_type[first], model.geom_type[second]]), axis=0)
+    return int(np.unique(shapes, axis=1, return_counts=True)[1].max(initial=0))

@@ -117,7 +117,7 @@ class Scene:
             CfbWarning: the MJCF asks for shorter steps than the drone's.
         """
         self._warn_of_steps(drone)
-        self._require_one_world(drone)
+        self._require_one_world(drone, state)
         model, data = self.mujoco_model, mujoco.MjData(self.mujoco_model)
         mujoco.mj_resetData(model, data)
         kind = jnp.asarray(state.position).dtype
@@ -141,10 +141,15 @@ class Scene:
         others = min(wakes.NEIGHBOURS, self.drones - 1)
         return jax.vmap(lambda model, state: wakes.begin_among(model, state, others))(drone, state)
 
-    def _require_one_world(self, drone: Quadrotor) -> None:
+    def _require_one_world(self, drone: Quadrotor, state: State) -> None:
         if self.drones is None:
             return
         wakes.require_drones(drone, self.drones)
+        if jnp.shape(state.position) != (self.drones, 3):
+            raise CfbError(
+                f"the states of a scene have a leading axis of its {self.drones} drones; the position has shape "
+                f"{jnp.shape(state.position)}."
+            )
         gravity = concrete(drone.parameters.gravity)
         if gravity is not None and np.ptp(gravity):
             raise CfbError("the drones of a scene fly under one gravity; their models have several.")

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from cfb_mjx.control.controllers import Controller
 from cfb_mjx.envs.episode import Episode
 from cfb_mjx.envs.path import Path as Way
-from cfb_mjx.envs.path import figure_eight, through
+from cfb_mjx.envs.path import figure_eight, slowed, through
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.envs.task import with_room
 from cfb_mjx.errors import CfbError
@@ -31,6 +31,7 @@ from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.state import stacked, unstack
 from cfb_mjx.model.wakes import interact, seen_by, sensing, wake_of
 from cfb_mjx.train.flight import Flight, Rows, fly, rows_along
+from cfb_mjx.train.tracking import Course, require_timescale
 
 _AXIS = "drones that fly together"
 
@@ -64,11 +65,13 @@ def fly_together(
         seconds: duration, s.
 
     Returns:
-        The flights, axes (drones, steps), with ``watched`` the target.
+        The flights, axes (drones, steps), with ``watched`` the target after every command.
 
     Raises:
-        CfbError: a drone follows one that does not exist or itself follows.
+        CfbError: there are no drones, or one follows another that does not exist or itself follows.
     """
+    if not ways:
+        raise CfbError("nothing flies: give a path or Follow for each drone.")
     steps, count = round(seconds / controller.control_dt_s), len(ways)
     leaders, offsets = np.arange(count), np.zeros((count, 3))
     for i, way in enumerate(ways):
@@ -106,7 +109,10 @@ def fly_together(
         return fly(controller, task, nominal, key, seconds, start, path=rows, between=between)
 
     keys = jax.random.split(key, count)
-    return jax.vmap(one, axis_name=_AXIS)(keys, starts, rows, jnp.asarray(leaders), jnp.asarray(offsets))
+    flown = jax.vmap(one, axis_name=_AXIS)(keys, starts, rows, jnp.asarray(leaders), jnp.asarray(offsets))
+    # A follower should have reached the place beside where its leader is now, not where it was before the command.
+    beside = flown.position[leaders] + jnp.asarray(offsets)[:, None]
+    return flown._replace(watched=jnp.where((leaders != np.arange(count))[:, None, None], beside, flown.watched))
 
 
 def _of_leader(ways: Sequence[Way | Follow], number: int) -> Way:
@@ -133,6 +139,16 @@ LAP_S, FOLLOWED_S, GATHERED_S = 8.0, 16.0, 4.0
 WAKE = 0.008
 """Coefficient of the `Downwash` of a model that has none, N s^2/m^2: least squares to the force on a Crazyflie 2.1 that
 crosses below another, in the flights published with G. Shi, W. Honig, Y. Yue, S.-J. Chung, Neural-Swarm, ICRA 2020."""
+
+
+def led(timescale: float = 1.0) -> Course:
+    """The leader's figure eight of `follow`, 2 m by 1 m, with all times multiplied by a factor.
+
+    Raises:
+        CfbError: the factor is not positive.
+    """
+    require_timescale(timescale)
+    return Course(slowed(figure_eight(lap_s=LAP_S), timescale), FOLLOWED_S * timescale, GATHERED_S * timescale)
 
 
 def with_wake(drone: Quadrotor) -> Quadrotor:
@@ -164,17 +180,20 @@ def follow(
     nominal: Quadrotor,
     keys: PRNGKeyArray,
     path: Way | None = None,
-    seconds: float = FOLLOWED_S,
-    settled_s: float = GATHERED_S,
+    seconds: float | None = None,
+    settled_s: float | None = None,
 ) -> tuple[Together, Flight]:
     """Let a drone lead along a path, and another follow `BELOW_M` below it; other arguments as for `cross`.
 
     Args:
-        path: the leader's path; default: a figure eight, 2 m by 1 m in `LAP_S`.
+        path: the leader's path; default: that of `led`.
         seconds: duration, s.
         settled_s: initial time that is not counted, s.
     """
-    path = figure_eight(lap_s=LAP_S) if path is None else path
+    course = led()
+    path = course.path if path is None else path
+    seconds = course.seconds if seconds is None else seconds
+    settled_s = course.settled_s if settled_s is None else settled_s
     ways = [path, Follow(0, (0.0, 0.0, -BELOW_M))]
     return _measured(controller, with_room(task, nominal), with_wake(nominal), keys, ways, seconds, settled_s)
 
@@ -183,9 +202,6 @@ def follow(
 def _measured(controller, task, nominal, keys, ways, seconds, settled_s):
     flown = jax.vmap(lambda key: fly_together(controller, task, nominal, key, ways, seconds))(keys)
     second = jax.tree.map(lambda x: x[:, 1], flown)
-    if isinstance(ways[1], Follow):
-        # Where the leader was after the command, not before it.
-        second = second._replace(watched=flown.position[:, 0] + jnp.asarray(ways[1].offset))
     distance = jnp.linalg.norm(second.position - second.watched, axis=-1)[
         :, round(settled_s / controller.control_dt_s) :
     ]
@@ -196,6 +212,8 @@ def _measured(controller, task, nominal, keys, ways, seconds, settled_s):
 def closest_m(flown: Flight) -> Float[Array, "*flights"]:
     """Least distance between two drones that fly together, m; axes of the flights (..., drones, steps)."""
     count = flown.position.shape[-3]
+    if count == 1:
+        return jnp.full(flown.position.shape[:-3], jnp.inf)
     pairs = [(i, j) for i in range(count) for j in range(i)]
     apart = [jnp.linalg.norm(flown.position[..., i, :, :] - flown.position[..., j, :, :], axis=-1) for i, j in pairs]
     return jnp.min(jnp.stack(apart), axis=(0, -1))

@@ -56,14 +56,19 @@ def find_course(name: str | Path, seed: int = 0, timescale: float = 1.0) -> Cour
     Raises:
         CfbError: no such path, a file of another format, or a timescale that is not positive.
     """
-    if not (np.isfinite(timescale) and timescale > 0):
-        raise CfbError(f"timescale = {timescale}: must be positive; 2 flies a path half as fast.")
+    require_timescale(timescale)
     if name == "figure-eight":
         return Course(slowed(figure_eight(), timescale), TRACKED_S * timescale, SETTLED_S * timescale)
     if name != "random" and Path(name).suffix != ".csv":
         raise CfbError(f"{name}: no such path; give figure-eight, random, or a trajectory file (.csv).")
     path: Polynomials = random_spline(seed) if name == "random" else read_path(name)
     return Course(slowed(path, timescale), float(path.end_s) * timescale + 1.0, 0.0)
+
+
+def require_timescale(timescale: float) -> None:
+    """Raise unless a factor on times is positive."""
+    if not (np.isfinite(timescale) and timescale > 0):
+        raise CfbError(f"timescale = {timescale}: must be positive; 2 flies a path half as fast.")
 
 
 def demanded(course: Course) -> dict[str, float]:

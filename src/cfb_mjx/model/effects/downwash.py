@@ -9,10 +9,10 @@ The wake is a turbulent jet along the other drone's thrust T, from its centre. A
 b is the radius at which the speed has fallen to half of that on the axis. The momentum of the jet is the thrust
 (0.805 pi rho w^2 = T), so u does not depend on the size of the propellers. The air at s left the other drone the time
 (width s + spreading s^2 / 2) / (convection w) ago; r and s are taken from where that drone was then, and which way it
-pointed. ``coefficient`` contains the drag of the body and the thrust that the rotors lose in the inflow, ``lever`` the moments
-of rotors and body in uneven air; about 1.8 on Crazyflies 2.1 that came below another (Neural-Swarm's flights, 2020). The other
-drone is assumed to have this drone's mass. Within two and a half motor distances of the other drone the wake is four
-jets rather than one; there the formula is an extrapolation.
+pointed. ``coefficient`` contains the drag of the body and the thrust that the rotors lose in the inflow, ``lever`` the
+moments of rotors and body in uneven air: about 1.8 for Crazyflies 2.1 that came below another (flights of
+Neural-Swarm, 2020). The other drone is assumed to have this drone's mass. Within two and a half motor distances of the
+other drone the wake is four jets rather than one; there the formula is an extrapolation.
 
 The memory holds, for each other drone, its position and the vector -R e_z sqrt(T / m) along its wake, with derivatives
 of both. A drone that flies alone has a wake of zero. Swarms (`cfb_mjx.model.swarm`) set the memory at every exchange,
@@ -40,7 +40,7 @@ AIR_DENSITY = 1.2
 MOMENTUM = 0.805 * math.pi * AIR_DENSITY
 """Momentum flux of the jet over the square of w, kg/m^3."""
 LONGEST_S = 1.0
-"""Greatest age of a wake, s. Older ones, more than about a metre below, are taken to be of this age."""
+"""Greatest age of a wake, s. Older ones, more than about a metre and a half below, are taken to be of this age."""
 ROUNDS = 3
 """Evaluations of where the other drone was when the air left it; each uses the age that follows from the one before."""
 _FALL = math.sqrt(2.0) - 1.0
@@ -124,7 +124,7 @@ class Downwash(Effect):
     needs: ClassVar[str | None] = "other"
     # A wake is narrow: it is found only if its age is known to a tenth of a second.
     probes: ClassVar[tuple[dict[str, float], ...]] = tuple(
-        {"width": 0.045, "spreading": 0.0767, "convection": x} for x in (0.4, 0.5, 0.62, 0.8, 1.1)
+        {"width": 0.045, "spreading": 0.0767, "convection": x, "lever": 1.0} for x in (0.4, 0.5, 0.62, 0.8, 1.1)
     )
 
     coefficient: Float[Array, "*batch"] = eqx.field(converter=number)
