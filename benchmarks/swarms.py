@@ -23,7 +23,8 @@ from cfb_mjx.runtime import configure_jax, environment
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "scripts")]
 SIZES = (1, 2, 4, 8, 64, 256)
-DRONES, STEPS, REPEATS = 4096, 250, 7
+DRONES, STEPS, REPEATS, FLIGHTS = 4096, 250, 7, 16
+IN_SCENE = STEPS // 5
 TIMES = (0, 0.5, 1)
 """Strengths of the wake that controllers fly in, over the default."""
 
@@ -87,7 +88,7 @@ def speeds() -> list[dict]:
             return rollout(alone, state, commands, every=STEPS).position
 
         # A scene hands every step to MuJoCo: fewer swarms and steps.
-        scene, some, few = Scene(shipped("assets", "cfb.xml"), "c", drones=size), max(1, count // 4), STEPS // 5
+        scene, some, few = Scene(shipped("assets", "cfb.xml"), "c", drones=size), max(1, count // 4), IN_SCENE
 
         def in_scene(state, commands, swarm=swarm, scene=scene, few=few):
             return scene.rollout(swarm, scene.begin(swarm, state), commands, every=few).drone.position
@@ -128,7 +129,7 @@ def flights() -> list[dict]:
     from cfb_mjx.model.effects import Downwash
     from cfb_mjx.train.together import WAKE, cross, follow
 
-    drone, keys, found, shown = Quadrotor.from_file("cfb-guards"), jax.random.split(jax.random.key(0), 16), [], {}
+    drone, keys, found, shown = Quadrotor.from_file("cfb-guards"), jax.random.split(jax.random.key(0), FLIGHTS), [], {}
     for name in ("track", "track-rates", "target", "pid", "mellinger"):
         controller, line = find_controller(name, drone), {"controller": name}
         for task, test in (("cross", cross), ("follow", follow)):
@@ -230,6 +231,8 @@ def page(results: dict) -> str:
         together="\n".join(together),
         least=least / 10,
         wake=WAKE,
+        few=IN_SCENE,
+        flights=FLIGHTS,
         mujoco=min(line["scene"] for line in results["speed"]) / 1e6,
     )
 
@@ -290,8 +293,8 @@ print(f"as near as {{apart.min():.2f}} m, then {{apart[-1]:.2f}} m apart")
 A load between two drones is a body with a cable to a site in each of the bodies `cfb` and `cfb1`.
 
 Drone steps per second ({steps} steps of 4 ms, {drones} drones with their own commands, float32), in turn with as many
-drones that fly alone without effects, and with a quarter as many swarms in a scene (engine `c`, 50 steps). A pair flies
-at {ratio:.2f} times the speed of two drones alone; a scene at no less than {mujoco:.2f} M drone steps/s in any size.
+drones that fly alone without effects, and with a quarter as many swarms in a scene (engine `c`, {few} steps). A pair
+flies at {ratio:.2f} times the speed of two drones alone; a scene at {mujoco:.2f} M drone steps/s or more in any size.
 The engine `mjx` is for few drones: its cost grows faster than their number ([measured](scenes.md#speed)).
 
 | drones per swarm | swarms | in swarms | alone | ratio | neglected, m/s | in a scene |
@@ -308,9 +311,9 @@ cfb fly track --task follow --path random   # one follows another, 0.3 m below i
 `cfb_mjx.train.together.fly_together` flies any number of drones, each along a path of its own or beside a leader that
 sends its position, velocity and acceleration. A policy that sees ahead continues the leader's motion with these.
 
-Mean distance of the lower drone from its target, mm, mean of 16 flights, with no wake, with one of half the commands'
-default of {wake:g} N s²/m², and with the default. The controllers that do not see ahead lag behind a target that moves.
-In all flights the two stayed at least {least:.1f} cm apart.
+Mean distance of the lower drone from its target, mm, mean of {flights} flights, with no wake, with one of half the
+commands' default of {wake:g} N s²/m², and with the default. The controllers that do not see ahead lag behind a target
+that moves. In all flights the two stayed at least {least:.1f} cm apart.
 
 | controller | cross: no wake | half | whole | follow: no wake | half | whole |
 |---|---|---|---|---|---|---|

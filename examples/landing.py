@@ -50,12 +50,13 @@ def platform_path(circle_m: float = 0.0, heave_m: float = 0.0, rate_radps: float
     return lambda time: path(time) + jnp.array([0.0, 0.0, HEIGHT_M])
 
 
+CIRCLE_M, HEAVE_M, RATE_RADPS = 0.5, 0.1, 1.0
 RIDES = {
-    "circle": platform_path(circle_m=0.5),
-    "heave": platform_path(heave_m=0.1),
-    "both": platform_path(circle_m=0.5, heave_m=0.1),
+    "circle": platform_path(CIRCLE_M, 0.0, RATE_RADPS),
+    "heave": platform_path(0.0, HEAVE_M, RATE_RADPS),
+    "both": platform_path(CIRCLE_M, HEAVE_M, RATE_RADPS),
 }
-"""A circle of 0.5 m at 0.5 m/s, heights of +-10 cm at up to 0.2 m/s, and both."""
+"""A circle at 0.5 m/s, heights that change at up to 0.2 m/s, and both."""
 
 
 def moved(world: SceneState, platform, time: Float[Array, ""]) -> SceneState:

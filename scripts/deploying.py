@@ -13,6 +13,8 @@ from campaign import ROOT, facts_line
 
 from cfb_mjx.commands import Export
 from cfb_mjx.deploy.check import FREE_RAM
+from cfb_mjx.deploy.deployment import find_deployment
+from cfb_mjx.deploy.weights import weight_set
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.runtime import environment, set_up_xla
@@ -68,6 +70,8 @@ def page(found: dict) -> str:
     """Write the text of docs/deploying.md."""
     rows = "\n".join(row(name, one) for name, one in found["policies"].items())
     costs, free_kb = next(iter(found["policies"].values()))["cortex_m4"], FREE_RAM / 1024
+    holders = {name: find_deployment(name) for name in POLICIES if "--" not in name}
+    large = [f"`{name}`" for name, one in holders.items() if not one.flips and len(weight_set(one)) > FREE_RAM]
     return f"""# Onto the drone
 
 This page is for users who want to run a policy on a Crazyflie. `cfb export` turns the policy into C for the drone's
@@ -137,7 +141,7 @@ python new-c/load_weights.py radio://0/80/2M/E7E7E7E7E7 new-c/weights.bin
 - The log variables `cfb.loaded`, `cfb.crc` and `cfb.weights` say which weights fly, and what became of the last set.
 - It costs memory: the row `target --loadable` of the table. `--check` compares it with the {free_kb:.0f} kB
   that [the firmware's default build](https://github.com/bitcraze/crazyflie-firmware/pull/1700) for the Crazyflie 2
-  leaves free; `target-adaptive` and `track` need more, and their check fails.
+  leaves free; the sets of {", ".join(large)} alone are larger, and their check fails.
 - It needs firmware since December 2025. Flips are exported without it.
 - It was never run on a drone, nor linked with the whole firmware. Tested are the C on this machine, with the weights in
   flash also on an emulated processor, and app and script with stand-ins for the firmware and `cflib`.

@@ -10,7 +10,7 @@ b is the radius at which the speed has fallen to half of that on the axis. The m
 (0.805 pi rho w^2 = T), so u does not depend on the size of the propellers. The air at s left the other drone the time
 (width s + spreading s^2 / 2) / (convection w) ago; r and s are taken from where that drone was then, and which way it
 pointed. ``coefficient`` contains the drag of the body and the thrust that the rotors lose in the inflow, ``lever`` the
-moments of rotors and body in uneven air: about 1.8 for Crazyflies 2.1 that came below another (flights of
+moments of rotors and body in uneven air: about two for Crazyflies 2.1 that came below another (flights of
 Neural-Swarm, 2020). The other drone is assumed to have this drone's mass. Within two and a half motor distances of the
 other drone the wake is four jets rather than one; there the formula is an extrapolation.
 
