@@ -163,9 +163,9 @@ def draw(shown: dict) -> None:
                 label = f"{times * WAKE:g} N s²/m²" if times else "no wake"
                 axes.plot(dt * np.arange(over.shape[1]), over.mean(axis=0), color=colour, linewidth=1.0, label=label)
             axes.set(title=title, xlabel="time, s")
-            axes.legend(fontsize=7)
         figure.axes[0].set_ylabel("height over the target, mm")
-        figure.subplots_adjust(left=0.08, right=0.98, bottom=0.18, top=0.9, wspace=0.15)
+        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="upper center", ncols=3, fontsize=8)
+        figure.subplots_adjust(left=0.08, right=0.98, bottom=0.17, top=0.8, wspace=0.15)
         save(figure, ROOT / "docs" / "swarms.png")
 
 
