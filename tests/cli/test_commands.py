@@ -85,10 +85,28 @@ def test_import_reports_and_reads_back(cfb, files, tmp_path):
     assert cfb("evaluate", tmp_path / "out.mcap").returncode == 0
 
 
+PEER = """#!{python}
+import sys
+print("ready 9.9 1.5 100", flush=True)
+for _ in sys.stdin:
+    print(0.02, flush=True)
+"""
+
+
 def test_bench_writes_its_rows(cfb, tmp_path):
-    done = cfb("bench", "--drones", "8", "--quick", "--json", tmp_path / "b.json", "--markdown", tmp_path / "b.md")
+    # In place of a Python with crazyflow; it takes 20 ms for 100 steps.
+    (tmp_path / "peer").write_text(PEER.format(python=sys.executable))
+    (tmp_path / "peer").chmod(0o755)
+    files = ("--json", tmp_path / "b.json", "--markdown", tmp_path / "b.md")
+    done = cfb("bench", "--drones", "8", "--quick", "--peer-python", tmp_path / "peer", *files)
     assert done.returncode == 0, done.stderr
-    rows = json.loads((tmp_path / "b.json").read_text())["rows"]
+    result = json.loads((tmp_path / "b.json").read_text())
+    assert {(p["name"], p["version"], p["what"], p["drones"]) for p in result["peers"]} == {
+        ("crazyflow", "9.9", "rollout", 8)
+    }
+    assert [p["steps_per_s"] for p in result["peers"]] == pytest.approx([8 * 100 / 0.02] * len(result["peers"]))
+    assert "crazyflow 9.9" in done.stdout
+    rows = result["rows"]
     assert {row["what"] for row in rows} == {"rollout", "rollout_kept", "rollout_randomised"}
     for row in rows:
         assert row["drones"] == 8

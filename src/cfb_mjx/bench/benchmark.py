@@ -34,8 +34,7 @@ TURNS_S = 20.0
 class Peer(TimedProcess):
     """A crazyflow process that times one run per request, so that its runs can alternate with this library's."""
 
-    body = "crazyflow"
-    devices = 1
+    name = "crazyflow"
 
     def __init__(self, python: Path, drones: int, network: Path | None = None, core: int | None = None):
         script = Path(__file__).with_name("peers") / "crazyflow_peer.py"
@@ -87,15 +86,15 @@ def benchmark(
         roofline: also compare the speed with the limits of the machine.
 
     Returns:
-        JSON values: ``rows``, ``environment`` and ``first_call``; ``scaling`` unless ``quick``; ``roofline`` if
-        requested.
+        JSON values: ``rows``, ``peers``, ``environment`` and ``first_call``; ``scaling`` unless ``quick``;
+        ``roofline`` if requested.
 
     Raises:
         CfbError: crazyflow does not run with ``peer_python``.
     """
     # A program from the cache would take no time to compile.
     jax.config.update("jax_enable_compilation_cache", False)
-    over, rows = Devices.take(jax.local_device_count()), []
+    over, rows, peers = Devices.take(jax.local_device_count()), [], []
     for count in drones:
         several = over if over.several and count >= 64 and count % over.count == 0 else None
         with tempfile.TemporaryDirectory() as folder:
@@ -106,12 +105,12 @@ def benchmark(
                 best = _alternate(group, QUICK_TURNS) if quick else _alternate(group, TURNS, TURNS_S)
                 for item, seconds in zip(group, best, strict=True):
                     row = _row(item, count, seconds)
-                    rows.append(row)
+                    (peers if isinstance(item, Peer) else rows).append(row)
                     say(f"{row['what']} of {count}, {page.body(row)}: {row['steps_per_s']:.3g} steps/s")
                     if isinstance(item, Peer):
                         item.close()
     say("measuring the first call")
-    result = {"rows": rows, "environment": environment(), "first_call": first_call()}
+    result = {"rows": rows, "peers": peers, "environment": environment(), "first_call": first_call()}
     if not quick:
         say("measuring one core and two cores")
         result["scaling"] = scaling()
@@ -174,10 +173,9 @@ def _alternate(items: list, turns: int, least_s: float = 0.0) -> list[float]:
 
 
 def _row(item: workloads.Workload | Peer, drones: int, seconds: float) -> dict:
-    row = {"what": item.what, "body": item.body, "drones": drones, "devices": item.devices}
-    row |= {"steps_per_s": drones * item.steps / seconds, "compile_s": item.compile_s}
+    speed = {"steps_per_s": drones * item.steps / seconds, "compile_s": item.compile_s}
     if isinstance(item, Peer):
-        row |= {"version": item.version, "cores": item.cores}
-    else:
-        row["peak_mb"] = item.peak_mb
-    return row
+        of = {"name": item.name, "version": item.version, "what": item.what, "drones": drones, "cores": item.cores}
+        return of | speed
+    of = {"what": item.what, "body": item.body, "drones": drones, "devices": item.devices}
+    return of | speed | {"peak_mb": item.peak_mb}

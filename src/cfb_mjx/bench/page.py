@@ -12,10 +12,15 @@ from cfb_mjx.bench.roofline import section
 
 
 def body(row: dict) -> str:
-    """Format the body of a row; for a peer with its version and cores."""
-    if "version" not in row:
+    """Format the body of a row; of a peer its name, version and cores."""
+    if "name" not in row:
         return row["body"]
-    return f"{row['body']} {row['version']}" + (f", {_cores(row['cores'])}" if row["cores"] else "")
+    return f"{row['name']} {row['version']}" + (f", {_cores(row['cores'])}" if row["cores"] else "")
+
+
+def _all(result: Mapping[str, Any]) -> list[dict]:
+    """Rows and peers, by batch size."""
+    return sorted([*result["rows"], *result["peers"]], key=lambda row: row["drones"])
 
 
 def _cores(count: int) -> str:
@@ -27,13 +32,14 @@ def ratios(result: Mapping[str, Any]) -> list[str]:
     lines = []
     for drones in sorted({row["drones"] for row in result["rows"]}):
         rows = [row for row in result["rows"] if row["drones"] == drones]
+        peers = [peer for peer in result["peers"] if peer["drones"] == drones]
 
         def speed(what, body="rigid", rows=rows, **wanted):
             wanted = {"what": what, "body": body} | ({"devices": 1} | wanted if body == "rigid" else wanted)
             fitting = (row["steps_per_s"] for row in rows if all(row.get(k) == v for k, v in wanted.items()))
             return next(fitting, None)
 
-        found = _beside_peers(rows, speed)
+        found = _beside_peers(peers, speed)
         if ten := speed("rollout_ten"):
             found.append(f"a gradient for ten parameters costs {speed('rollout_hundred') / ten:.1f} x the same rollout")
         if plain := speed("rollout", "rigid-plain"):
@@ -46,19 +52,20 @@ def ratios(result: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _beside_peers(rows: list[dict], speed) -> list[str]:
+def _beside_peers(peers: list[dict], speed) -> list[str]:
     lines = []
     for what, title in (("rollout", "closed form"), ("rollout_policy", "the same network in the loop")):
         name, parts = "", []
-        for peer in (row for row in rows if "version" in row and row["what"] == what):
+        for peer in (peer for peer in peers if peer["what"] == what):
             # Compare with as many devices as the peer has cores, if that was measured, else with one.
             ours = speed(what, devices=peer["cores"]) if peer["cores"] else None
             on = f"{_cores(peer['cores'])} each" if ours else "one device of ours"
             parts.append(f"{(ours or speed(what)) / peer['steps_per_s']:.1f} x ({on})")
-            name = f"{peer['body']} {peer['version']}"
+            name = f"{peer['name']} {peer['version']}"
         if parts:
             lines.append(f"{title} {', '.join(parts)} {name}")
-    alone, one = speed("network_alone"), speed("rollout_policy", "crazyflow", cores=1)
+    alone = speed("network_alone")
+    one = next((p["steps_per_s"] for p in peers if (p["what"], p["cores"]) == ("rollout_policy", 1)), None)
     if alone and one:
         lines.append(f"the network alone, without simulation, {alone / one:.1f} x crazyflow in the loop (1 core each)")
     return lines
@@ -67,7 +74,7 @@ def _beside_peers(rows: list[dict], speed) -> list[str]:
 def text(result: Mapping[str, Any]) -> str:
     """Return all rows as a table, and the comparison."""
     head = f"{'what':<20}{'body':<18}{'drones':>7}{'devices':>8}{'steps/s':>12}{'compile s':>11}{'memory MB':>11}"
-    lines = [head, *map(_line, result["rows"])]
+    lines = [head, *map(_line, _all(result))]
     if "roofline" in result:
         lines.append(section(result["roofline"]))
     return "\n".join([*lines, *ratios(result)])
@@ -75,7 +82,7 @@ def text(result: Mapping[str, Any]) -> str:
 
 def _line(row: dict) -> str:
     return (
-        f"{row['what']:<20}{body(row):<18}{row['drones']:>7}{row['devices']:>8}{row['steps_per_s']:>12.3g}"
+        f"{row['what']:<20}{body(row):<18}{row['drones']:>7}{row.get('devices', ''):>8}{row['steps_per_s']:>12.3g}"
         f"{row['compile_s']:>11.2f}{_memory(row):>11}"
     )
 
@@ -96,9 +103,9 @@ def page(result: dict, flags: str) -> str:
         "| what | body | drones | devices | steps/s | compile, s | memory, MB |",
         "|---|---|---:|---:|---:|---:|---:|",
     ]
-    for row in result["rows"]:
+    for row in _all(result):
         table.append(
-            f"| {row['what']} | {body(row)} | {row['drones']} | {row['devices']} | {row['steps_per_s']:.3g} "
+            f"| {row['what']} | {body(row)} | {row['drones']} | {row.get('devices', '')} | {row['steps_per_s']:.3g} "
             f"| {row['compile_s']:.2f} | {_memory(row)} |"
         )
     gpu = "" if jax.default_backend() != "cpu" else "On a GPU: [performance-gpu.md](performance-gpu.md).\n"
