@@ -349,8 +349,8 @@ of a perfect model, and the share of the achievable improvement that is reached 
 - Within 2.5 motor distances (25 cm) the four jets have not merged.
 - Beside four crossings of two Crazyflies 2.1, in the flights published with Neural-Swarm (2020): the force has the
   model's height and width, but is shifted along the way by one or two centimetres (perhaps by the clocks). Before the
-  axis the torque is about twice that of the model with `lever=1`, more than downward forces at the hubs can give;
-  behind it the flights cannot tell, because their motors saturate. Fit both numbers to your drones.
+  axis the torque is two to three times that of the model with `lever=1`, more than downward forces at the hubs can
+  give; behind it the flights cannot tell, because their motors saturate. Fit both numbers to your drones.
 - The downwash of gym-pybullet-drones (2021) is several times larger.
 """.replace("{steps}", str(STEPS)).replace("{drones}", str(DRONES))
 
