@@ -199,7 +199,8 @@ class Course:
         """Draw the figures of the page and write a recording of each flip to out/flips."""
         from cfb_mjx.files import output_folder
         from cfb_mjx.train.flips import flips
-        from cfb_mjx.view.flight import draw_path, flip_figure, write_flight_recording
+        from cfb_mjx.view.flight import write_flight_recording
+        from cfb_mjx.view.flight_figures import draw_path, flip_figure
         from cfb_mjx.view.style import context, new_figure, save
 
         with context():

@@ -17,8 +17,9 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model import Quadrotor, rollout
 from cfb_mjx.model.effects import Downwash
 from cfb_mjx.model.swarm import rollout_swarm
-from cfb_mjx.train.flight import fly
+from cfb_mjx.train.flight import Flight, fly
 from cfb_mjx.train.together import Follow, closest_m, cross, fly_together, with_wake
+from cfb_mjx.view import flight_figures
 
 KEY = jax.random.PRNGKey(3)
 
@@ -117,3 +118,15 @@ def test_a_stronger_wake_pushes_the_lower_drone_further(drone, track):
     ]
     assert worst[0] < 0.01
     assert worst[1] > 2 * worst[0]
+
+
+def test_a_figure_shows_the_distance_of_every_follower_from_its_own_leader(tmp_path, monkeypatch):
+    """It showed all flights' distances from the target of the first."""
+    targets = jnp.arange(2.0)[:, None, None] + jnp.zeros((2, 5, 3))
+    zero, ones = 0 * targets, jnp.ones((2, 5, 4))
+    there = Flight(targets, zero, ones, zero, ones, zero[..., 0] > 0, targets)
+    seen = []
+    drawn = flight_figures._over_time
+    monkeypatch.setattr(flight_figures, "_over_time", lambda *given: seen.append(given[3]) or drawn(*given))
+    flight_figures.track_figure(there, 0.01, tmp_path / "tracked.png")
+    np.testing.assert_array_equal(dict(seen[0])["error, mm"], np.zeros((2, 5)))

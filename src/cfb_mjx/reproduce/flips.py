@@ -36,7 +36,7 @@ def _flown(name: str, count: int):
 
 def four_flips(folder: Path, real: Path | None) -> Result:
     """Fly single flips of different shape, and draw them in the YZ plane."""
-    from cfb_mjx.view.flight import draw_path
+    from cfb_mjx.view.flight_figures import draw_path
     from cfb_mjx.view.style import context, new_figure, save
 
     rows, numbers = [], []
@@ -70,7 +70,7 @@ def four_flips(folder: Path, real: Path | None) -> Result:
 
 def double_flip(folder: Path, real: Path | None) -> Result:
     """Fly double flips, and draw the path in the YZ plane and the roll angle over time."""
-    from cfb_mjx.view.flight import flip_figure
+    from cfb_mjx.view.flight_figures import flip_figure
 
     rows, numbers, figures = [], [], []
     stated = {

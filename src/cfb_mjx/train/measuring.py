@@ -34,6 +34,8 @@ TESTS: dict[str, Callable[..., tuple[Any, Flight]]] = {
 }
 """Tests by name; each takes controller, task, nominal drone and keys, and returns measurements and flights."""
 
+TRACKED = ("track", "cross", "follow")
+"""Tests in which a target moves."""
 _ENDS = {"recover": "recovered", "land": "landed"}
 """Words for the success of a single flight of a test."""
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
@@ -102,11 +104,9 @@ def summary(
     elif test == "step":
         values = {key: numbers[key] for key in ("arrival_s", "peak_speed_mps", "overshoot_m")}
         good = ~failed & np.isfinite(numbers["arrival_s"])
-    elif test == "track":
-        lengths = {f"{key}_mm": 1e3 * numbers[f"{key}_m"] for key in ("mean_distance", "largest_distance")}
-        values, good = lengths | {"peak_speed_mps": numbers["peak_speed_mps"]}, ~failed
-    elif test in ("cross", "follow"):
-        values = {f"{key}_mm": 1e3 * numbers[f"{key}_m"] for key in ("mean_distance", "largest_distance", "closest")}
+    elif test in TRACKED:
+        values = {f"{key}m": 1e3 * x for key, x in numbers.items() if key.endswith("_m")}
+        values |= {key: x for key, x in numbers.items() if key.endswith("_mps")}
         good = ~failed
     elif test == "recover":
         values = {key: numbers[key] for key in ("lost_height_m", "final_distance_m")}
