@@ -88,10 +88,10 @@ def speeds() -> list[dict]:
             return rollout(alone, state, commands, every=STEPS).position
 
         # A scene hands every step to MuJoCo: fewer swarms and steps.
-        scene, some, few = Scene(shipped("assets", "cfb.xml"), "c", drones=size), max(1, count // 4), IN_SCENE
+        scene, some = Scene(shipped("assets", "cfb.xml"), "c", drones=size), max(1, count // 4)
 
-        def in_scene(state, commands, swarm=swarm, scene=scene, few=few):
-            return scene.rollout(swarm, scene.begin(swarm, state), commands, every=few).drone.position
+        def in_scene(state, commands, swarm=swarm, scene=scene):
+            return scene.rollout(swarm, scene.begin(swarm, state), commands, every=IN_SCENE).drone.position
 
         single = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), states)
         own = jnp.transpose(commands, (0, 2, 3, 1)).reshape(STEPS, 4, -1)
@@ -100,7 +100,7 @@ def speeds() -> list[dict]:
             (jax.jit(jax.vmap(apart, in_axes=(0, 2))), (single, own)),
             (
                 jax.jit(jax.vmap(in_scene, in_axes=(0, 3))),
-                (jax.tree.map(lambda x, n=some: x[:n], states), commands[:few, ..., :some]),
+                (jax.tree.map(lambda x, n=some: x[:n], states), commands[:IN_SCENE, ..., :some]),
             ),
         ]
         found_now = [jax.block_until_ready(run(*arguments)) for run, arguments in runs]
@@ -111,7 +111,7 @@ def speeds() -> list[dict]:
                 began = time.perf_counter()
                 jax.block_until_ready(run(*arguments))
                 best[i] = min(best[i], time.perf_counter() - began)
-        steps = (count * size * STEPS, count * size * STEPS, some * size * few)
+        steps = (count * size * STEPS, count * size * STEPS, some * size * IN_SCENE)
         rate, free, touching = (number / seconds for number, seconds in zip(steps, best, strict=True))
         one = {"size": size, "swarms": count, "rate": rate, "alone": free, "neglected": neglected}
         found.append(one | {"scene": touching})

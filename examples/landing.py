@@ -28,7 +28,7 @@ from cfb_mjx.model import Quadrotor, Scene, State
 from cfb_mjx.model.scene import SceneState
 from cfb_mjx.runtime import configure_jax, environment
 from cfb_mjx.train.flight import Flight
-from cfb_mjx.train.landing import LANDING_S, Lander, drawn, touch_down
+from cfb_mjx.train.landing import LANDING_S, Lander, Landing, drawn, touch_down
 
 PLATFORM = Path(__file__).with_name("platform.xml")
 HEIGHT_M = 0.5
@@ -97,6 +97,18 @@ def landed(platform, scene: Scene, controller, drone: Quadrotor, key: PRNGKeyArr
     return jax.lax.scan(one, first, dt * jnp.arange(round(LANDING_S / dt)))[1]
 
 
+def summary(found: Landing) -> dict[str, float]:
+    """Share that landed, and medians and largest values, for JSON."""
+    return {
+        "landed": float(np.mean(found.landed)),
+        "vertical_speed_mps": float(np.nanmedian(found.vertical_speed_mps)),
+        "largest_vertical_speed_mps": float(np.nanmax(found.vertical_speed_mps)),
+        "horizontal_speed_mps": float(np.nanmedian(found.horizontal_speed_mps)),
+        "distance_mm": 1e3 * float(np.median(found.distance_m)),
+        "largest_distance_mm": 1e3 * float(np.max(found.distance_m)),
+    }
+
+
 def main() -> None:
     """Land on every platform, and print how it went."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -111,15 +123,7 @@ def main() -> None:
     results = {"environment": environment(), "flights": arguments.flights, "seed": arguments.seed, "on": {}}
     for name, platform in RIDES.items():
         flown = jax.jit(jax.vmap(partial(landed, platform, scene, controller, drone)))(keys)
-        found = touch_down(flown, controller.control_dt_s)
-        one = {
-            "landed": float(np.mean(found.landed)),
-            "vertical_speed_mps": float(np.nanmedian(found.vertical_speed_mps)),
-            "largest_vertical_speed_mps": float(np.nanmax(found.vertical_speed_mps)),
-            "horizontal_speed_mps": float(np.nanmedian(found.horizontal_speed_mps)),
-            "distance_mm": 1e3 * float(np.median(found.distance_m)),
-            "largest_distance_mm": 1e3 * float(np.max(found.distance_m)),
-        }
+        one = summary(touch_down(flown, controller.control_dt_s))
         results["on"][name] = one
         print(
             f"{name}: {one['landed']:.0%} of {arguments.flights} landed; relative to the platform they touched it at "

@@ -65,7 +65,7 @@ def measured(drones: int) -> dict:
     from cfb_mjx.train.flying import load_plants
     from cfb_mjx.train.judge import Judge
     from cfb_mjx.train.tracking import Course, demanded, find_course, track
-    from cfb_mjx.view.flight import track_figure
+    from cfb_mjx.view.flight_figures import track_figure
 
     judge = Judge(random_drones=0)
     nominal, keys = judge.nominal, jax.random.split(jax.random.PRNGKey(0), FEW)
@@ -152,8 +152,7 @@ def landings(nominal, keys, many) -> dict:
 def on_a_platform(nominal, keys) -> dict:
     """Landings of `track` on the platform of ``examples/landing.py`` that turns and heaves, for JSON."""
     import jax
-    import numpy as np
-    from landing import CIRCLE_M, HEAVE_M, PLATFORM, RATE_RADPS, RIDES, landed
+    from landing import CIRCLE_M, HEAVE_M, PLATFORM, RATE_RADPS, RIDES, landed, summary
 
     from cfb_mjx.control.controllers import find_controller
     from cfb_mjx.model import Scene
@@ -162,15 +161,8 @@ def on_a_platform(nominal, keys) -> dict:
     say("a platform that moves")
     controller, scene = find_controller("track", nominal), Scene(PLATFORM, engine="c")
     flown = jax.jit(jax.vmap(lambda key: landed(RIDES["both"], scene, controller, nominal, key)))(keys)
-    numbers = touch_down(flown, controller.control_dt_s)
-    return {
-        "success_rate": float(np.mean(numbers.landed)),
-        "vertical_speed_mps": float(np.nanmedian(numbers.vertical_speed_mps)),
-        "distance_mm": 1e3 * float(np.median(numbers.distance_m)),
-        "circle_m": CIRCLE_M,
-        "speed_mps": CIRCLE_M * RATE_RADPS,
-        "heave_m": HEAVE_M,
-    }
+    ride = {"circle_m": CIRCLE_M, "speed_mps": CIRCLE_M * RATE_RADPS, "heave_m": HEAVE_M}
+    return ride | summary(touch_down(flown, controller.control_dt_s))
 
 
 def page(found: dict) -> str:
@@ -299,7 +291,7 @@ def _landing(found: dict) -> list[str]:
         "",
         f"On a platform that turns in a circle of {platform['circle_m']:g} m at {platform['speed_mps']:g} m/s and "
         f"heaves by +-{100 * platform['heave_m']:g} cm, `track` sees ahead along the platform's path: "
-        f"{platform['success_rate']:.0%} of {FEW} landings succeed, at {platform['vertical_speed_mps']:.2f} m/s "
+        f"{platform['landed']:.0%} of {FEW} landings succeed, at {platform['vertical_speed_mps']:.2f} m/s "
         f"relative to it and {platform['distance_mm']:.0f} mm from its middle (medians of all; without "
         "noise, and without a cushion above the platform). The platform is on slide joints whose positions and "
         "velocities are set. A mocap body has no velocity in contacts, so friction would hold the drone back.",

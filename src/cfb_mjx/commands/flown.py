@@ -76,7 +76,7 @@ def _row(name: str, measured: Mapping[str, Any], width: int) -> str:
         lost = f"   {measured['failure_rate']:.0%} failed"
     if measured.get("success_rate", 1.0) < 1:
         lost += f"   {measured['success_rate']:.0%} succeeded"
-    lost += "".join(f"   not {end}" for end in ("recovered", "landed", "completed") if measured.get(end) is False)
+    lost += "".join(f"   not {end}" for end, value in measured.items() if value is False and end != "failed")
     lost += f"   {_diverged(measured)}" if "diverged" in measured else ""
     return f"  {name:<{width}}  {'   '.join(shown)}{lost}"
 

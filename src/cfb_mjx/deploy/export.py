@@ -279,14 +279,13 @@ def _data(deployment: Deployment) -> str:
 
 
 def _network(name: str, policy: PolicyFile) -> str:
-    arrays, scales = weight_arrays(policy), policy.controller.layout.setpoint_scales
-    written = {key: _array(f"{name}_{key}", x) for key, x in arrays.items()}
-    if scales:
-        unit = {key: written.pop(key) for key in arrays if key.startswith("gru")}
-        written |= {"scales": _array(f"{name}_setpoint_scales", np.asarray(scales, np.float32))} | unit
-    parts = [f"/* weights_sha256 {policy.weights_sha256} */", *written.values()]
+    arrays, values, scales = weight_arrays(policy), policy.controller.layout.setpoint_scales, "NULL"
     where = {key: f"{name}_{key}" for key in arrays}
-    return "\n\n".join([*parts, _structure(name, policy, where, f"{name}_setpoint_scales" if scales else "NULL")])
+    parts = [f"/* weights_sha256 {policy.weights_sha256} */", *(_array(where[key], x) for key, x in arrays.items())]
+    if values:
+        scales = f"{name}_setpoint_scales"
+        parts.append(_array(scales, np.asarray(values, np.float32)))
+    return "\n\n".join([*parts, _structure(name, policy, where, scales)])
 
 
 def _loaded(policy: PolicyFile) -> str:

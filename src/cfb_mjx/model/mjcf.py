@@ -128,10 +128,10 @@ def warn_of_untouched(path: str | Path, model: mujoco.MjModel, drones: Sequence[
         model: the compiled world.
         drones: names of the drones' bodies.
     """
-    bodies = [model.body(name).id for name in drones]
+    bodies = numbers_of(model, drones)
     first = model.geom_bodyid == bodies[0]
     others = np.flatnonzero(~np.isin(model.geom_bodyid, bodies) & (model.geom_group < 3))
-    if untouched := [f"geom '{model.geom(i).name or i}'" for i in others if not _touch(model, first, [i])]:
+    if untouched := [f"geom '{model.geom(i).name or i}'" for i in others if not meet(model, first, [i]).any()]:
         warnings.warn(
             f'{path}: the drone flies through {", ".join(untouched)}; give them contype="1" conaffinity="1", or a '
             "group from 3 if they are not there to be touched.",
@@ -141,7 +141,7 @@ def warn_of_untouched(path: str | Path, model: mujoco.MjModel, drones: Sequence[
     # Not by their feet alone, which touch every outline.
     solid = (model.geom_contype & model.geom_conaffinity) != 0
     drone_geoms = [solid & (model.geom_bodyid == body) for body in bodies]
-    if not all(_touch(model, a, b) for a, b in itertools.combinations(drone_geoms, 2)):
+    if not all(meet(model, a, b).any() for a, b in itertools.combinations(drone_geoms, 2)):
         warnings.warn(
             f"{path}: the drones fly through each other; leave their geoms out, so that those of assets/cfb.xml are "
             "added, or copy the geoms of class outline from there.",
@@ -150,18 +150,22 @@ def warn_of_untouched(path: str | Path, model: mujoco.MjModel, drones: Sequence[
         )
 
 
-def _touch(model: mujoco.MjModel, some, others) -> bool:
-    """Whether any of some geoms can touch any of others."""
+def meet(model: mujoco.MjModel, some, others) -> np.ndarray:
+    """Whether each of some geoms, an index of them, can touch each of others, (some, others)."""
     kinds, affinities = model.geom_contype, model.geom_conaffinity
-    met = kinds[some][:, None] & affinities[others] | affinities[some][:, None] & kinds[others]
-    return bool(met.any())
+    return (kinds[some][:, None] & affinities[others] | affinities[some][:, None] & kinds[others]) != 0
+
+
+def numbers_of(model: mujoco.MjModel, bodies: Sequence[str]) -> np.ndarray:
+    """Numbers of bodies by their names."""
+    return np.array([int(model.body(name).id) for name in bodies])
 
 
 def _most_pairs(model: mujoco.MjModel, drones: Sequence[str]) -> int:
     """Largest number of pairs of the same two shapes that can touch, without those of two drones."""
-    kinds, affinities, bodies = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
-    drone = np.isin(bodies, [model.body(name).id for name in drones])
-    met = (kinds[:, None] & affinities) | (affinities[:, None] & kinds)
-    first, second = np.nonzero(np.triu(met) * (bodies[:, None] != bodies) * ~(drone[:, None] & drone))
+    bodies, every = model.geom_bodyid, slice(None)
+    drone = np.isin(bodies, numbers_of(model, drones))
+    met = meet(model, every, every) & (bodies[:, None] != bodies) & ~(drone[:, None] & drone)
+    first, second = np.nonzero(np.triu(met))
     shapes = np.sort(np.stack([model.geom_type[first], model.geom_type[second]]), axis=0)
     return int(np.unique(shapes, axis=1, return_counts=True)[1].max(initial=0))

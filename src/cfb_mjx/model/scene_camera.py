@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from cfb_mjx.errors import CfbError
+from cfb_mjx.model.mjcf import numbers_of
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.scene import Scene, SceneState
-from cfb_mjx.model.scene_engines import body_numbers, cast_by_c, cast_by_mjx
+from cfb_mjx.model.scene_engines import cast_by_c, cast_by_mjx
 from cfb_mjx.model.vector import Vec, multiply, rotate
 
 
@@ -46,7 +47,7 @@ def look(scene: Scene, drone: Quadrotor, state: SceneState, camera: str, width: 
     names = [model.camera(i).name for i in range(model.ncam)]
     if camera not in names:
         raise CfbError(f"{scene.mjcf}: has no camera '{camera}'; its cameras: {', '.join(names) or 'none'}.")
-    number, bodies = names.index(camera), body_numbers(scene.world).tolist()
+    number, bodies = names.index(camera), numbers_of(model, scene.world.bodies).tolist()
     of = int(model.cam_bodyid[number])
     if of not in (0, *bodies):
         drones = ", ".join(f"'{name}'" for name in scene.world.bodies)

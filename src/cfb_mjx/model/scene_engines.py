@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from cfb_mjx.engine.host import on_host
 from cfb_mjx.errors import CfbError
-from cfb_mjx.model.mjcf import World, compiled_scene
+from cfb_mjx.model.mjcf import World, compiled_scene, numbers_of
 from cfb_mjx.model.state import AnyArray
 from cfb_mjx.quiet import quietly
 
@@ -63,7 +63,7 @@ def set_mjx(world: World, inputs: Inputs) -> tuple[mjx.Model, mjx.Data]:
     """MJX model and data of a scene before its step; one example."""
     x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]  # jax adds it as it loads
     model, data = jax.tree.map(jnp.asarray, _template(world, x64))
-    bodies, mass, gravity = body_numbers(world), inputs.mass, inputs.gravity
+    bodies, mass, gravity = numbers_of(compiled_scene(world), world.bodies), inputs.mass, inputs.gravity
     change = mass - model.body_mass[bodies]
     model = model.replace(
         opt=model.opt.replace(gravity=jnp.stack([0.0 * gravity, 0.0 * gravity, -gravity]), timestep=inputs.dt),
@@ -91,11 +91,6 @@ def set_mjx(world: World, inputs: Inputs) -> tuple[mjx.Model, mjx.Data]:
 @functools.lru_cache(maxsize=8)
 def _template(world: World, x64: bool) -> Any:
     return on_mjx(world.mjcf, compiled_scene(world))
-
-
-def body_numbers(world: World) -> np.ndarray:
-    """Numbers of the drones' bodies."""
-    return np.array([int(compiled_scene(world).body(name).id) for name in world.bodies])
 
 
 def on_mjx(path: str, compiled: mujoco.MjModel) -> tuple[mjx.Model, mjx.Data]:
@@ -237,7 +232,8 @@ class _Worker:
     def __init__(self, world: World, count: int):
         from mujoco.batch import Batch
 
-        self.bodies, self.batch = body_numbers(world), Batch(compiled_scene(world), count)
+        model = compiled_scene(world)
+        self.bodies, self.batch = numbers_of(model, world.bodies), Batch(model, count)
         names = ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat", "qfrc_applied")
         self.state = [self.batch.bind(name) for name in names]
         self.start, self.constraint = self.batch.bind("qacc_warmstart"), self.batch.bind("qfrc_constraint")

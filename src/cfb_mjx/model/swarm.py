@@ -36,9 +36,8 @@ from cfb_mjx.model.wakes import (
     interact,
     neighbours,
     require_drones,
-    seen_by,
     sense,
-    sensing,
+    shown,
     wake_of,
 )
 
@@ -116,8 +115,7 @@ def _stepped(prepared: tuple[Prepared, ...], states: tuple[Components, ...], row
     wakes = [wake_of(p, at) for p, at in zip(prepared, states, strict=True)]
     moved = []
     for i, (own, at) in enumerate(zip(prepared, states, strict=True)):
-        others = [seen_by(own, wake).memory() for j, wake in enumerate(wakes) if j != i]
-        at = replace(at, memory=sensing(own.model, at.memory, others))
+        at = shown(own, at, [wake for j, wake in enumerate(wakes) if j != i])
         moved.append(advance(replace(own, wrench_once=plain), at, Vec.unstack(row[4 * i : 4 * i + 4])))
     return tuple(moved)
 

@@ -48,14 +48,14 @@ def begin_among(model: Quadrotor, state: State, others: int) -> State:
     """Add the memory of a long steady flight to a state without memory, with room for so many other drones."""
     at = unstack(begin(model, state), Vec(0.0, 0.0, 0.0))
     unseen = Vec(*(jnp.zeros_like(at.rotor_speed[0]),) * (3 * sum(FORECAST)))
-    return replace(state, memory=stacked(sensing(model, at.memory, [unseen] * others)))
+    return replace(state, memory=stacked(_told(model, at.memory, [unseen] * others)))
 
 
 def _place(model: Quadrotor) -> int:
     return next(i for i, effect in enumerate(model.effects) if isinstance(effect, Downwash))
 
 
-def sensing(model: Quadrotor, memory: tuple, others: Sequence[Vec]) -> tuple:
+def _told(model: Quadrotor, memory: tuple, others: Sequence[Vec]) -> tuple:
     """Memory of all effects of a model with these other drones."""
     return tuple(tuple(others) if i == _place(model) else own for i, own in enumerate(memory))
 
@@ -76,10 +76,16 @@ def wake_of(prepared: Prepared, at: Components) -> Other:
     return Other(path, wake)
 
 
-def seen_by(prepared: Prepared, other: Other) -> Other:
+def _seen_by(prepared: Prepared, other: Other) -> Other:
     """Another drone as the memory of this one holds it."""
     root = 1 / jnp.sqrt(prepared.parameters.mass)
     return other._replace(wake=tuple(part * root for part in other.wake))
+
+
+def shown(prepared: Prepared, at: Components, others: Sequence[Other]) -> Components:
+    """A drone that has seen where the others (`wake_of`) are and point now."""
+    seen = [_seen_by(prepared, other).memory() for other in others]
+    return replace(at, memory=_told(prepared.model, at.memory, seen))
 
 
 def sense(prepared: Prepared, at: Components, near: Int[AnyArray, "drones neighbours"]) -> Components:
@@ -93,8 +99,7 @@ def sense(prepared: Prepared, at: Components, near: Int[AnyArray, "drones neighb
     wakes = jax.vmap(wake_of)(prepared, at)
 
     def one(own, at, near):
-        others = [seen_by(own, jax.tree.map(lambda x, j=j: x[j], wakes)).memory() for j in near]
-        return replace(at, memory=sensing(own.model, at.memory, others))
+        return shown(own, at, [jax.tree.map(lambda x, j=j: x[j], wakes) for j in near])
 
     return jax.vmap(one)(prepared, at, near)
 
@@ -135,7 +140,7 @@ def neighbours(prepared: Prepared, at: Components) -> tuple[Array, Array]:
             air = effect.air_velocity(here - begun, wake)
             return air.dot(air)
 
-        squares = jax.vmap(one)(jax.tree.map(lambda x: x[others], seen_by(own, wakes)))
+        squares = jax.vmap(one)(jax.tree.map(lambda x: x[others], _seen_by(own, wakes)))
         return jnp.where(there, squares, -1.0)
 
     now, soon = (

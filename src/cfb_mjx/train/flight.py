@@ -42,6 +42,11 @@ class Flight(NamedTuple):
     """(*drones, steps, 4), rad/s."""
 
 
+def off_target(flown: Flight, dt: float, settled_s: float) -> Float[Array, "*drones steps"]:
+    """Distance from the target in ``watched`` after every command, m, without the first ``settled_s`` seconds."""
+    return jnp.linalg.norm(flown.position - flown.watched, axis=-1)[..., round(settled_s / dt) :]
+
+
 def steps_flown(flown: Flight, drone: int = 0) -> int:
     """Number of steps that a drone flew before it failed; all steps if it never did.
 
@@ -64,14 +69,19 @@ class Rows(NamedTuple):
     """Target after the command."""
 
 
+def horizons_s(controller: Controller) -> tuple[float, ...]:
+    """How far ahead of the target a controller sees, s; empty if it does not."""
+    layout = getattr(controller, "layout", None)
+    return layout.preview_s if isinstance(layout, Layout) else ()
+
+
 def rows_along(controller: Controller, path: Path, steps: int) -> Rows:
     """Targets along a path, for a controller."""
-    layout, dt = getattr(controller, "layout", None), controller.control_dt_s
-    times = dt * jnp.arange(steps + 1)
+    times = controller.control_dt_s * jnp.arange(steps + 1)
     places = jax.vmap(path)(times)
     ahead = None
-    if isinstance(layout, Layout) and layout.preview_s:
-        horizons = jnp.asarray(layout.preview_s)
+    if horizons_s(controller):
+        horizons = jnp.asarray(horizons_s(controller))
         seen = jax.vmap(lambda time: jax.vmap(lambda ahead: path(time + ahead))(horizons))(times[:-1])
         ahead = (seen - places[:-1, None]).reshape(steps, -1)
     return Rows(places[:-1], ahead, places[1:])

@@ -22,7 +22,7 @@ from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.envs.task import with_room
 from cfb_mjx.files import shipped
 from cfb_mjx.model.effects import GroundEffect
-from cfb_mjx.model.mjcf import BODY_NAME, World, compiled_scene
+from cfb_mjx.model.mjcf import BODY_NAME, World, compiled_scene, meet
 from cfb_mjx.model.mujoco_body import MujocoBody
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.state import AnyArray
@@ -152,9 +152,7 @@ def clearance(position: Float[AnyArray, "*batch 3"], quaternion: Float[AnyArray,
         quaternion: attitude, body to world.
     """
     model = compiled_scene(World(str(shipped("assets", "cfb.xml"))))
-    floor = model.geom("floor")
-    meets = (model.geom_contype & floor.conaffinity) | (floor.contype & model.geom_conaffinity)
-    own = (model.geom_bodyid == model.body(BODY_NAME).id) & (meets > 0)
+    own = (model.geom_bodyid == model.body(BODY_NAME).id) & meet(model, slice(None), [model.geom("floor").id])[:, 0]
     # Spheres and flat ellipsoids, in the body's axes.
     axes = np.where(model.geom_size[own, 1:2] > 0, model.geom_size[own], model.geom_size[own, :1])
     w, x, y, z = jnp.moveaxis(jnp.asarray(quaternion), -1, 0)

@@ -29,8 +29,8 @@ from cfb_mjx.errors import CfbError
 from cfb_mjx.model.effects import Downwash
 from cfb_mjx.model.quadrotor import Quadrotor, prepare
 from cfb_mjx.model.state import stacked, unstack
-from cfb_mjx.model.wakes import interact, seen_by, sensing, wake_of
-from cfb_mjx.train.flight import Flight, Rows, fly, rows_along
+from cfb_mjx.model.wakes import interact, shown, wake_of
+from cfb_mjx.train.flight import Flight, Rows, fly, horizons_s, off_target, rows_along
 from cfb_mjx.train.tracking import Course, require_timescale
 
 _AXIS = "drones that fly together"
@@ -73,19 +73,19 @@ def fly_together(
     if not ways:
         raise CfbError("nothing flies: give a path or Follow for each drone.")
     steps, count = round(seconds / controller.control_dt_s), len(ways)
-    leaders, offsets = np.arange(count), np.zeros((count, 3))
+    leaders, offsets, along = np.arange(count), np.zeros((count, 3)), []
     for i, way in enumerate(ways):
+        path = way
         if isinstance(way, Follow):
-            if not 0 <= way.leader < count or isinstance(ways[way.leader], Follow):
-                raise CfbError(
-                    f"drone {i} follows drone {way.leader}; it must be one with a path, from 0 to {count - 1}."
-                )
+            path = ways[way.leader] if 0 <= way.leader < count else way
             leaders[i], offsets[i] = way.leader, way.offset
-    along = [rows_along(controller, _of_leader(ways, i), steps) for i in range(count)]
+        if isinstance(path, Follow):
+            raise CfbError(f"drone {i} follows drone {leaders[i]}; it must be one with a path, from 0 to {count - 1}.")
+        along.append(rows_along(controller, path, steps))
     rows = jax.tree.map(lambda *x: jnp.stack(x), *along)
     rows = Rows(rows.target + offsets[:, None], rows.ahead, rows.later + offsets[:, None])
     starts = jax.vmap(lambda place: replace(nominal.hover_state(place), memory=()))(rows.target[:, 0])
-    horizons = jnp.asarray(getattr(getattr(controller, "layout", None), "preview_s", ()))
+    horizons = jnp.asarray(horizons_s(controller))[:, None]
 
     def one(key, start, rows, leader, offset):
         own = jax.lax.axis_index(_AXIS)
@@ -96,12 +96,12 @@ def fly_together(
             everyone = jax.lax.all_gather(wake_of(prepared, at), _AXIS)
             others = [jax.tree.map(lambda x, k=k: x[(own + k) % count], everyone) for k in range(1, count)]
             if interact(episode.model):
-                memory = sensing(episode.model, at.memory, [seen_by(prepared, other).memory() for other in others])
-                episode = replace(episode, state=replace(episode.state, memory=stacked(memory)))
+                memory = stacked(shown(prepared, at, others).memory)
+                episode = replace(episode, state=replace(episode.state, memory=memory))
             position, velocity, pull = (part.stack() for part in jax.tree.map(lambda x: x[leader], everyone).path)
             ahead = None
             if row.ahead is not None:
-                ahead = (velocity * horizons[:, None] + pull * (horizons[:, None] ** 2 / 2)).reshape(-1)
+                ahead = (velocity * horizons + pull * (horizons**2 / 2)).reshape(-1)
             follows = leader != own
             seen = Rows(position + offset, ahead, position + offset)
             return episode, jax.tree.map(lambda led, given: jnp.where(follows, led, given), seen, row)
@@ -113,11 +113,6 @@ def fly_together(
     # A follower should have reached the place beside where its leader is now, not where it was before the command.
     beside = flown.position[leaders] + jnp.asarray(offsets)[:, None]
     return flown._replace(watched=jnp.where((leaders != np.arange(count))[:, None, None], beside, flown.watched))
-
-
-def _of_leader(ways: Sequence[Way | Follow], number: int) -> Way:
-    way = ways[number]
-    return _of_leader(ways, way.leader) if isinstance(way, Follow) else way
 
 
 class Together(NamedTuple):
@@ -180,8 +175,8 @@ def follow(
     nominal: Quadrotor,
     keys: PRNGKeyArray,
     path: Way | None = None,
-    seconds: float | None = None,
-    settled_s: float | None = None,
+    seconds: float = FOLLOWED_S,
+    settled_s: float = GATHERED_S,
 ) -> tuple[Together, Flight]:
     """Let a drone lead along a path, and another follow `BELOW_M` below it; other arguments as for `cross`.
 
@@ -190,10 +185,7 @@ def follow(
         seconds: duration, s.
         settled_s: initial time that is not counted, s.
     """
-    course = led()
-    path = course.path if path is None else path
-    seconds = course.seconds if seconds is None else seconds
-    settled_s = course.settled_s if settled_s is None else settled_s
+    path = led().path if path is None else path
     ways = [path, Follow(0, (0.0, 0.0, -BELOW_M))]
     return _measured(controller, with_room(task, nominal), with_wake(nominal), keys, ways, seconds, settled_s)
 
@@ -202,9 +194,7 @@ def follow(
 def _measured(controller, task, nominal, keys, ways, seconds, settled_s):
     flown = jax.vmap(lambda key: fly_together(controller, task, nominal, key, ways, seconds))(keys)
     second = jax.tree.map(lambda x: x[:, 1], flown)
-    distance = jnp.linalg.norm(second.position - second.watched, axis=-1)[
-        :, round(settled_s / controller.control_dt_s) :
-    ]
+    distance = off_target(second, controller.control_dt_s, settled_s)
     failed = flown.failed[..., -1].any(axis=1)
     return Together(distance.mean(axis=1), distance.max(axis=1), closest_m(flown), failed), second
 

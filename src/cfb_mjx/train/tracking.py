@@ -18,7 +18,7 @@ from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.envs.task import with_room
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
-from cfb_mjx.train.flight import Flight, fly
+from cfb_mjx.train.flight import Flight, fly, off_target
 
 
 class Tracking(NamedTuple):
@@ -108,7 +108,6 @@ def track(
 def _track(controller, task, nominal, keys, path, seconds, settled_s):
     start = nominal.hover_state(path(jnp.zeros(())))
     flown = jax.vmap(lambda key: fly(controller, task, nominal, key, seconds, start, path=path))(keys)
-    counted = round(settled_s / controller.control_dt_s)
-    distance = jnp.linalg.norm(flown.position - flown.watched, axis=-1)[:, counted:]
-    speed = jnp.linalg.norm(flown.velocity, axis=-1)[:, counted:].max(axis=1)
+    distance = off_target(flown, controller.control_dt_s, settled_s)
+    speed = jnp.linalg.norm(flown.velocity, axis=-1)[:, -distance.shape[1] :].max(axis=1)
     return Tracking(distance.mean(axis=1), distance.max(axis=1), speed, flown.failed[:, -1]), flown

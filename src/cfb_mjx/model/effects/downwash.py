@@ -135,7 +135,6 @@ class Downwash(Effect):
     """Growth of that distance per distance from the other drone."""
     convection: Float[Array, "*batch"] = eqx.field(converter=number, default=0.6)
     """Speed at which the wake moves on over the speed of the air on its axis; about 0.6 in turbulent round jets."""
-
     lever: Float[Array, "*batch"] = eqx.field(converter=number, default=1.0)
     """Torque over that of the forces at the hubs."""
 
