@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from cfb_mjx.errors import CfbError
@@ -136,7 +137,7 @@ class Devices:
         Args:
             function: function of pytrees of arrays that treats examples independently.
             in_axes: axis to divide of every argument; None for arguments that every device gets whole.
-            out_axes: the same for the results, a pytree prefix.
+            out_axes: the same for the results, a pytree prefix; None for results that are the same on every device.
 
         Returns:
             A function with the same arguments and results, to be called within a compiled function.
@@ -150,13 +151,27 @@ class Devices:
                 lambda *x: function(*eqx.combine(self._together(x), rest)),
                 mesh=self.mesh,
                 in_specs=tuple(map(_spec, in_axes)),
-                out_specs=jax.tree.map(_spec, out_axes),
+                out_specs=jax.tree.map(_spec, out_axes, is_leaf=lambda axis: axis is None),
                 # The check rejects scans that begin with constants.
                 check_vma=False,
             )
             return shared(*arrays)
 
         return call
+
+    def own(self, x: Any, axis: int = 0) -> Any:
+        """Within `divided`: this device's part of an array that every device holds, along ``axis``."""
+        if not self.several:
+            return x
+        length = x.shape[axis] // self.count
+        return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * length, length, axis)
+
+    def total(self, tree: Any) -> Any:
+        """Within `divided`: the sum of every array over the devices, in one exchange."""
+        if not self.several:
+            return tree
+        numbers, unravel = ravel_pytree(tree)
+        return unravel(jax.lax.psum(numbers, AXIS))
 
     def mapped(self, function: Callable) -> Callable:
         """Return ``jax.vmap(function)`` with the examples divided over the devices; the caller compiles it."""

@@ -250,11 +250,11 @@ def test_a_change_of_command_has_its_price_within_a_flight_alone():
             changes += [float(np.sum((b - a) ** 2)) for a, b in pairwise(mean[begin:end, copy])]
     last = data["hidden"][-1]
     weights = jnp.asarray(1.0), jnp.asarray(0.0)
-    both = state.actor, state.critic
-    total, metrics = jax.jit(ppo._loss)(both, weights, data, last, jax.random.PRNGKey(0))
+    both, keys = (state.actor, state.critic), jax.random.split(jax.random.PRNGKey(0), 8)
+    total, metrics = jax.jit(ppo._loss)(both, weights, data, last, keys)
     assert float(metrics["change"]) == pytest.approx(np.mean(changes), rel=1e-4)
     free = Ppo(replace(ppo.settings, smoothness=0.0), ppo.task, ppo.nominal)
-    without, _ = jax.jit(free._loss)(both, weights, data, last, jax.random.PRNGKey(0))
+    without, _ = jax.jit(free._loss)(both, weights, data, last, keys)
     assert float(total - without) == pytest.approx(ppo.settings.smoothness * np.mean(changes), rel=1e-3)
 
 
@@ -580,10 +580,9 @@ def test_the_loss_is_the_articles_written_out():
     actor = eqx.tree_at(lambda a: a.raw_std, actor, replace_fn=lambda s: s + 0.2)
     last = data["hidden"][-1]
     loss = jax.jit(ppo._loss)
-    total, metrics = loss(
-        (actor, state.critic), (jnp.asarray(1.0), jnp.asarray(0.0)), data, last, jax.random.PRNGKey(0)
-    )
-    dearer, _ = loss((actor, state.critic), (jnp.asarray(1.0), jnp.asarray(0.5)), data, last, jax.random.PRNGKey(0))
+    both, keys = (actor, state.critic), jax.random.split(jax.random.PRNGKey(0), 8)
+    total, metrics = loss(both, (jnp.asarray(1.0), jnp.asarray(0.0)), data, last, keys)
+    dearer, _ = loss(both, (jnp.asarray(1.0), jnp.asarray(0.5)), data, last, keys)
 
     s, n = ppo.settings, {k: np.asarray(v, float) for k, v in data.items() if k not in ("seen", "hidden")}
     # The best reward forever, and what the network says of it.
@@ -610,8 +609,7 @@ def test_the_loss_is_the_articles_written_out():
     advantage /= np.sqrt(mean(advantage**2))
     loc, std = np.asarray(actor.network(data["seen"])), np.log1p(np.exp(np.asarray(actor.raw_std))) + 0.001
     raw = n["raw"]
-    # log |d tanh(x) / dx| = log(1 - tanh(x)^2)
-    density = (norm.logpdf(raw, loc, std) - np.log1p(-(np.tanh(raw) ** 2))).sum(-1)
+    density = norm.logpdf(raw, loc, std).sum(-1)
     ratio = np.exp(density - n["log_prob"])
     assert 0.05 < mean(np.abs(ratio - 1) > s.clipping) < 0.95
     gain = mean(np.minimum(ratio * advantage, np.clip(ratio, 1 - s.clipping, 1 + s.clipping) * advantage))
@@ -621,6 +619,11 @@ def test_the_loss_is_the_articles_written_out():
     assert float(metrics["kl"]) == pytest.approx(mean(ratio - 1 - np.log(ratio)), rel=1e-5)
     # More entropy is a gain.
     assert float(total - dearer) == pytest.approx(0.5 * float(metrics["entropy"]), rel=1e-4)
+    # Brax's entropy, also of random commands.
+    logits = jnp.concatenate([jnp.asarray(loc), jnp.broadcast_to(actor.raw_std, loc.shape)], axis=-1)
+    draws = jax.vmap(lambda key: ppo.distribution.entropy(logits, key))(jax.random.split(jax.random.key(1), 200))
+    each = (np.asarray(draws) * flown).sum((1, 2)) / flown.sum()
+    assert abs(float(metrics["entropy"]) - each.mean()) < 4 * each.std()
 
 
 def test_the_entropy_bonus_falls_to_its_last_share(monkeypatch):
@@ -628,12 +631,12 @@ def test_the_entropy_bonus_falls_to_its_last_share(monkeypatch):
     ppo, state, _, after, data, outcome = collected_after_throwing(slice(0, 0))
     seen = []
 
-    def epoch(weights, data, last, learnt, key):
+    def learn(learnt, weights, data, last, key):
         seen.append([float(w) for w in weights])
         return learnt, {"kl": jnp.zeros(())}
 
     monkeypatch.setattr(ppo, "_collect", lambda *_: (after, data, outcome))
-    monkeypatch.setattr(ppo, "_epoch", epoch)
+    monkeypatch.setattr(ppo, "_learn", learn)
     monkeypatch.setattr(ppo, "updates", 10)
     for count in (0, 5, 10):
         ppo._update(eqx.tree_at(lambda s: s.count, state, jnp.asarray(count)))

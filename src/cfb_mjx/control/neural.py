@@ -141,9 +141,14 @@ class Network(eqx.Module):
 
     def columns(self, x: Float[Array, "inputs drones"]) -> Float[Array, "outputs drones"]:
         """Evaluate for many inputs along the last axis."""
+
+        def layer(weight, bias, x):
+            # XLA's library for matrix products is slow for a single row.
+            single = weight.shape[1] == 1
+            return (jnp.sum(weight * x, axis=0, keepdims=True) if single else weight.T @ x) + bias[:, None]
+
         # Without the barrier XLA would split the product into one per part of a concatenated x, and add them up.
-        x = jax.lax.optimization_barrier(x)
-        return self._through(lambda weight, bias, x: weight.T @ x + bias[:, None], x)
+        return self._through(layer, jax.lax.optimization_barrier(x))
 
     def _through(self, layer: Callable, x: Array) -> Array:
         if self.gru is not None:

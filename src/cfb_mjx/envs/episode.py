@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from cfb_mjx.engine.draws import normal
 from cfb_mjx.envs import observation as seen
 from cfb_mjx.envs.observation import Memory, StateEstimate
 from cfb_mjx.envs.task import Task, room_s
@@ -222,7 +223,7 @@ def step(
     of_state, of_estimate = jax.random.split(jax.random.fold_in(episode.key, episode.count))
     hold, noise = task.hold(model), task.noise
     scale = jnp.array([noise.state_velocity_mps] * 3 + [noise.state_rate_radps] * 3, command.dtype)
-    kicks = scale * jax.random.normal(of_state, (hold, 6), command.dtype)
+    kicks = scale * normal(of_state, (hold, 6), command.dtype)
     on = 1.0 if stopped is None else jnp.where(stopped, 0.0, 1.0)
     row, center = Vec.unstack(on * command), prepared.parameters.center_of_gravity
 
@@ -285,13 +286,13 @@ def _estimate(task: Task, model: Quadrotor, past: DelayLine, target: Array, key:
     if not task.lumped_delay:
         gyro = DelayLine(past.samples.body_rate, past.dt).read(parameters.gyro_delay)
         late = Pose(late.position, late.velocity, late.quaternion, gyro)
-    draws = jax.random.normal(key, (12,), late.position.dtype)
+    errors = normal(key, (12,), late.position.dtype)
     # Interpolation between two unit quaternions is slightly shorter than one.
     q = late.quaternion / jnp.sqrt(jnp.sum(late.quaternion**2))
-    turned = Vec.unstack(parameters.attitude_offset + noise.attitude_rad * draws[6:9])
+    turned = Vec.unstack(parameters.attitude_offset + noise.attitude_rad * errors[6:9])
     return StateEstimate(
-        late.position - target + noise.position_m * draws[:3],
-        late.velocity + noise.velocity_mps * draws[3:6],
+        late.position - target + noise.position_m * errors[:3],
+        late.velocity + noise.velocity_mps * errors[3:6],
         multiply(Vec.unstack(q), exponential(turned * 0.5)).stack(),
-        late.body_rate + noise.rate_radps * draws[9:],
+        late.body_rate + noise.rate_radps * errors[9:],
     )

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from cfb_mjx.control.neural import Network, NeuralController
 from cfb_mjx.devices import Devices
+from cfb_mjx.engine.draws import normal
 from cfb_mjx.envs.episode import Episode, choose, observe, privileged, reset, step
 from cfb_mjx.envs.task import Task
 from cfb_mjx.model.quadrotor import Quadrotor
@@ -128,12 +129,9 @@ class Ppo:
         learning = jnp.where(state.count < self.warm_up, 0.0, 1.0)
         left = 1 - (1 - self.settings.last_entropy) * state.count / self.updates
         weights = learning, learning * self.settings.entropy_cost * left
-        (actor, critic, optimizer, rate), losses = jax.lax.scan(
-            partial(self._epoch, weights, data, last),
-            (state.actor, state.critic, state.optimizer, state.rate),
-            jax.random.split(of_learning, self.settings.epochs),
-        )
-        losses = jax.tree.map(jnp.mean, losses)
+        learn = self.devices.divided(self._learn, (None,) * 5, None)
+        learnt = state.actor, state.critic, state.optimizer, state.rate
+        (actor, critic, optimizer, rate), losses = learn(learnt, weights, data, last, of_learning)
         # The rate falls within an update and rises between updates: the first batches have no divergence yet.
         calm = (learning > 0) & (losses["kl"] < self.settings.largest_kl / 4)
         rate = jnp.minimum(jnp.where(calm, 1.5 * rate, rate), 1.0)
@@ -186,9 +184,8 @@ class Ppo:
         def one(fresh, episodes, noise):
             episodes, lost = episodes
             shown = jax.vmap(self._show)(episodes)
-            logits = _logits(actor, shown["seen"])
-            normal = self.distribution.create_dist(logits)
-            raw = normal.loc + normal.scale * noise
+            loc, scale = actor.network(shown["seen"]), self._std(actor)
+            raw = loc + scale * noise
             action = self.distribution.postprocess(raw)
             after, outcome = jax.vmap(partial(step, self.task))(episodes, 0.5 * (1 + action))
             failed, timed_out = outcome.failed | lost, outcome.timed_out & ~lost
@@ -196,7 +193,7 @@ class Ppo:
             over = jnp.repeat(over, copies)
             kept = shown | {
                 "raw": raw,
-                "log_prob": self.distribution.log_prob(logits, raw),
+                "log_prob": _log_prob(loc.T, scale[:, None], raw.T),
                 "reward": self.settings.reward_scaling * jnp.maximum(outcome.reward, self.settings.least_reward),
                 "failed": 1.0 * failed,
                 "cut": 1.0 * (over & ~failed),
@@ -207,20 +204,27 @@ class Ppo:
 
         return jax.lax.scan(some, episodes, (of_reset, noise))
 
-    def _epoch(self, weights, data: dict[str, Array], last: Array, learnt: tuple, key: PRNGKeyArray):
-        of_order, of_entropy = jax.random.split(key)
-        count = self.settings.minibatches
-        # A batch consists of the whole flights of some drones; every device takes its share of it.
-        copies = self.settings.copies
-        order = jax.random.permutation(of_order, self.settings.drones // copies)
-        order = (copies * order[:, None] + jnp.arange(copies)).reshape(count, -1)
-        order = self.devices.along(order, 1)
-        batches = jax.tree.map(lambda x: self.devices.along(jnp.moveaxis(x[:, order], 1, 0), 2), data)
-        batches = batches, self.devices.along(last[order], 1), jax.random.split(of_entropy, count)
+    def _learn(
+        self, learnt: tuple, weights: tuple[Array, Array], data: dict[str, Array], last: Array, key: PRNGKeyArray
+    ) -> tuple[tuple, dict[str, Array]]:
+        """Learn from the flights of all drones; every device takes its share of each batch, and all learn the same."""
+        count, copies = self.settings.minibatches, self.settings.copies
+
+        def epoch(learnt, key):
+            of_order, of_entropy = jax.random.split(key)
+            # A batch consists of the whole flights of some drones.
+            order = jax.random.permutation(of_order, self.settings.drones // copies)
+            order = (copies * order[:, None] + jnp.arange(copies)).reshape(count, -1)
+            return jax.lax.scan(one, learnt, (order, jax.random.split(of_entropy, count)))
 
         def one(learnt, batch):
             actor, critic, optimizer, rate = learnt
-            gradient, metrics = jax.grad(self._loss, has_aux=True)((actor, critic), weights, *batch)
+            drones, keys = self.devices.own(batch[0]), self.devices.own(jax.random.split(batch[1], len(batch[0])))
+            flights = {name: x[:, drones] for name, x in data.items()}
+            loss = jax.grad(self._loss, has_aux=True)
+            gradient, metrics = self.devices.total(loss((actor, critic), weights, flights, last[drones], keys))
+            spread = metrics.pop("squares") - metrics.pop("returns") ** 2
+            metrics["value_explained"] = 1 - 4 * metrics["value_loss"] / spread
             changes, optimizer = self.optimizer.update(gradient, optimizer)
             changes = cast(tuple[Actor, Network], changes)
             if most := self.settings.largest_kl:
@@ -233,57 +237,86 @@ class Ppo:
             actor, critic = eqx.apply_updates((actor, critic), changes)
             return (actor, critic, optimizer, rate), metrics
 
-        return jax.lax.scan(one, learnt, batches)
+        learnt, metrics = jax.lax.scan(epoch, learnt, jax.random.split(key, self.settings.epochs))
+        return learnt, jax.tree.map(jnp.mean, metrics)
 
     def _loss(
-        self, both: tuple[Actor, Network], weights: tuple[Array, Array], data: dict, last: Array, key: PRNGKeyArray
-    ) -> tuple[Array, dict]:
-        logits = _logits(both[0], data["seen"])
-        values = self._value(both[1], data["hidden"])
+        self,
+        both: tuple[Actor, Network],
+        weights: tuple[Array, Array],
+        flights: dict[str, Array],
+        last: Float[Array, "drones hidden"],
+        keys: PRNGKeyArray,
+    ) -> tuple[Array, dict[str, Array]]:
+        """Loss of a batch, and metrics: this device's addends, which `cfb_mjx.devices.Devices.total` adds up.
+
+        Args:
+            both: policy and value network.
+            weights: of what the policy learns, and of the entropy.
+            flights: this device's share of the batch: values of `_fly`, (unroll, drones, ...).
+            last: what the value network sees after the flights.
+            keys: a key per drone.
+        """
+        (actor, critic), settings, total, flown = both, self.settings, self.devices.total, flights["flown"]
+        seen, hidden, raw = (_columns(flights[name]) for name in ("seen", "hidden", "raw"))
+        values = self._value(critic, hidden).reshape(flown.shape)
         # Computed again for every batch, because the value network learns from the same flights.
         returns, advantage = self.brax.losses.compute_gae(
-            truncation=data["cut"],
-            termination=data["failed"],
-            rewards=data["reward"],
+            truncation=flights["cut"],
+            termination=flights["failed"],
+            rewards=flights["reward"],
             values=values,
-            bootstrap_value=self._value(both[1], last),
-            lambda_=self.settings.gae_lambda,
-            discount=self.settings.discount,
+            bootstrap_value=self._value(critic, last.T),
+            lambda_=settings.gae_lambda,
+            discount=settings.discount,
         )
-        flown = data["flown"]
-
-        def mean(x):
-            return jnp.sum(flown * x) / jnp.sum(flown)
-
-        advantage = beside_copies(advantage, flown, self.settings.copies)
-        most = self.settings.advantage_limit * mean(jnp.abs(advantage))
-        advantage = jnp.clip(advantage, -most, most)
-        advantage -= mean(advantage)
-        advantage /= jnp.sqrt(mean(advantage**2)) + 1e-8
-        log_ratio = self.distribution.log_prob(logits, data["raw"]) - data["log_prob"]
-        ratio = jnp.exp(log_ratio)
-        near = self.settings.clipping
-        gain = mean(jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - near, 1 + near) * advantage))
-        value_loss = mean((returns - values) ** 2) / 4
-        entropy = mean(self.distribution.entropy(logits, key))
         # Change from one command to the next of the same flight.
-        follows = (flown * (1 - data["failed"]) * (1 - data["cut"]))[:-1] * flown[1:]
-        change = jnp.sum(jnp.diff(jnp.tanh(logits[..., :4]), axis=0) ** 2, axis=-1)
-        change = jnp.sum(follows * change) / jnp.maximum(jnp.sum(follows), 1.0)
-        loss = value_loss - weights[0] * (gain - self.settings.smoothness * change) - weights[1] * entropy
-        return loss, {
-            "loss": loss,
-            "value_loss": value_loss,
-            "value_explained": 1 - 4 * value_loss / mean((returns - mean(returns)) ** 2),
-            "entropy": entropy,
-            "change": change,
-            # The low-variance estimator (Schulman, Approximating KL divergence, 2020).
-            "kl": mean(ratio - 1 - log_ratio),
-            "clipped": mean(jnp.abs(ratio - 1) > near),
-        }
+        follows = (flown * (1 - flights["failed"]) * (1 - flights["cut"]))[:-1] * flown[1:]
+        advantage = beside_copies(advantage, flown, settings.copies)
+        commands, pairs, size = total((jnp.sum(flown), jnp.sum(follows), jnp.sum(flown * jnp.abs(advantage))))
+        most = settings.advantage_limit * size / commands
+        advantage = jnp.clip(advantage, -most, most)
+        sums = total((jnp.sum(flown * advantage), jnp.sum(flown * advantage**2)))
+        mean, square = (x / commands for x in sums)
+        advantage = (advantage - mean) / (jnp.sqrt(jnp.maximum(square - mean**2, 0.0)) + 1e-8)
 
-    def _value(self, critic: Network, shown: Array) -> Array:
-        return self.ideal + critic(shown)[..., 0]
+        raw = raw.reshape(4, *flown.shape)
+        loc, scale = actor.network.columns(seen).reshape(raw.shape), self._std(actor)[:, None, None]
+        log_ratio = _log_prob(loc, scale, raw) - flights["log_prob"]
+        ratio = jnp.exp(log_ratio)
+        near = settings.clipping
+        gain = jnp.minimum(ratio * advantage, jnp.clip(ratio, 1 - near, 1 + near) * advantage)
+        noise = jnp.moveaxis(jax.vmap(lambda key: normal(key, (4, len(flown)), raw.dtype))(keys), 0, -1)
+        # Of the Gaussian in closed form; what the tanh takes of it, at random commands.
+        entropy = jnp.sum(
+            0.5 * math.log(2 * math.pi * math.e) + jnp.log(scale) + _log_slope(loc + scale * noise), axis=0
+        )
+        change = jnp.sum(jnp.diff(jnp.tanh(loc), axis=1) ** 2, axis=0)
+
+        def mean_of(x):
+            return jnp.sum(flown * x) / commands
+
+        metrics = {
+            "value_loss": mean_of((returns - values) ** 2) / 4,
+            "entropy": mean_of(entropy),
+            "change": jnp.sum(follows * change) / jnp.maximum(pairs, 1.0),
+            # The low-variance estimator (Schulman, Approximating KL divergence, 2020).
+            "kl": mean_of(ratio - 1 - log_ratio),
+            "clipped": mean_of(jnp.abs(ratio - 1) > near),
+            # Relative to the value of the best flight, which is large beside their spread.
+            "returns": mean_of(returns - self.ideal),
+            "squares": mean_of((returns - self.ideal) ** 2),
+        }
+        learning = weights[0] * (mean_of(gain) - settings.smoothness * metrics["change"])
+        loss = metrics["value_loss"] - learning - weights[1] * metrics["entropy"]
+        return loss, metrics | {"loss": loss}
+
+    def _value(self, critic: Network, shown: Float[Array, "hidden n"]) -> Float[Array, " n"]:
+        return self.ideal + critic.columns(shown)[0]
+
+    def _std(self, actor: Actor) -> Float[Array, "4"]:
+        """Standard deviations of the Gaussian before the tanh."""
+        return self.distribution.create_dist(jnp.concatenate([actor.raw_std, actor.raw_std])).scale
 
 
 def beside_copies(
@@ -307,6 +340,18 @@ def beside_copies(
     return (of_each - mean).reshape(advantage.shape)
 
 
-def _logits(actor: Actor, seen: Array) -> Array:
-    loc = actor.network(seen)
-    return jnp.concatenate([loc, jnp.broadcast_to(actor.raw_std, loc.shape)], axis=-1)
+def _columns(x: Float[Array, "n drones size"]) -> Float[Array, "size m"]:
+    """All commands of all drones side by side, which is how XLA multiplies matrices fastest on CPUs."""
+    return jax.lax.optimization_barrier(x.reshape(-1, x.shape[-1]).T)
+
+
+def _log_prob(
+    loc: Float[Array, "4 ..."], scale: Float[Array, "4 ..."], raw: Float[Array, "4 ..."]
+) -> Float[Array, "..."]:
+    """Logarithm of the density of commands before the tanh, which changes all densities by the same factor."""
+    return -jnp.sum(0.5 * ((raw - loc) / scale) ** 2 + jnp.log(scale) + 0.5 * math.log(2 * math.pi), axis=0)
+
+
+def _log_slope(raw: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """Logarithm of the derivative of tanh."""
+    return 2 * (math.log(2.0) - raw - jax.nn.softplus(-2 * raw))
