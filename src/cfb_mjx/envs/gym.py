@@ -15,14 +15,15 @@ from __future__ import annotations
 
 import os
 import sys
-from functools import partial
-from typing import Any
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
-from cfb_mjx.envs.episode import Episode, Outcome, choose, observe, reset, step
+from cfb_mjx.envs.episode import Episode, choose, observe, reset, step
 from cfb_mjx.envs.flip import FlipTask
 from cfb_mjx.envs.target import TargetTask
 from cfb_mjx.envs.task import Task, with_room
@@ -87,7 +88,6 @@ def _truth(episode: Episode) -> dict[str, Any]:
     }
 
 
-# Compiled once for all environments of a task in a process.
 @partial(jax.jit, static_argnums=0)
 def _draw(task: Task, nominal: Quadrotor, keys: Array) -> tuple[Array, Episode]:
     """New keys, and the next episode of every drone."""
@@ -95,17 +95,47 @@ def _draw(task: Task, nominal: Quadrotor, keys: Array) -> tuple[Array, Episode]:
     return keys, jax.vmap(partial(reset, task, nominal))(own)
 
 
-@partial(jax.jit, static_argnums=0)
-def _fly(task: Task, episodes: Episode, actions: Array) -> tuple[Episode, Outcome, tuple[Array, dict[str, Any]]]:
-    after, outcome = jax.vmap(partial(step, task))(episodes, 0.5 * (1 + actions))
-    return after, outcome, _show(task, after)
+Leaves = list[Array]
+"""The arrays of an `Episode`: jax hands over a list in half the time that it needs for the object."""
 
 
-@partial(jax.jit, static_argnums=0)
-def _begin(task: Task, which: Array, waiting: Episode, episodes: Episode) -> tuple[Episode, tuple[Array, dict]]:
-    """Begin the waiting episodes of ``which``."""
-    begun = choose(which, waiting, episodes)
-    return begun, _show(task, begun)
+class _Programs(NamedTuple):
+    """Compiled functions of the drones of an environment."""
+
+    fly: Callable[[Leaves, Leaves, np.ndarray, np.ndarray, Any], tuple]
+    """Fly actions. Then begin the waiting episodes, as far as they are ready, of drones whose time for it has come: in
+    the same step or in the next. Returns the episodes, the outcome, and what is seen before and after that."""
+    begin: Callable[[np.ndarray, Leaves, Leaves], tuple]
+    """Begin the waiting episodes of some drones; also returns what is seen of all."""
+    redraw: Callable[[Quadrotor, Array, Leaves, np.ndarray, np.ndarray, np.ndarray], tuple]
+    """Draw again the waiting episodes of some drones: (nominal drone, keys, waiting episodes, which drones, their
+    numbers, each drone's place among the numbers)."""
+
+
+@lru_cache(maxsize=32)
+def _programs(task: Task, mode: AutoresetMode, structure: Any) -> _Programs:
+    """Programs for a task, compiled once in a process."""
+
+    def fly(flying, waiting, ready, anew, actions):
+        after, outcome = jax.vmap(partial(step, task))(structure.unflatten(flying), 0.5 * (1 + actions))
+        seen = _show(task, after)
+        if mode == AutoresetMode.DISABLED:
+            return jax.tree.leaves(after), outcome, seen, seen
+        now = anew if mode == AutoresetMode.NEXT_STEP else (outcome.failed | outcome.timed_out) & ~anew
+        begun = choose(now & ready, structure.unflatten(waiting), after)
+        return jax.tree.leaves(begun), outcome, seen, _show(task, begun)
+
+    def begin(which, waiting, flying):
+        begun = choose(which, structure.unflatten(waiting), structure.unflatten(flying))
+        return jax.tree.leaves(begun), _show(task, begun)
+
+    def redraw(nominal, keys, waiting, which, numbers, places):
+        drawn = _draw(task, nominal, keys[numbers])
+        drawn = jax.tree.map(lambda x: x[places], drawn)
+        keys, waiting = choose(which, drawn, (keys, structure.unflatten(waiting)))
+        return keys, jax.tree.leaves(waiting)
+
+    return _Programs(*map(jax.jit, (fly, begin, redraw)))
 
 
 def _show(task: Task, episodes: Episode) -> tuple[Array, dict[str, Any]]:
@@ -114,6 +144,8 @@ def _show(task: Task, episodes: Episode) -> tuple[Array, dict[str, Any]]:
 
 
 _choose = jax.jit(choose)
+_AT_ONCE = 64
+"""Waiting episodes that are drawn together."""
 
 
 class TargetVectorEnv(VectorEnv):
@@ -204,8 +236,10 @@ class TargetVectorEnv(VectorEnv):
             if not each:
                 given, keys = np.ones(self.num_envs, bool), jax.random.split(keys[0], self.num_envs)
             if self._keys is None:
-                self._keys, self._waiting = _draw(self.task, self.nominal, keys)
+                self._keys, episodes = _draw(self.task, self.nominal, keys)
+                self._waiting, structure = jax.tree.flatten(episodes)
                 self._episodes, self._taken = self._waiting, np.zeros(self.num_envs, bool)
+                self._programs = _programs(self.task, self.autoreset_mode, structure)
             else:
                 self._keys, self._taken = _choose(given, keys, self._keys), self._taken | given
         seen, truth = self._begin(which)
@@ -219,16 +253,28 @@ class TargetVectorEnv(VectorEnv):
     def _begin(self, which: np.ndarray) -> tuple[Array, dict[str, Any]]:
         """Begin the waiting episodes of ``which`` and return what is seen of all drones.
 
-        Drawing costs as much as flying: all waiting episodes that were used are drawn again together, when one of them
-        is needed. A drone's own key alone determines the sequence of its episodes.
+        Waiting episodes that were used are drawn again when one of them is needed, so that each drawing is of many. A
+        drone's own key alone determines the sequence of its episodes.
         """
         if (which & self._taken).any():
-            drawn = _draw(self.task, self.nominal, self._keys)
-            self._keys, self._waiting = _choose(self._taken, drawn, (self._keys, self._waiting))
-            self._taken = np.zeros(self.num_envs, bool)
-        self._episodes, shown = _begin(self.task, which, self._waiting, self._episodes)
+            self._redraw()
+        self._episodes, shown = self._programs.begin(which, self._waiting, self._episodes)
         self._taken, self._over = self._taken | which, self._over & ~which
         return shown
+
+    def _redraw(self) -> None:
+        numbers = np.flatnonzero(self._taken)
+        # All of them at once if they are many.
+        block = self.num_envs if 2 * len(numbers) > self.num_envs else min(_AT_ONCE, self.num_envs)
+        for start in range(0, len(numbers), block):
+            some, which = numbers[start : start + block], np.zeros(self.num_envs, bool)
+            places = np.zeros(self.num_envs, np.int32)
+            which[some], places[some] = True, np.arange(len(some))
+            padded = np.concatenate([some, np.full(block - len(some), some[0])])
+            self._keys, self._waiting = self._programs.redraw(
+                self.nominal, self._keys, self._waiting, which, padded, places
+            )
+        self._taken = np.zeros(self.num_envs, bool)
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Fly one action per drone.
@@ -245,7 +291,9 @@ class TargetVectorEnv(VectorEnv):
             over = f" ({anew.sum()} episodes are over)" if anew.any() else ""
             raise NotReset(f"{who}: call reset before step{over}.")
         actions = _checked(actions, (self.num_envs, 4), who)
-        self._episodes, outcome, shown = _fly(self.task, self._episodes, actions)
+        self._episodes, outcome, before, shown = self._programs.fly(
+            self._episodes, self._waiting, ~self._taken, anew, actions
+        )
         # If the last step ended an episode, this one begins the next, and its action is ignored.
         failed = np.asarray(outcome.failed) & ~anew
         timed_out = np.asarray(outcome.timed_out) & ~anew & ~failed
@@ -257,11 +305,12 @@ class TargetVectorEnv(VectorEnv):
         over = failed | timed_out
         self._over, final = over, {}
         if self.autoreset_mode == AutoresetMode.SAME_STEP and over.any():
-            final = {"final_obs": np.asarray(shown[0], np.float32), "final_info": _shown(shown[1], over) | why}
+            final = {"final_obs": np.asarray(before[0], np.float32), "final_info": _shown(before[1], over) | why}
             final |= {f"_{name}": over for name in final}
             why, anew = {}, over
-        if anew.any():
-            shown = self._begin(anew)
+        if (late := anew & self._taken).any():
+            shown = self._begin(late)
+        self._taken, self._over = self._taken | anew, self._over & ~anew
         info = _shown(shown[1], np.ones(self.num_envs, bool)) | why | final
         return np.asarray(shown[0], np.float32), reward, failed, timed_out, info
 
