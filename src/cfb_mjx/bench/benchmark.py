@@ -1,10 +1,12 @@
-"""Measure throughput, together with that of crazyflow, in one run on one machine."""
+"""Measure throughput, together with that of other simulators, in one run on one machine."""
 
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import os
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -16,11 +18,12 @@ import jax
 from cfb_mjx.bench import page, workloads
 from cfb_mjx.bench.first_call import first_call
 from cfb_mjx.bench.roofline import roofline as roofline_of_machine
-from cfb_mjx.bench.scaling import scaling
+from cfb_mjx.bench.scaling import braxs_ppo, scaling
 from cfb_mjx.bench.timed_process import TimedProcess
 from cfb_mjx.devices import Devices
 from cfb_mjx.engine.gpu import kernel_is_chosen
 from cfb_mjx.errors import CfbError
+from cfb_mjx.files import shipped
 from cfb_mjx.optional import not_none
 from cfb_mjx.runtime import cores, environment, say
 
@@ -32,16 +35,28 @@ TURNS_S = 20.0
 
 
 class Peer(TimedProcess):
-    """A crazyflow process that times one run per request, so that its runs can alternate with this library's."""
+    """A process of another simulator that times one run per request, so that its runs can alternate with ours.
 
-    name = "crazyflow"
+    Args:
+        name: name of the simulator; the process runs ``peers/NAME_peer.py``.
+        python: its Python.
+        what: what it is compared with, see `cfb_mjx.bench.workloads`.
+        drones: number of drones.
+        arguments: further arguments of its script.
+        core: the only core that it may use; None does not limit it.
 
-    def __init__(self, python: Path, drones: int, network: Path | None = None, core: int | None = None):
-        script = Path(__file__).with_name("peers") / "crazyflow_peer.py"
+    Raises:
+        CfbError: the simulator does not run with that Python.
+    """
+
+    def __init__(
+        self, name: str, python: Path, what: str, drones: int, arguments: Sequence[str] = (), core: int | None = None
+    ):
+        script = Path(__file__).with_name("peers") / f"{name.replace('.', '_')}_peer.py"
         try:
             with _bound_to(core):
                 self.process = subprocess.Popen(
-                    [str(python), str(script), str(drones), *([] if network is None else [str(network)])],
+                    [str(python), str(script), str(drones), *arguments],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=subprocess.PIPE,
@@ -54,9 +69,9 @@ class Peer(TimedProcess):
         answer = not_none(self.process.stdout).readline().split()
         if len(answer) != 4 or answer[0] != "ready":
             last = (self.process.communicate()[1].strip().splitlines() or ["no output"])[-1]
-            raise CfbError(f"--peer-python {python}: crazyflow does not run there ({last}).")
-        self.version, self.compile_s, self.steps, self.drones = answer[1], float(answer[2]), int(answer[3]), drones
-        self.what = "rollout" if network is None else "rollout_policy"
+            raise CfbError(f"--peer-python {python}: {name} does not run there ({last}).")
+        self.name, self.what, self.drones = name, what, drones
+        self.version, self.compile_s, self.steps = answer[1], float(answer[2]), int(answer[3])
         self.cores = (cores() if core is None else 1) if jax.default_backend() == "cpu" else None
 
 
@@ -81,7 +96,7 @@ def benchmark(
 
     Args:
         drones: batch sizes.
-        peer_python: Python of an environment with crazyflow, to measure it as well.
+        peer_python: Python of an environment with crazyflow, to measure it as well; also l2f, if it has that.
         quick: measure fewer workloads with fewer repetitions.
         roofline: also compare the speed with the limits of the machine.
 
@@ -100,8 +115,10 @@ def benchmark(
         with tempfile.TemporaryDirectory() as folder:
             network = workloads.network_file(Path(folder))
             groups = [_open_loop(count, several, peer_python)]
-            groups += [] if quick else [_closed_loop(count, several, peer_python, network), _others(count)]
-            for group in groups:
+            if not quick:
+                groups += [_closed_loop(count, several, peer_python, network), _environments(count, peer_python)]
+                groups += [_contact(count), _derivatives(count)]
+            for group in filter(None, groups):
                 best = _alternate(group, QUICK_TURNS) if quick else _alternate(group, TURNS, TURNS_S)
                 for item, seconds in zip(group, best, strict=True):
                     row = _row(item, count, seconds)
@@ -114,6 +131,8 @@ def benchmark(
     if not quick:
         say("measuring one core and two cores")
         result["scaling"] = scaling()
+        say("measuring Brax's own PPO")
+        peers += braxs_ppo()
     if roofline:
         say("measuring the limits of the machine")
         result["roofline"] = roofline_of_machine()
@@ -121,32 +140,54 @@ def benchmark(
 
 
 def _open_loop(count: int, several: Devices | None, python: Path | None) -> list:
-    """Workloads that take turns with crazyflow's rollout."""
+    """Workloads that take turns with rollouts of crazyflow and of Learning to Fly's simulator."""
     found = [workloads.rollout(count), workloads.rollout_kept(count), workloads.rollout_randomised(count)]
     found += [workloads.rollout(count, "rigid-plain")] if kernel_is_chosen() else []
     found += [workloads.rollout(count, over=several)] if several else []
-    return found + _peers(python, count, None)
+    found += _peers("crazyflow", python, "rollout", count)
+    # It has no other numbers of drones.
+    if python is not None and count <= 8192 and count & (count - 1) == 0 and _has(python, "l2f"):
+        found += _peers("l2f", python, "rollout", count)
+    return found
 
 
 def _closed_loop(count: int, several: Devices | None, python: Path | None, network: Path) -> list:
     """Workloads that take turns with crazyflow and the same network."""
     found = [workloads.rollout_policy(count), workloads.network_alone(count)]
     found += [workloads.rollout_policy(count, several)] if several else []
-    return found + _peers(python, count, network)
+    return found + _peers("crazyflow", python, "rollout_policy", count, str(network))
 
 
-def _peers(python: Path | None, count: int, network: Path | None) -> list[Peer]:
-    """crazyflow as its users run it, and bound to one core, to compare it with one device."""
+def _environments(count: int, python: Path | None) -> list:
+    """Our environment for Gymnasium, if that is installed, and crazyflow's."""
+    if count > 8192 or importlib.util.find_spec("gymnasium") is None:
+        return []
+    return [workloads.gymnasium(count), *_peers("crazyflow", python, "gymnasium", count, "environment")]
+
+
+def _contact(count: int) -> list:
+    """Bodies with a floor that is rarely touched, and MuJoCo's C alone."""
+    found = [workloads.rollout(count, body) for body in ("mjx", "mjx-floor", "mujoco-floor")]
+    path = str(shipped("assets", "cfb.xml"))
+    return found + _peers("mujoco.batch", Path(sys.executable), "rollout", count, path, str(workloads.HEIGHT_M))
+
+
+def _has(python: Path, module: str) -> bool:
+    return subprocess.run([str(python), "-c", f"import {module}"], capture_output=True).returncode == 0
+
+
+def _peers(name: str, python: Path | None, what: str, count: int, *arguments: str) -> list[Peer]:
+    """A simulator as its users run it, and bound to one core, to compare it with one device."""
     if python is None:
         return []
     apart = jax.default_backend() == "cpu" and cores() > 1 and hasattr(os, "sched_getaffinity")
     bound_to = [None, min(os.sched_getaffinity(0))] if apart else [None]
-    return [Peer(python, count, network, core) for core in bound_to]
+    return [Peer(name, python, what, count, arguments, core) for core in bound_to]
 
 
-def _others(count: int) -> list:
-    """Workloads of MJX and of derivatives."""
-    found = [workloads.rollout(count, "mjx"), workloads.rollout(count, "mjx-floor"), workloads.stock_mjx(count)]
+def _derivatives(count: int) -> list:
+    """Workloads of derivatives, and plain MJX."""
+    found = [workloads.stock_mjx(count)]
     if count <= 8192:
         found += [workloads.rollout_gradient(count), workloads.rollout_ten(count), workloads.rollout_hundred(count)]
     return found
@@ -178,4 +219,4 @@ def _row(item: workloads.Workload | Peer, drones: int, seconds: float) -> dict:
         of = {"name": item.name, "version": item.version, "what": item.what, "drones": drones, "cores": item.cores}
         return of | speed
     of = {"what": item.what, "body": item.body, "drones": drones, "devices": item.devices}
-    return of | speed | {"peak_mb": item.peak_mb}
+    return of | speed | ({} if item.peak_mb is None else {"peak_mb": item.peak_mb})

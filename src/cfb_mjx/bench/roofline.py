@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from cfb_mjx.bench import workloads
 from cfb_mjx.bench.machine import Peaks, peaks
 from cfb_mjx.engine import primitive
+from cfb_mjx.optional import not_none
 
 PLAIN = {
     "add", "sub", "mul", "div", "max", "min", "neg", "abs", "sqrt", "rsqrt", "sign", "floor", "round", "clamp",
@@ -150,7 +151,7 @@ def roofline(drones: int = 1024, repetitions: int = REPETITIONS) -> dict[str, An
 
 
 def _row(work: workloads.Workload, seconds: float, machine: Peaks) -> dict[str, Any]:
-    function, arguments = work.trace
+    function, arguments = not_none(work.trace)
     steps = work.drones * work.steps
     done = operations(function, *arguments)
     plain, transcendental, moved = (x / steps for x in done)

@@ -16,7 +16,7 @@ from typing import Any
 from cfb_mjx.bench.timed_process import TimedProcess
 from cfb_mjx.optional import not_none
 
-DRONES = {"rollout": 8192, "rollout_policy": 8192, "ppo": 512}
+DRONES = {"rollout": 8192, "rollout_policy": 8192, "ppo": 256}
 """Workloads and their numbers of drones."""
 
 
@@ -90,7 +90,7 @@ def _rollout(what: str, drones: int, over) -> tuple[int, Callable[[], None]]:
     from cfb_mjx.bench import workloads
 
     workload = getattr(workloads, what)(drones)
-    function, (model, *batch) = workload.trace
+    function, (model, *batch) = not_none(workload.trace)
     divided = jax.jit(over.divided(function, (None, *[0] * len(batch)), 0))
     model, batch = over.whole(model), over.along(batch)
     return drones * workload.steps, lambda: jax.block_until_ready(divided(model, *batch))
@@ -110,5 +110,76 @@ def _ppo(_, drones: int, over) -> tuple[int, Callable[[], None]]:
     return algorithm.steps_per_update * task.hold(nominal), lambda: jax.block_until_ready(algorithm.update(state)[1])
 
 
+def braxs_ppo() -> list[dict[str, Any]]:
+    """Measure Brax's own PPO on the same task, with networks, drones, batches and epochs of the shipped configuration.
+
+    Returns:
+        Rows as peers have them, on one core and on two; empty where `scaling` has none.
+    """
+    if not hasattr(os, "sched_getaffinity") or len(os.sched_getaffinity(0)) < 2:
+        return []
+    chosen, rows = sorted(os.sched_getaffinity(0))[:2], []
+    for cores in (chosen[:1], chosen):
+        command = [sys.executable, "-m", "cfb_mjx.bench.scaling", "brax", "0", ",".join(map(str, cores))]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode:
+            raise RuntimeError(f"the measurement of Brax ended with {done.stderr.strip().splitlines()[-1:]}")
+        version, drones, speed = done.stdout.split()
+        of = {"name": "brax", "version": version, "what": "ppo", "drones": int(drones), "cores": len(cores)}
+        rows.append(of | {"steps_per_s": float(speed), "compile_s": 0.0})
+    return rows
+
+
+def _brax(cores: list[int]) -> None:
+    """Train with Brax for a few updates and print its version, the drones, and steps per second."""
+    os.sched_setaffinity(0, cores)
+    from importlib.metadata import version
+
+    # As its users run it: without the option of `configure_jax`.
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+    import functools
+
+    from brax.training.agents.ppo.networks import make_ppo_networks
+
+    from cfb_mjx.envs.brax_env import BraxEnv, wrap
+    from cfb_mjx.train.brax_compat import brax_ppo
+    from cfb_mjx.train.config import load_config
+
+    config = load_config("target")
+    settings, env = config.ppo, BraxEnv(config.build_task(), config.model)
+    updates, speeds = 6, []
+    with brax_ppo() as train:
+        train(
+            env,
+            # Two parts: the first one compiles.
+            num_timesteps=2 * updates * settings.drones * settings.unroll,
+            num_evals=3,
+            num_resets_per_eval=0,
+            run_evals=False,
+            episode_length=env.task.episode_steps,
+            num_envs=settings.drones,
+            batch_size=settings.drones // settings.minibatches,
+            num_minibatches=settings.minibatches,
+            unroll_length=settings.unroll,
+            num_updates_per_batch=settings.epochs,
+            learning_rate=settings.learning_rate,
+            discounting=settings.discount,
+            wrap_env_fn=wrap,
+            network_factory=functools.partial(
+                make_ppo_networks,
+                policy_hidden_layer_sizes=config.network.hidden,
+                value_hidden_layer_sizes=settings.value_hidden,
+                policy_obs_key="state",
+                value_obs_key="privileged_state",
+            ),
+            progress_fn=lambda _, metrics: speeds.append(float(metrics["training/sps"])),
+        )
+    print(version("brax"), settings.drones, speeds[-1] * env.task.hold(env.sys))
+
+
 if __name__ == "__main__":
-    _serve(sys.argv[1], int(sys.argv[2]), [int(core) for core in sys.argv[3].split(",")])
+    bound_to = [int(core) for core in sys.argv[3].split(",")]
+    if sys.argv[1] == "brax":
+        _brax(bound_to)
+    else:
+        _serve(sys.argv[1], int(sys.argv[2]), bound_to)

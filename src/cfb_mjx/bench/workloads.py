@@ -21,7 +21,7 @@ from cfb_mjx.control.policy_file import load_policy
 from cfb_mjx.devices import Devices
 from cfb_mjx.engine.gpu import using
 from cfb_mjx.files import shipped
-from cfb_mjx.model import MjxBody, Quadrotor, rollout_final
+from cfb_mjx.model import MjxBody, MujocoBody, Quadrotor, rollout_final
 from cfb_mjx.model import rollout as every_state
 from cfb_mjx.model.mjx_body import mjx
 from cfb_mjx.model.state import State
@@ -31,6 +31,12 @@ from cfb_mjx.parameters import load_randomisation, sample_parameters
 STEPS = 500
 MJX_WORK = 200_000
 """Steps of all drones together in one MJX measurement; MJX is about a hundred times slower than the closed form."""
+
+ENVIRONMENT_STEPS = 20
+"""Steps of an environment in one measurement."""
+
+HEIGHT_M = 1.0
+"""Height of the drones above the floor, if there is one."""
 
 KEPT = 1_000_000
 """States of all drones together in a measurement that returns them: 70 MB."""
@@ -46,10 +52,10 @@ class Workload:
     steps: int
     run: Callable[[], None]
     compile_s: float
-    peak_mb: float
+    peak_mb: float | None
     devices: int
-    trace: tuple[Callable, tuple]
-    """The function and its arguments, before compiling."""
+    trace: tuple[Callable, tuple] | None = None
+    """The function and its arguments, before compiling; None for what is not one program."""
 
     def seconds(self) -> float:
         """Run it once and return the wall time."""
@@ -80,7 +86,7 @@ def _compile(
 
 
 def _start(model: Quadrotor, drones: int):
-    hover, command = model.hover_state(), model.hover_command()
+    hover, command = model.hover_state((0.0, 0.0, HEIGHT_M)), model.hover_command()
     states = jax.tree.map(lambda x: jnp.broadcast_to(x, (drones, *x.shape)), hover)
     # Different commands, so that no work can be shared between drones.
     commands = command * (1 + 0.01 * jax.random.normal(jax.random.key(0), (drones, 1, 4)))
@@ -92,11 +98,12 @@ def rollout(drones: int, body: str = "rigid", over: Devices | None = None) -> Wo
 
     Args:
         drones: number of drones.
-        body: ``rigid``, ``rigid-plain`` (without the GPU kernel), ``mjx`` or ``mjx-floor``.
+        body: ``rigid``, ``rigid-plain`` (without the GPU kernel), ``mjx``, ``mjx-floor`` or ``mujoco-floor``; the
+            drones hover `HEIGHT_M` above the floor.
         over: devices that share the drones; one device by default.
     """
-    mjx_floor = {"mjx": False, "mjx-floor": True}
-    choices = {"body": MjxBody(floor=mjx_floor[body])} if body in mjx_floor else {}
+    bodies = {"mjx": lambda: MjxBody(floor=False), "mjx-floor": MjxBody, "mujoco-floor": MujocoBody}
+    choices: dict[str, Any] = {"body": bodies[body]()} if body in bodies else {}
     model = Quadrotor.from_file("cfb-guards", **choices)
     steps = max(5, min(200, MJX_WORK // drones)) if choices else STEPS
     states, commands = _start(model, drones)
@@ -259,6 +266,26 @@ def ppo_update(drones: int = 512) -> Workload:
         return eqx.filter(algorithm._update(eqx.combine(arrays, rest)), eqx.is_array)
 
     return _compile("ppo", "rigid", drones, config.ppo.unroll * task.hold(nominal), update, arrays)
+
+
+def gymnasium(drones: int) -> Workload:
+    """Steps of the Gymnasium environment, of 8 ms each, on drones drawn from the paper's randomisation."""
+    from cfb_mjx.envs.gym import TargetVectorEnv
+    from cfb_mjx.envs.target import TargetTask
+
+    begin = time.perf_counter()
+    env = TargetVectorEnv(drones, TargetTask(randomisation=load_randomisation()))
+    env.reset(seed=0)
+    # About hover, so that episodes end as often as those of an untrained policy.
+    actions = np.random.default_rng(0).uniform(-0.2, 0.3, (ENVIRONMENT_STEPS, drones, 4)).astype(np.float32)
+
+    def run():
+        for action in actions:
+            env.step(action)
+
+    run()
+    compile_s = time.perf_counter() - begin
+    return Workload("gymnasium", "rigid", drones, ENVIRONMENT_STEPS, run, compile_s, None, 1)
 
 
 def stock_mjx(drones: int) -> Workload:

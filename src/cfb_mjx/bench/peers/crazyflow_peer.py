@@ -1,9 +1,10 @@
 """Runs under a Python that has crazyflow (not cfb_mjx): times one flight of all drones for every line it is sent.
 
-Usage: python crazyflow_peer.py DRONES [NETWORK.npz]. Answers ``ready VERSION COMPILE_SECONDS STEPS``, then seconds per
-request. Without a network a flight is ``sim.step(500)`` at crazyflow's own 500 Hz; with one (weights w0, b0, w1 ... of
+Usage: python crazyflow_peer.py DRONES [NETWORK.npz | environment]. Answers ``ready VERSION COMPILE_SECONDS STEPS``, then
+seconds per request. Without a network a flight is ``sim.step(500)`` at crazyflow's own 500 Hz; with one (weights w0, b0, w1 ... of
 a tanh network that sees the present and one past estimate and six past commands) it is 1 s of that network in the loop,
-a command every 8 ms, two steps of 4 ms each, as one compiled program of crazyflow's pure functions.
+a command every 8 ms, two steps of 4 ms each, as one compiled program of crazyflow's pure functions. With the word a
+flight is 20 steps of its Gymnasium environment `ReachPosEnv` with these dynamics and its other defaults.
 """
 
 import contextlib
@@ -13,6 +14,7 @@ import warnings
 
 warnings.filterwarnings("ignore")
 OPEN_STEPS, COMMANDS, HOLD, RPM = 500, 125, 2, 22000.0
+ENVIRONMENT_STEPS = 20
 
 
 def open_loop(drones):
@@ -71,6 +73,25 @@ def closed_loop(drones, path):
     return fly, COMMANDS * HOLD
 
 
+def environment(drones):
+    """Steps under random attitude commands near hover; everything is read as numpy arrays."""
+    from crazyflow.envs.reach_pos_env import ReachPosEnv
+
+    env = ReachPosEnv(num_envs=drones, dynamics="first_principles")
+    env.reset(seed=0)
+    low, high = env.action_space.low, env.action_space.high
+    shares = np.random.default_rng(0).uniform(0.45, 0.55, (ENVIRONMENT_STEPS, drones, 4)).astype("f4")
+    actions = low + shares * (high - low)
+
+    def fly():
+        begin = time.perf_counter()
+        for action in actions:
+            jax.tree.map(np.asarray, env.step(action))
+        return time.perf_counter() - begin
+
+    return fly, ENVIRONMENT_STEPS
+
+
 def simulator(drones, frequency):
     """First-principles dynamics under rotor-velocity control."""
     return Sim(
@@ -93,7 +114,13 @@ with contextlib.redirect_stdout(sys.stderr):
     from crazyflow.control import Control
     from crazyflow.sim import Sim, functional
 
-    fly, steps = closed_loop(int(sys.argv[1]), sys.argv[2]) if len(sys.argv) > 2 else open_loop(int(sys.argv[1]))
+    count, what = int(sys.argv[1]), sys.argv[2] if len(sys.argv) > 2 else None
+    if what is None:
+        fly, steps = open_loop(count)
+    elif what == "environment":
+        fly, steps = environment(count)
+    else:
+        fly, steps = closed_loop(count, what)
     begin = time.perf_counter()
     fly()
     compiled = time.perf_counter() - begin
