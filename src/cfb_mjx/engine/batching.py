@@ -100,7 +100,7 @@ MANY = 8192
 """Fewest examples per call of `for_some` on a GPU."""
 
 
-def for_some(function: Callable[..., Sequence[Array]], needed: Array, leaves: Sequence[Array], block: int) -> list:
+def for_some(function: Callable[..., Sequence], needed: Array, leaves: Sequence, block: int) -> list:
     """``function(True, *leaves)`` where it is needed, and zeros elsewhere, computed for the examples that need it.
 
     Under ``vmap``, also nested, these are gathered and computed a block at a time, so that the cost is in proportion to

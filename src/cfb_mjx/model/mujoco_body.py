@@ -101,7 +101,7 @@ class MujocoBody:
         def contact(real, *inputs):
             return [accelerations_by_c(world, real, Inputs(*inputs))]
 
-        (found,) = for_some(contact, touching, inputs, BLOCK)
+        (found,) = for_some(contact, touching, list(inputs), BLOCK)
         linear, angular = Vec.unstack(found[:3]), Vec.unstack(found[3:])
         # qacc of the origin is its coordinate acceleration in the world.
         lever = angular.cross(center) + omega.cross(omega.cross(center))
