@@ -58,9 +58,12 @@ def main() -> None:
     """Measure, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--parts", nargs="*", default=["speed", "race"], help="the others are taken from the file")
-    parser.add_argument("--bodies", type=Path, help="only write the speed of bodies, with the cores of this process")
+    parser.add_argument("--bodies", type=Path, help="only write the speed of bodies")
+    parser.add_argument("--on", nargs="*", type=int, help="with --bodies: the cores to use; otherwise all")
     arguments = parser.parse_args()
     if arguments.bodies:
+        if arguments.on:
+            os.sched_setaffinity(0, arguments.on)
         write_text(arguments.bodies, json.dumps(rates_of_bodies()))
         return
     file = ROOT / "benchmarks" / "scenes.json"
@@ -156,9 +159,10 @@ def bodies() -> dict:
     with scratch("cfb-scenes-") as folder:
         every = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
         for cpus in [every[:1], every] if len(every) > 1 else [every]:
-            # In a process of its own, because threads are counted as it begins.
-            written, own = Path(folder) / "rates.json", partial(os.sched_setaffinity, 0, cpus) if cpus else None
-            subprocess.run([sys.executable, __file__, "--bodies", str(written)], check=True, preexec_fn=own)
+            # In a process of its own, because jax counts cores as it begins.
+            written = Path(folder) / "rates.json"
+            command = [sys.executable, __file__, "--bodies", str(written), "--on", *map(str, cpus)]
+            subprocess.run(command, check=True)
             rates[str(len(cpus) or cores())] = json.loads(written.read_text())
     return {"drones": COUNT, "shares": SHARES, "rates": rates}
 

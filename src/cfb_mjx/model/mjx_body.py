@@ -58,8 +58,9 @@ class MjxBody:
     """Accelerations from MJX for an MJCF whose only moving body has a free joint and the name ``cfb``.
 
     Contact forces are computed at every call from the state alone (no warm start), so that a simulation remains a pure
-    function of the 17 state variables. Reverse-mode derivatives exist only without the floor, because the contact
-    solver has none. Without contacts the body is several times faster and flies the same.
+    function of the 17 state variables. MuJoCo computes only the drones of a batch that may touch something; the others
+    fly in closed form, unless more than contacts acts on them (MuJoCo's drag, damping). Reverse-mode derivatives exist
+    only without the floor, because the contact solver has none.
 
     Args:
         floor: whether the drone can touch the floor and other static geometry of the MJCF.

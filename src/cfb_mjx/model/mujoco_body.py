@@ -37,10 +37,11 @@ BLOCK = 512
 
 
 class MujocoBody:
-    """Accelerations from MuJoCo's C (`mujoco.batch`), all drones of a batch at once on all cores.
+    """Accelerations from MuJoCo's C (`mujoco.batch`) for the drones that may touch something, at once on all cores.
 
-    The interface of `MjxBody` with its floor: `rollout`, `jit` and `vmap` work alike. It has no derivatives, and runs
-    on the CPU, whatever the device of the rest; ``docs/scenes.md`` measures where it is faster.
+    The others fly in closed form, as in `MjxBody`, whose interface it has: `rollout`, `jit` and `vmap` work alike. It
+    has no derivatives, and MuJoCo runs on the CPU, whatever the device of the rest; ``docs/scenes.md`` measures where it
+    is faster.
 
     Args:
         mjcf: path of an MJCF with the drone and static geometry; default: ``assets/cfb.xml``, the drone and a floor.
