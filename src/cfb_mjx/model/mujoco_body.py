@@ -40,8 +40,8 @@ class MujocoBody:
     """Accelerations from MuJoCo's C (`mujoco.batch`) for the drones that may touch something, at once on all cores.
 
     The others fly in closed form, as in `MjxBody`, whose interface it has: `rollout`, `jit` and `vmap` work alike. It
-    has no derivatives, and MuJoCo runs on the CPU, whatever the device of the rest; ``docs/scenes.md`` measures where it
-    is faster.
+    has no derivatives, and MuJoCo runs on the CPU, whatever the device of the rest; ``docs/scenes.md`` measures where
+    it is faster.
 
     Args:
         mjcf: path of an MJCF with the drone and static geometry; default: ``assets/cfb.xml``, the drone and a floor.
