@@ -10,10 +10,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -26,7 +28,11 @@ from cfb_mjx.runtime import cores, environment, say
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "scripts"), str(ROOT / "examples")]
-REPEATS, STEPS = 5, 50
+REPEATS, STEPS, COUNT = 5, 50, 1024
+SHARES = (0.0, 0.01, 0.1, 1.0)
+"""Shares of the drones that stand on the floor."""
+STANDING_M = 0.0138
+"""Height of the rotors' centre of a drone that stands on its feet."""
 WORLDS = {
     "floor": '<geom name="floor" type="plane" size="0 0 1"/>',
     "floor and a gate": (
@@ -52,7 +58,14 @@ def main() -> None:
     """Measure, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--parts", nargs="*", default=["speed", "race"], help="the others are taken from the file")
+    parser.add_argument("--bodies", type=Path, help="only write the speed of bodies")
+    parser.add_argument("--on", nargs="*", type=int, help="with --bodies: the cores to use; otherwise all")
     arguments = parser.parse_args()
+    if arguments.bodies:
+        if arguments.on:
+            os.sched_setaffinity(0, arguments.on)
+        write_text(arguments.bodies, json.dumps(rates_of_bodies()))
+        return
     file = ROOT / "benchmarks" / "scenes.json"
     results = json.loads(file.read_text()) if file.exists() else {}
     # Without the options of `configure_jax`: jaxlib 0.10 aborts while it compiles contacts with them.
@@ -84,13 +97,26 @@ def _rates(functions: dict, amount: dict) -> dict[str, float]:
     return {name: amount[name] / best[name] for name in functions}
 
 
-def _rollout(drone, count: int):
+def _rollouts(drone, count: int) -> list:
+    """Rollouts of so many drones, of which each of `SHARES` stands on the floor; the others hover 1 m above it."""
     from cfb_mjx.model import rollout_final
 
-    commands = jnp.tile(drone.hover_command(), (STEPS, 1))
-    states = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), drone.hover_state())
-    fly = jax.jit(jax.vmap(lambda state: rollout_final(drone, state, commands)))
-    return lambda: jax.block_until_ready(fly(states))
+    fly = jax.jit(jax.vmap(lambda state, commands: rollout_final(drone, state, commands)))
+    hover = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), drone.hover_state())
+
+    def rollout(share: float):
+        stands = _standing(count, share)[:, None]
+        standing = {"position": jnp.array([0.0, 0.0, STANDING_M]), "rotor_speed": 0.0}
+        states = replace(hover, **{key: jnp.where(stands, x, getattr(hover, key)) for key, x in standing.items()})
+        commands = jnp.where(stands[:, None], 0.0, jnp.tile(drone.hover_command(), (count, STEPS, 1)))
+        return lambda: jax.block_until_ready(fly(states, commands))
+
+    return [rollout(share) for share in SHARES]
+
+
+def _standing(count: int, share: float) -> np.ndarray:
+    """Which of so many drones stand on the floor: any, for neighbours are computed together."""
+    return np.random.default_rng(0).permutation(count) < round(share * count)
 
 
 def _flown(scene, drone, count: int):
@@ -108,33 +134,60 @@ def _flown(scene, drone, count: int):
     return lambda: jax.block_until_ready(fly(states))
 
 
-def _alone(model, count: int, bodies: Sequence[str] = ("cfb",)):
-    """`mujoco.batch` alone: hover of so many drones in all under a constant force, all steps in one call."""
+def _alone(model, count: int, bodies: Sequence[str] = ("cfb",), share: float = 0.0):
+    """`mujoco.batch` alone: hover of so many drones in all under a constant force, all steps in one call.
+
+    A ``share`` of them stands on the floor instead.
+    """
     from mujoco.batch import Batch
 
     batch = Batch(model, count // len(bodies))
+    stands = _standing(count // len(bodies), share)
     for i, body in enumerate(bodies):
         joint = int(model.body(body).jntadr[0])
         first = model.jnt_qposadr[joint]
         batch.bind("qpos")[:, first : first + 3] = (0.5 * i, 0.0, 1.0)
-        batch.bind("qfrc_applied")[:, model.jnt_dofadr[joint] + 2] = 9.81 * model.body(body).mass[0]
+        batch.bind("qpos")[stands, first + 2] = STANDING_M
+        batch.bind("qfrc_applied")[~stands, model.jnt_dofadr[joint] + 2] = 9.81 * model.body(body).mass[0]
     return lambda: batch.step(nstep=STEPS)
 
 
 def bodies() -> dict:
-    """Bodies of one drone with a floor, beside `mujoco.batch` alone."""
-    from cfb_mjx.model import MjxBody, MujocoBody, Quadrotor
-
+    """Bodies of one drone with a floor, beside `mujoco.batch` alone, on one core and on all."""
     say("bodies")
-    count = 1024
+    rates = {}
+    with scratch("cfb-scenes-") as folder:
+        every = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+        for cpus in [every[:1], every] if len(every) > 1 else [every]:
+            # In a process of its own, because jax counts cores as it begins.
+            written = Path(folder) / "rates.json"
+            command = [sys.executable, __file__, "--bodies", str(written), "--on", *map(str, cpus)]
+            subprocess.run(command, check=True)
+            rates[str(len(cpus) or cores())] = json.loads(written.read_text())
+    return {"drones": COUNT, "shares": SHARES, "rates": rates}
+
+
+def rates_of_bodies() -> dict[str, list[float]]:
+    """Steps per second of every body, one for each of `SHARES`."""
+    from cfb_mjx.model import MjxBody, MujocoBody, Quadrotor, RigidBody
+
     drones = {
+        "RigidBody()": RigidBody(),
         "MjxBody(floor=False)": MjxBody(floor=False),
         "MjxBody()": MjxBody(),
         "MujocoBody()": MujocoBody(),
     }
-    functions = {name: _rollout(Quadrotor.from_file("cfb-guards", body=body), count) for name, body in drones.items()}
-    functions["mujoco.batch alone"] = _alone(MujocoBody().mujoco_model, count)
-    return {"drones": count, "rates": _rates(functions, dict.fromkeys(functions, count * STEPS))}
+    functions = {}
+    for name, body in drones.items():
+        flights = _rollouts(Quadrotor.from_file("cfb-guards", body=body), COUNT)
+        has_floor = body in (MjxBody(), MujocoBody())
+        functions |= {(name, i): fly for i, fly in enumerate(flights) if has_floor or not i}
+    model = MujocoBody().mujoco_model
+    functions |= {("mujoco.batch alone", i): _alone(model, COUNT, share=share) for i, share in enumerate(SHARES)}
+    found: dict[str, list[float]] = {}
+    for (name, _), rate in _rates(functions, dict.fromkeys(functions, COUNT * STEPS)).items():
+        found.setdefault(name, []).append(rate)
+    return found
 
 
 def worlds() -> dict:
@@ -238,10 +291,14 @@ def draw(path: Path, gates, way: np.ndarray) -> None:
 def page(results: dict) -> str:
     """Return the page."""
     facts = ", ".join(f"{name} {value}" for name, value in results["environment"].items())
-    alone = results["bodies"]["rates"]["mujoco.batch alone"]
-    of_bodies = [
-        f"| `{name}` | {rate / 1e6:.2f} M | {rate / alone:.2f} |" for name, rate in results["bodies"]["rates"].items()
-    ]
+    measured = results["bodies"]
+    of_bodies = []
+    for many, rates in measured["rates"].items():
+        on = f"{many} core{'s' if many != '1' else ''}"
+        for name, row in rates.items():
+            numbers = [f"{rate / 1e6:.2f} M" for rate in row] + ["" for _ in measured["shares"][len(row) :]]
+            of_bodies.append(f"| {on} | `{name}` | {' | '.join(numbers)} |")
+    shares = " | ".join({0: "none", 1: "all"}.get(share, f"{share:.0%}") for share in measured["shares"])
     of_worlds = []
     for name, rates in results["worlds"]["rates"].items():
         whole = rates["mujoco.batch alone"]
@@ -255,6 +312,9 @@ def page(results: dict) -> str:
         quotes='"""',
         cores=cores(),
         bodies="\n".join(of_bodies),
+        drones=measured["drones"],
+        shares=shares,
+        lines="---|" * len(measured["shares"]),
         worlds="\n".join(of_worlds),
         geoms=results["rays"]["geoms"],
         mjx_rays=rays["mjx"] / 1e6,
@@ -347,17 +407,19 @@ can be hit: {race_gates_in_10_s:.1f} gates in 10 s, a lap of five gates in {race
 
 ## Speed
 
-Steps of 4 ms per second on {cores} cores, all in one run and in turn, the best of five calls. `mujoco.batch alone`
-takes the same MJCF through as many steps under a constant force, in one call, without rotors or effects: it is the
-limit for the engine `c`, which hands over the state after every step.
+Steps of 4 ms per second, the best of five calls that take turns. `mujoco.batch alone` takes the same MJCF through as
+many steps under a constant force, in one call, without rotors or effects: it is the limit for the engine `c`, which
+hands over the state after every step.
 
-| one drone and a floor, 1024 at once | steps/s | of `mujoco.batch` alone |
-|---|---|---|
+One drone and a floor, {drones} at once, of which so many stand on the floor; the others hover 1 m above it:
+
+| on | body | {shares} |
+|---|---|{lines}
 {bodies}
 
-`MujocoBody` has the interface of `MjxBody`, so that every rollout, task and training can use it.
-
-Drone steps, where there are several:
+`MjxBody` and `MujocoBody` fly drones that are near nothing in closed form, as `RigidBody` does, and ask MuJoCo for the
+others alone: the speed depends on how many are near something. Both have the same interface, so that every rollout,
+task and training can use them. Scenes ask MuJoCo for everything in every step; on {cores} cores:
 
 | world | `mjx`, {counts[mjx]} drones | `c`, {counts[c]} drones | `mujoco.batch` alone | `c` of it | `c` over `mjx` |
 |---|---|---|---|---|---|

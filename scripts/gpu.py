@@ -187,7 +187,7 @@ of 4 warps; the last rows are other partitions.""",
     "gradient": """Reverse mode through 100 steps, with respect to all parameters (`rollout_gradient`) and to ten
 (`rollout_ten`). `rollout_hundred` is the loss alone, in the kernel. The reverse pass has no kernel; it is the program
 that XLA compiles.""",
-    "mjx": "`mjx-floor` is with floor contact, `mjx-stock` is plain `mjx.step` on the same MJCF without contact.",
+    "mjx": "`mjx-floor` is with a floor 1 m below, `mjx-stock` plain `mjx.step` on the same MJCF without contact.",
     "ppo": "One update flies all drones and trains on the flights, with the configuration `target` and steps of 4 ms.",
 }
 

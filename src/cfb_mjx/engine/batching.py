@@ -96,6 +96,79 @@ def differentiated_as(function: Callable, plain: Callable) -> Callable:
     return outer
 
 
+MANY = 8192
+"""Fewest examples per call of `for_some` on a GPU."""
+
+
+def for_some(function: Callable[..., Sequence], needed: Array, leaves: Sequence, block: int) -> list:
+    """``function(True, *leaves)`` where it is needed, and zeros elsewhere, computed for the examples that need it.
+
+    Under ``vmap``, also nested, these are gathered and computed a block at a time, so that the cost is in proportion to
+    their number; without any there is none. Forward-mode derivatives of all orders are computed in the same way.
+
+    Args:
+        function: from a flag and arrays to a sequence of arrays. Where the flag is False, the example only fills a
+            block, and its results are not used. It must not close over arrays that are being traced.
+        needed: whether the results are needed; for one example, as the leaves.
+        leaves: arguments of the function.
+        block: number of examples per call.
+    """
+
+    def together(own: tuple[bool, ...], needed: Array, *leaves: Array) -> list[Array]:
+        size, own = examples(own, (needed, *leaves)), own[1:]
+        needed = jnp.broadcast_to(needed, (size,))
+        # Other devices than a CPU take as long for few examples as for many: a few blocks for all of them.
+        width = min(block if jax.default_backend() == "cpu" else max(block, MANY, -(-size // 4)), size)
+        one = [x[0] if mine else x for x, mine in zip(leaves, own, strict=True)]
+        shapes = jax.eval_shape(function, jnp.asarray(True), *one)
+        every = jax.vmap(function, in_axes=(0, *axes(own)), axis_size=width)
+
+        def compute() -> list[Array]:
+            rank = jnp.cumsum(needed)
+            count = rank[-1]
+
+            def some(at: Array, found: list[Array]) -> tuple[Array, list[Array]]:
+                ranks = at + jnp.arange(1, width + 1)
+                # Blocks are filled with their first example, whose work is being done anyway.
+                real = ranks <= count
+                index = jnp.searchsorted(rank, jnp.where(real, ranks, at + 1))
+                now = every(real, *(x[index] if mine else x for x, mine in zip(leaves, own, strict=True)))
+                put = jax.lax.dynamic_update_slice_in_dim
+                return at + width, [put(x, y, at, 0) for x, y in zip(found, now, strict=True)]
+
+            room = -(-size // width) * width
+            start = jnp.zeros_like(count), [jnp.zeros((room, *x.shape), x.dtype) for x in shapes]
+            found = jax.lax.while_loop(lambda c: c[0] < count, lambda c: some(*c), start)[1]
+            place = jnp.maximum(rank - 1, 0)
+            return [jnp.where(needed.reshape(size, *(1,) * (x.ndim - 1)), x[place], 0) for x in found]
+
+        nothing = [jnp.zeros((size, *x.shape), x.dtype) for x in shapes]
+        return jax.lax.cond(jnp.any(needed), compute, lambda: nothing)
+
+    outer = jax.custom_jvp(one_of_many(together))
+
+    @functools.partial(outer.defjvp, symbolic_zeros=True)
+    def rule(given, tangents):
+        needed, *leaves = given
+        moving = [i for i, tangent in enumerate(tangents[1:]) if not isinstance(tangent, SymbolicZero)]
+        count = len(leaves)
+
+        def pushed(real, *both):
+            def along(*moved):
+                filled = list(both[:count])
+                for i, x in zip(moving, moved, strict=True):
+                    filled[i] = x
+                return list(function(real, *filled))
+
+            return jax.jvp(along, [both[i] for i in moving], list(both[count:]))[1]
+
+        # Apart from the tangents, of which `jax.jacfwd` has many for one result.
+        found = outer(*given)
+        return found, for_some(pushed, needed, [*leaves, *(tangents[i + 1] for i in moving)], block)
+
+    return outer(needed, *leaves)
+
+
 LANES = 128
 """Examples per group. The numbers of one step of a derivative must fit into the nearest cache, and the start of a
 kernel must be short compared with its work. From 64 to 256 the speed is within a fifth."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,10 +13,13 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
+from cfb_mjx.engine.batching import for_some
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
+from cfb_mjx.model.bodies import RigidBody
 from cfb_mjx.model.effects.base import Wrench
 from cfb_mjx.model.mjcf import BODY_NAME, compiled, specification, warn_of_untouched
+from cfb_mjx.model.near import near, surroundings, where_touching
 from cfb_mjx.model.scene_engines import on_mjx
 from cfb_mjx.model.state import Components
 from cfb_mjx.model.vector import Vec, rotate
@@ -35,20 +39,28 @@ _NOT_NEEDED = (
 )
 
 
+BLOCK = 32
+"""Drones per call of the contact solver."""
+
+
 class _Prepared(eqx.Module):
     model: mjx.Model
     data: mjx.Data
     mass_diagonal: Float[Array, "6"]
     """Diagonal of the joint-space inertia. For one free body in its centre-of-gravity frame the matrix is diagonal and
     the same in every state, so it is computed once, not at every step."""
+    center: Vec
+    free: Any
+    """What the closed form needs, which flies a drone that nothing is near to."""
 
 
 class MjxBody:
     """Accelerations from MJX for an MJCF whose only moving body has a free joint and the name ``cfb``.
 
     Contact forces are computed at every call from the state alone (no warm start), so that a simulation remains a pure
-    function of the 17 state variables. Reverse-mode derivatives exist only without the floor, because the contact
-    solver has none. Without contacts the body is several times faster and flies the same.
+    function of the 17 state variables. MuJoCo computes only the drones of a batch that may touch something; the others
+    fly in closed form, unless more than contacts acts on them (MuJoCo's drag, damping). Reverse-mode derivatives exist
+    only without the floor, because the contact solver has none.
 
     Args:
         floor: whether the drone can touch the floor and other static geometry of the MJCF.
@@ -67,6 +79,7 @@ class MjxBody:
         self.floor = bool(floor)
         self.mjcf = None if mjcf is None else str(mjcf)
         self.mujoco_model = _compile(self.mjcf, self.floor)
+        self.around = surroundings(self.mujoco_model)
 
     def prepare(self, parameters: Parameters, dt) -> _Prepared:
         x64 = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]  # jax adds it as it loads
@@ -93,27 +106,35 @@ class MjxBody:
             geom_pos=jnp.where(moving[:, None], model.geom_pos - center, model.geom_pos),
             body_invweight0=model.body_invweight0.at[body].set(inverse),
         )
-        return _Prepared(model, data, _mass_diagonal(model, data))
+        free = RigidBody().prepare(parameters, dt)
+        return _Prepared(model, data, _mass_diagonal(model, data), Vec.unstack(center), free)
 
     def accelerations(
         self, prepared: _Prepared, state: Components, wrench: Wrench, gyroscopic: bool = True
     ) -> tuple[Vec, Vec]:
-        model, torque = prepared.model, wrench.torque
+        torque = wrench.torque
         if not gyroscopic:
             # MuJoCo subtracts the gyroscopic torque; adding it here cancels it.
             inertia = Vec.unstack(prepared.mass_diagonal[3:])
             torque = torque + state.body_rate.cross(inertia * state.body_rate)
-        data = prepared.data.replace(
-            qpos=jnp.concatenate([state.position.stack(), state.quaternion.stack()]),
-            qvel=jnp.concatenate([state.velocity.stack(), state.body_rate.stack()]),
-            # Generalised force of a free joint: world force at its origin, torque in body axes.
-            qfrc_applied=jnp.concatenate([rotate(state.quaternion, wrench.force).stack(), torque.stack()]),
-        )
-        if self.floor:
-            acceleration = _with_contact(model, data)
-        else:
-            acceleration = _contact_free(model, data, prepared.mass_diagonal)
-        return Vec.unstack(acceleration[:3]), Vec.unstack(acceleration[3:])
+        positions = jnp.concatenate([state.position.stack(), state.quaternion.stack()])
+        velocities = jnp.concatenate([state.velocity.stack(), state.body_rate.stack()])
+        # Generalised force of a free joint: world force at its origin, torque in body axes.
+        forces = jnp.concatenate([rotate(state.quaternion, wrench.force).stack(), torque.stack()])
+        if not self.floor:
+            data = prepared.data.replace(qpos=positions, qvel=velocities, qfrc_applied=forces)
+            acceleration = _contact_free(prepared.model, data, prepared.mass_diagonal)
+            return Vec.unstack(acceleration[:3]), Vec.unstack(acceleration[3:])
+        touching = near(self.around, state.position - rotate(state.quaternion, prepared.center))
+        leaves, structure = jax.tree.flatten((prepared.model, prepared.data))
+
+        def contact(_, positions, velocities, forces, *leaves):
+            model, data = jax.tree.unflatten(structure, leaves)
+            return [_with_contact(model, data.replace(qpos=positions, qvel=velocities, qfrc_applied=forces))]
+
+        (found,) = for_some(contact, touching, [positions, velocities, forces, *leaves], BLOCK)
+        free = RigidBody().accelerations(prepared.free, state, wrench, gyroscopic)
+        return where_touching(touching, found, free)
 
     def __eq__(self, other) -> bool:
         return type(other) is MjxBody and (self.floor, self.mjcf) == (other.floor, other.mjcf)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from cfb_mjx.engine.batching import for_some
 from cfb_mjx.errors import CfbError
 from cfb_mjx.files import shipped
+from cfb_mjx.model.bodies import RigidBody
 from cfb_mjx.model.effects.base import Wrench
 from cfb_mjx.model.mjcf import World, compiled_scene
+from cfb_mjx.model.near import near, surroundings, where_touching
 from cfb_mjx.model.scene_engines import Inputs, accelerations_by_c
 from cfb_mjx.model.state import Components
-from cfb_mjx.model.vector import Vec, rotate
+from cfb_mjx.model.vector import Vec, renormalise, rotate, rotate_inverse
 from cfb_mjx.parameters.parameters import Parameters
 
 
@@ -24,13 +28,20 @@ class _Prepared(eqx.Module):
     center: Vec
     mass: Float[Array, ""]
     gravity: Float[Array, ""]
+    free: Any
+    """What the closed form needs, which flies a drone that nothing is near to."""
+
+
+BLOCK = 512
+"""Largest number of drones per call of the host."""
 
 
 class MujocoBody:
-    """Accelerations from MuJoCo's C (`mujoco.batch`), all drones of a batch at once on all cores.
+    """Accelerations from MuJoCo's C (`mujoco.batch`) for the drones that may touch something, at once on all cores.
 
-    The interface of `MjxBody` with its floor: `rollout`, `jit` and `vmap` work alike. It has no derivatives, and runs
-    on the CPU, whatever the device of the rest; ``docs/scenes.md`` measures where it is faster.
+    The others fly in closed form, as in `MjxBody`, whose interface it has: `rollout`, `jit` and `vmap` work alike. It
+    has no derivatives, and MuJoCo runs on the CPU, whatever the device of the rest; ``docs/scenes.md`` measures where
+    it is faster.
 
     Args:
         mjcf: path of an MJCF with the drone and static geometry; default: ``assets/cfb.xml``, the drone and a floor.
@@ -46,6 +57,7 @@ class MujocoBody:
         self.mujoco_model = compiled_scene(World(self.mjcf))
         if self.mujoco_model.nq != 7:
             raise CfbError(f"{self.mjcf}: other bodies than the drone move in this MJCF; use Scene for such a world.")
+        self.around = surroundings(self.mujoco_model)
 
     def prepare(self, parameters: Parameters, dt) -> _Prepared:
         return _Prepared(
@@ -54,6 +66,7 @@ class MujocoBody:
             Vec.unstack(parameters.center_of_gravity),
             parameters.mass,
             parameters.gravity,
+            RigidBody().prepare(parameters, dt),
         )
 
     def accelerations(
@@ -63,30 +76,39 @@ class MujocoBody:
         if not gyroscopic:
             # MuJoCo subtracts the gyroscopic torque; adding it here cancels it.
             torque = torque + omega.cross(prepared.inertia * omega)
-        # MuJoCo's free joint is at the rotors' centre; the state and the wrench are at the centre of gravity.
-        origin = state.position - rotate(state.quaternion, center)
-        velocity = state.velocity - rotate(state.quaternion, omega.cross(center))
-        torque = torque + center.cross(wrench.force)
+        # MuJoCo's free joint is at the rotors' centre; the state and the wrench are at the centre of gravity. MuJoCo
+        # makes quaternions unit ones; within a step of an integrator they are so only nearly.
+        unit, force = renormalise(state.quaternion), rotate(state.quaternion, wrench.force)
+        origin = state.position - rotate(unit, center)
+        velocity = state.velocity - rotate(unit, omega.cross(center))
+        torque = torque + center.cross(rotate_inverse(unit, force))
         none = jnp.zeros(0, prepared.dt.dtype)
         inputs = Inputs(
-            jnp.concatenate([origin.stack(), state.quaternion.stack()]),
+            jnp.concatenate([origin.stack(), unit.stack()]),
             jnp.concatenate([velocity.stack(), omega.stack()]),
             none,
             none,
             none.reshape(0, 3),
             none.reshape(0, 4),
-            jnp.concatenate([rotate(state.quaternion, wrench.force).stack(), torque.stack()]),
+            jnp.concatenate([force.stack(), torque.stack()]),
             prepared.dt,
             prepared.inertia.stack()[None],
             center.stack()[None],
             prepared.mass[None],
             prepared.gravity,
         )
-        found = accelerations_by_c(World(self.mjcf), inputs)
+        world, touching = World(self.mjcf), near(self.around, origin)
+
+        def contact(real, *inputs):
+            return [accelerations_by_c(world, real, Inputs(*inputs))]
+
+        (found,) = for_some(contact, touching, list(inputs), BLOCK)
         linear, angular = Vec.unstack(found[:3]), Vec.unstack(found[3:])
         # qacc of the origin is its coordinate acceleration in the world.
         lever = angular.cross(center) + omega.cross(omega.cross(center))
-        return linear + rotate(state.quaternion, lever), angular
+        linear = linear + rotate(unit, lever)
+        free = RigidBody().accelerations(prepared.free, state, wrench, gyroscopic)
+        return where_touching(touching, jnp.concatenate([linear.stack(), angular.stack()]), free)
 
     def __eq__(self, other) -> bool:
         return type(other) is MujocoBody and self.mjcf == other.mjcf

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from cfb_mjx.engine.host import on_host
 from cfb_mjx.errors import CfbError
@@ -142,18 +142,24 @@ def by_c(world: World, inputs: Inputs) -> Moved:
 
 
 @_without_derivatives("MujocoBody has no derivatives; use MjxBody(floor=False) or RigidBody for those.")
-def accelerations_by_c(world: World, inputs: Inputs) -> Float[AnyArray, " nv"]:
-    """Generalised accelerations in MuJoCo's C, of all examples at once; it has no derivatives."""
+def accelerations_by_c(world: World, real: Bool[AnyArray, ""], inputs: Inputs) -> Float[AnyArray, " nv"]:
+    """Generalised accelerations in MuJoCo's C, of all ``real`` examples at once; it has no derivatives.
+
+    Those of the others are zero.
+    """
     model = compiled_scene(world)
 
     def accelerate(rows: np.ndarray) -> np.ndarray:
+        found, real = np.zeros((len(rows), model.nv)), np.flatnonzero(rows[:, -1])
         with _TURN:
             worker = _worker(world, len(rows))
-            worker.take(_taken(world, rows))
-            worker.batch.forward()
-            return worker.acceleration.copy()
+            worker.take(_taken(world, rows), real)
+            worker.batch.forward(ids=real)
+            found[real] = worker.acceleration[real]
+        return found
 
-    return on_host(accelerate, model.nv, _packed(inputs))
+    packed = _packed(inputs)
+    return on_host(accelerate, model.nv, jnp.append(packed, real.astype(packed.dtype)))
 
 
 def _packed(inputs: Inputs) -> Float[Array, " numbers"]:
@@ -241,25 +247,30 @@ class _Worker:
         self.constants = [self.batch.expand(name) for name in ("body_mass", "body_inertia", "body_ipos")]
         self.gravity, self.dt = self.batch.expand("opt.gravity"), self.batch.expand("opt.timestep")
         self.batch.expand("body_iquat")[:, self.bodies] = (1.0, 0.0, 0.0, 0.0)
-        self.before: list[np.ndarray] = []
+        drones = len(self.bodies)
+        self.before = np.full((count, 7 * drones + 2), np.nan)
+        """Constants that the models have: time step, inertias, centres, masses and gravity."""
 
-    def take(self, inputs: Inputs) -> None:
-        """Set states and models."""
+    def take(self, inputs: Inputs, which: np.ndarray | None = None) -> None:
+        """Set states and models of the simulations, or of those with the numbers ``which``."""
+        ids = np.arange(len(self.gravity)) if which is None else which
         for own, given in zip(self.state, inputs, strict=False):
-            own[...] = given
+            own[ids] = given[ids]
         # From the state alone, as in MJX.
-        self.start[...] = 0.0
-        constants = inputs[len(self.state) :]
-        if self.before and all(np.array_equal(old, new) for old, new in zip(self.before, constants, strict=True)):
+        self.start[ids] = 0.0
+        constants = [np.reshape(x, (len(x), -1)) for x in inputs[len(self.state) :]]
+        given = np.concatenate(constants, axis=1)
+        ids = ids[np.any(self.before[ids] != given[ids], axis=1)]
+        if not len(ids):
             return
-        self.before = [np.array(x) for x in constants]
+        self.before[ids] = given[ids]
         mass, inertia, center = self.constants
-        self.dt[...] = np.reshape(inputs.dt, self.dt.shape)
-        inertia[:, self.bodies], center[:, self.bodies] = inputs.inertia, inputs.center
-        mass[:, self.bodies] = inputs.mass
-        self.gravity[:, 2] = -inputs.gravity
+        self.dt[ids] = np.reshape(inputs.dt, self.dt.shape)[ids]
+        rows = np.ix_(ids, self.bodies)
+        inertia[rows], center[rows], mass[rows] = inputs.inertia[ids], inputs.center[ids], inputs.mass[ids]
+        self.gravity[ids, 2] = -inputs.gravity[ids]
         # The softness of contacts follows from masses and inertias.
-        self.batch.set_const()
+        self.batch.set_const(ids=ids)
 
     def step(self) -> np.ndarray:
         """Advance all simulations by one step; return positions, velocities, activations and constraint forces."""
