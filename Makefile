@@ -80,7 +80,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 .venv-peers/.installed:
 	"$(PYTHON)" -m venv .venv-peers
-	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check 'crazyflow==0.4.0'
+	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check 'crazyflow==0.4.0' 'l2f==2.0.18'
 	@touch $@
 
 clean:

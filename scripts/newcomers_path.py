@@ -1,6 +1,6 @@
 """Time the first steps of a new user in a fresh clone and a fresh virtual environment.
 
-python scripts/newcomers_path.py     docs/newcomers-path.md and benchmarks/newcomers-path.json (about ten minutes)
+python scripts/newcomers_path.py     docs/newcomers-path.md and benchmarks/newcomers-path.json (two minutes)
 
 The steps lead from Python and pip to a policy that is trained, flown, viewed and exported to C.
 """
@@ -11,10 +11,12 @@ import os
 import subprocess
 import sys
 import tempfile
+import textwrap
 import time
 from pathlib import Path
 
 from campaign import ROOT, facts_line
+from marked_block import write_block
 
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.runtime import environment
@@ -32,6 +34,48 @@ STEPS = (
     ("export it", ".venv/bin/cfb export out/mine/policy.npz -o out/c --check"),
 )
 
+WEIGHED = """
+import json
+from importlib.metadata import distributions
+sizes = {d.metadata["Name"]: sum(p.stat().st_size for f in d.files or [] if (p := f.locate()).is_file())
+         for d in distributions()}
+print(json.dumps(sizes))
+"""
+WHY = {
+    "rerun-sdk": "`cfb view`, with the viewer itself",
+    "jaxlib": "compiles and runs everything",
+    "pyarrow": "tables of flights; rerun needs it",
+    "scipy": "statistics, filters",
+    "tensorstore": "Brax needs it",
+    "mujoco-core": "bodies, contact, scenes",
+    "mujoco-studio": "a part of MuJoCo",
+    "mujoco-mjx": "MuJoCo in JAX",
+    "numpy": "arrays",
+    "matplotlib": "figures",
+    "fonttools": "matplotlib needs it",
+    "zstandard": "compressed logs",
+    "jax": "the language of the simulator",
+}
+"""What the largest packages are for."""
+
+
+def weight(place: Path) -> dict[str, float]:
+    """Size of every installed package, MB, the largest first."""
+    printed = subprocess.run(
+        [str(place / ".venv/bin/python"), "-c", WEIGHED], check=True, capture_output=True, text=True
+    )
+    sizes = {name: size / 2**20 for name, size in json.loads(printed.stdout).items()}
+    return dict(sorted(sizes.items(), key=lambda item: -item[1]))
+
+
+def weighed(sizes: dict[str, float]) -> str:
+    """What an installation weighs, in a sentence."""
+    most = [f"{name} {size:.0f} ({WHY.get(name, 'needed by others')})" for name, size in list(sizes.items())[:6]]
+    return (
+        f"An installation takes {sum(sizes.values()) / 1024:.1f} GB in {len(sizes)} packages, of which in MB: "
+        f"{', '.join(most)}. No package has a smaller build."
+    )
+
 
 def walk(python: str) -> dict:
     """Run the steps; return the seconds of each, and the scores of the policy."""
@@ -40,16 +84,17 @@ def walk(python: str) -> dict:
         subprocess.run(["git", "clone", "-q", str(ROOT), str(place)], check=True)
         # An empty home, so that neither pip's cache nor compiled programs shorten the times.
         fresh = os.environ | {"HOME": folder, "XDG_CACHE_HOME": str(Path(folder) / "cache")}
-        taken = []
+        taken, sizes = [], {}
         for what, command in STEPS:
             print(f"$ {command}", flush=True)
             began = time.perf_counter()
             subprocess.run(command.format(python=python), shell=True, check=True, cwd=place, env=fresh)
             shown = command.format(python="python3")
             taken.append({"step": what, "command": shown, "seconds": time.perf_counter() - began})
+            sizes = weight(place) if what == "install" else sizes
         hover = json.loads((place / "out" / "fly.json").read_text())
         check = json.loads((place / "out" / "c" / "check.json").read_text())
-    return {"steps": taken, "hover": hover, "check": check, "environment": environment()}
+    return {"steps": taken, "hover": hover, "check": check, "sizes": sizes, "environment": environment()}
 
 
 def page(found: dict) -> str:
@@ -73,6 +118,8 @@ program is compiled.
 |---|---|---|---|
 {table}
 
+{weighed(found["sizes"])}
+
 The trained policy hovers {hover["mean_distance_mm"]:.1f} mm from its target on average, with a standard deviation of
 its commands of {hover["command_std"]:.4f}. The commands of the C and of JAX differ by at most
 {check["parity"]["largest"]:.1e}. The policy was trained on the nominal drone only. For a real drone use a shipped
@@ -89,7 +136,9 @@ def main() -> None:
     arguments = parser.parse_args()
     if not arguments.page_only:
         write_json(NUMBERS, walk(arguments.python))
-    write_text(PAGE, page(json.loads(NUMBERS.read_text())))
+    found = json.loads(NUMBERS.read_text())
+    write_text(PAGE, page(found))
+    write_block(ROOT / "README.md", "weight", textwrap.fill(weighed(found["sizes"]), 120, break_long_words=False))
     print(PAGE.relative_to(ROOT))
 
 

@@ -2,6 +2,7 @@
 
 import ast
 import re
+import tomllib
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -78,3 +79,21 @@ def test_no_module_imports_itself_by_way_of_others():
 
 def _types_only(node: ast.If) -> bool:
     return isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+
+
+MODULES = {
+    "mcap-ros2-support": "mcap_ros2",
+    "mujoco-mjx": "mujoco",
+    "pillow": "PIL",
+    "protobuf": "google",
+    "pyyaml": "yaml",
+}
+"""Names of modules, where they are not those of the packages."""
+
+
+def test_every_declared_package_is_imported():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = [re.match(r"[\w-]+", line)[0] for line in project["dependencies"]]
+    text = "\n".join(path.read_text() for path in SOURCE.rglob("*.py"))
+    wanted = {name: MODULES.get(name, name.removesuffix("-sdk")) for name in names}
+    assert [n for n, m in wanted.items() if not re.search(rf"^\s*(import|from) {m}\b", text, re.MULTILINE)] == []

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 
 from cfb_mjx.bench import page, workloads
-from cfb_mjx.bench.first_call import first_call
+from cfb_mjx.bench.first_call import first_call, start_up
 from cfb_mjx.bench.roofline import roofline as roofline_of_machine
 from cfb_mjx.bench.scaling import braxs_ppo, scaling
 from cfb_mjx.bench.timed_process import TimedProcess
@@ -101,8 +101,8 @@ def benchmark(
         roofline: also compare the speed with the limits of the machine.
 
     Returns:
-        JSON values: ``rows``, ``peers``, ``environment`` and ``first_call``; ``scaling`` unless ``quick``;
-        ``roofline`` if requested.
+        JSON values: ``rows``, ``peers``, ``environment``, ``first_call`` and ``start_up``; ``scaling`` unless
+        ``quick``; ``roofline`` if requested.
 
     Raises:
         CfbError: crazyflow does not run with ``peer_python``.
@@ -127,7 +127,13 @@ def benchmark(
                     if isinstance(item, Peer):
                         item.close()
     say("measuring the first call")
-    result = {"rows": rows, "peers": peers, "environment": environment(), "first_call": first_call()}
+    result = {
+        "rows": rows,
+        "peers": peers,
+        "environment": environment(),
+        "first_call": first_call(),
+        "start_up": start_up(),
+    }
     if not quick:
         say("measuring one core and two cores")
         result["scaling"] = scaling()
@@ -147,7 +153,8 @@ def _open_loop(count: int, several: Devices | None, python: Path | None) -> list
     found += _peers("crazyflow", python, "rollout", count)
     # It has no other numbers of drones.
     if python is not None and count <= 8192 and count & (count - 1) == 0 and _has(python, "l2f"):
-        found += _peers("l2f", python, "rollout", count)
+        # Its threads wait for one another on a shared machine, so it is bound to one core.
+        found += _peers("l2f", python, "rollout", count, one_core=True)
     return found
 
 
@@ -176,12 +183,14 @@ def _has(python: Path, module: str) -> bool:
     return subprocess.run([str(python), "-c", f"import {module}"], capture_output=True).returncode == 0
 
 
-def _peers(name: str, python: Path | None, what: str, count: int, *arguments: str) -> list[Peer]:
+def _peers(
+    name: str, python: Path | None, what: str, count: int, *arguments: str, one_core: bool = False
+) -> list[Peer]:
     """A simulator as its users run it, and bound to one core, to compare it with one device."""
     if python is None:
         return []
     apart = jax.default_backend() == "cpu" and cores() > 1 and hasattr(os, "sched_getaffinity")
-    bound_to = [None, min(os.sched_getaffinity(0))] if apart else [None]
+    bound_to = [None, min(os.sched_getaffinity(0))][one_core:] if apart else [None]
     return [Peer(name, python, what, count, arguments, core) for core in bound_to]
 
 

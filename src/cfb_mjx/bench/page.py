@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 
 from cfb_mjx.bench import workloads
+from cfb_mjx.bench.first_call import START_UP
 from cfb_mjx.bench.roofline import section
 
 
@@ -52,23 +54,72 @@ def ratios(result: Mapping[str, Any]) -> list[str]:
     return lines
 
 
+COMPARED = (
+    ("rollout", "rigid", "crazyflow", "closed form"),
+    ("rollout_policy", "rigid", "crazyflow", "the same network in the loop"),
+    ("gymnasium", "rigid", "crazyflow", "environment for Gymnasium"),
+    ("rollout_randomised", "rigid", "l2f", "closed form of randomised drones"),
+    ("rollout", "mjx-floor", "mujoco.batch", "MJX 1 m above a floor"),
+    ("rollout", "mujoco-floor", "mujoco.batch", "MuJoCo 1 m above a floor"),
+)
+"""Rows and peers that are compared: what and body of ours, the peer, and how a sentence names them."""
+
+
 def _beside_peers(peers: list[dict], speed) -> list[str]:
     lines = []
-    for what, title in (("rollout", "closed form"), ("rollout_policy", "the same network in the loop")):
-        name, parts = "", []
-        for peer in (peer for peer in peers if peer["what"] == what):
+    for what, body, name, title in COMPARED:
+        of_peer = "rollout" if what == "rollout_randomised" else what
+        found, parts = [p for p in peers if (p["name"], p["what"]) == (name, of_peer)], []
+        for peer in found:
             # Compare with as many devices as the peer has cores, if that was measured, else with one.
-            ours = speed(what, devices=peer["cores"]) if peer["cores"] else None
-            on = f"{_cores(peer['cores'])} each" if ours else "one device of ours"
-            parts.append(f"{(ours or speed(what)) / peer['steps_per_s']:.1f} x ({on})")
-            name = f"{peer['name']} {peer['version']}"
+            ours = speed(what, body, devices=peer["cores"]) if peer["cores"] and body == "rigid" else None
+            alike = f"{_cores(peer['cores'])} each" if ours else f"one device of ours, {_cores(peer['cores'] or 1)}"
+            if ours := ours or speed(what, body):
+                parts.append(f"{ours / peer['steps_per_s']:.1f} x ({alike})")
         if parts:
-            lines.append(f"{title} {', '.join(parts)} {name}")
-    alone = speed("network_alone")
+            lines.append(f"{title} {', '.join(parts)} {name} {found[0]['version']}")
+    alone = speed("network_alone", "none")
     one = next((p["steps_per_s"] for p in peers if (p["what"], p["cores"]) == ("rollout_policy", 1)), None)
     if alone and one:
         lines.append(f"the network alone, without simulation, {alone / one:.1f} x crazyflow in the loop (1 core each)")
     return lines
+
+
+def goals(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What was aimed at on two cores of a CPU, and what was measured."""
+
+    def best(what: str, body: str) -> float:
+        found = (
+            r["steps_per_s"] for r in result["rows"] if (r["what"], r["body"]) == (what, body) and r["devices"] == 1
+        )
+        return max(found, default=math.nan)
+
+    def beside(name: str, what: str, cores: int) -> float:
+        found = (p["steps_per_s"] for p in result["peers"] if (p["name"], p["what"], p["cores"]) == (name, what, cores))
+        return max(found, default=math.nan)
+
+    ppo = {row["devices"]: row["steps_per_s"] / 2 for row in result.get("scaling", []) if row["what"] == "ppo"}
+    start = {row["command"]: row["seconds"] for row in result.get("start_up", [])}
+    floor, alone = best("rollout", "mjx-floor"), beside("mujoco.batch", "rollout", 1)
+    of_environment, theirs = best("gymnasium", "rigid"), beside("crazyflow", "gymnasium", 1)
+    brax = beside("brax", "ppo", 2) / 2
+    found = [
+        (
+            "1 M steps/s a core above a floor that is rarely touched",
+            f"{floor / 1e6:.1f} M; `mujoco.batch` alone {alone / 1e6:.2f} M",
+        ),
+        (
+            "PPO: 276 k commands/s on two cores, flights and learning",
+            f"{ppo.get(2, math.nan) / 1e3:.0f} k (one core: {ppo.get(1, math.nan) / 1e3:.0f} k); Brax's own PPO on the "
+            f"same task, networks, batches and epochs {brax / 1e3:.0f} k",
+        ),
+        (
+            "environment for Gymnasium beside crazyflow's, best batch on one core",
+            f"{of_environment / 1e6:.2f} M steps/s of 8 ms; crazyflow's {theirs / 1e6:.2f} M of 2 ms, without delay, "
+            "noise and randomised drones",
+        ),
+    ]
+    return found + [(f"`{c}` in under {limit} s", f"{start[c]:.2f} s") for c, limit in START_UP.items() if c in start]
 
 
 def text(result: Mapping[str, Any]) -> str:
@@ -131,32 +182,53 @@ program's arguments, results and temporaries. One JAX device of a CPU is one cor
 | `rollout_hundred` | that 100-step rollout without gradient |
 | `rollout_policy` | the shipped policy `target-analytic` in the loop (`rollout_closed_loop`), a command every 8 ms |
 | `network_alone` | its network evaluated as often, without simulation and observation |
+| `gymnasium` | steps of 8 ms of the environment for Gymnasium, with randomised drones, delays and noise |
 
 | body | meaning |
 |---|---|
 | `rigid` | closed form |
 | `mjx` | MuJoCo XLA without contact |
 | `mjx-floor` | MuJoCo XLA with a floor 1 m below the drones, which fly as in closed form unless they are near it |
+| `mujoco-floor` | the same with MuJoCo's C (`MujocoBody`) |
 | `mjx-stock` | plain `mjx.step` on the same MJCF without contact |
 
 The runs take turns with those of crazyflow. It simulates first-principles dynamics under rotor-velocity control at
 500 Hz (`sim.step(500)`), and with the same network in its loop at 250 Hz, a command every 8 ms. Its process has XLA's
 default options and one device. It is measured twice: free to use all cores, as XLA's library for matrix products does,
-and bound to one core. This library runs with the option that the `cfb` command sets on CPU
-([model.md](model.md#speed)): `XLA_FLAGS={flags}`.
+and bound to one core, as are the others: `l2f`, the C++ of Learning to Fly (steps of 10 ms of the method of Runge and
+Kutta, one call from Python per step, drones drawn by itself), `mujoco.batch`, MuJoCo's C alone (the drone 1 m above a
+floor under a constant force, 50 steps per call), and crazyflow's `ReachPosEnv` (steps of 2 ms of the same dynamics).
+Brax's own PPO trains on the same task for a few updates. This library runs with the option that the `cfb` command sets
+on CPU ([model.md](model.md#speed)): `XLA_FLAGS={flags}`.
 
+{_goals_section(result)}
 {comparison}
 
 {gpu}
 {chr(10).join(table)}
 
-{first_call_section(result["first_call"])}
+{first_call_section(result["first_call"], result.get("start_up", []))}
 {scaling_section(result.get("scaling"))}
 {section(result["roofline"]) if "roofline" in result else ""}"""
 
 
-def first_call_section(rows: list[dict]) -> str:
+def _goals_section(result: Mapping[str, Any]) -> str:
+    if "scaling" not in result:
+        return ""
+    lines = "\n".join(f"| {goal} | {number} |" for goal, number in goals(result))
+    return f"""## Goals
+
+| aimed at | measured in this run |
+|---|---|
+{lines}
+
+## Ratios
+"""
+
+
+def first_call_section(rows: list[dict], start_up: list[dict]) -> str:
     """Return the section on the first call, as Markdown."""
+    begun = "".join(f"\n- `{row['command']}`: {row['seconds']:.2f} s" for row in start_up)
     lines = "\n".join(f"| {row['cache']} | {row['import_s']:.1f} | {row['call_s']:.1f} |" for row in rows)
     return f"""## The first call
 
@@ -166,6 +238,9 @@ compiled programs is on by default, in the user's cache folder.
 | cache | loading, s | first call, s |
 |---|---:|---:|
 {lines}
+
+New processes, the best of three:
+{begun}
 """
 
 

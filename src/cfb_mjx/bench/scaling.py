@@ -124,7 +124,7 @@ def braxs_ppo() -> list[dict[str, Any]]:
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"the measurement of Brax ended with {done.stderr.strip().splitlines()[-1:]}")
-        version, drones, speed = done.stdout.split()
+        version, drones, speed = done.stdout.splitlines()[-1].split()
         of = {"name": "brax", "version": version, "what": "ppo", "drones": int(drones), "cores": len(cores)}
         rows.append(of | {"steps_per_s": float(speed), "compile_s": 0.0})
     return rows

@@ -1,10 +1,10 @@
 """Runs under a Python that has crazyflow (not cfb_mjx): times one flight of all drones for every line it is sent.
 
-Usage: python crazyflow_peer.py DRONES [NETWORK.npz | environment]. Answers ``ready VERSION COMPILE_SECONDS STEPS``, then
-seconds per request. Without a network a flight is ``sim.step(500)`` at crazyflow's own 500 Hz; with one (weights w0, b0, w1 ... of
-a tanh network that sees the present and one past estimate and six past commands) it is 1 s of that network in the loop,
-a command every 8 ms, two steps of 4 ms each, as one compiled program of crazyflow's pure functions. With the word a
-flight is 20 steps of its Gymnasium environment `ReachPosEnv` with these dynamics and its other defaults.
+Usage: python crazyflow_peer.py DRONES [NETWORK.npz | environment]. Answers ``ready VERSION COMPILE_SECONDS STEPS``,
+then seconds per request. Without a network a flight is ``sim.step(500)`` at crazyflow's own 500 Hz. With one (weights
+w0, b0, w1 ... of a tanh network that sees the present and one past estimate and six past commands) it is 1 s of that
+network in the loop, a command every 8 ms, two steps of 4 ms each, as one program of crazyflow's pure functions. With
+the word it is 20 steps of the Gymnasium environment `ReachPosEnv` with these dynamics and its other defaults.
 """
 
 import contextlib
