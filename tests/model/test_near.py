@@ -175,6 +175,20 @@ def test_what_else_acts_on_the_drone_acts_everywhere(drone, write):
     assert ends[0] > -9.0
 
 
+MOVED = '<body mocap="true" pos="-2 0 0.2"><geom type="box" size="0.3 0.3 0.02"/></body>'
+MOTOR = '<actuator><general joint="free"/></actuator>'
+
+
+@pytest.mark.parametrize("text", [f"<worldbody>{FLOOR}{MOVED}</worldbody>", f"<worldbody>{FLOOR}</worldbody>{MOTOR}"])
+def test_a_world_with_moved_bodies_or_actuators_is_left_to_scenes(write, text):
+    """Their poses and controls were missing in what MuJoCo was given, and all after them was off by so many numbers."""
+    if "joint" in text:
+        text = text.replace("</worldbody>", '<body name="cfb" pos="0 0 1"><freejoint name="free"/></body></worldbody>')
+        text = text.replace("<freejoint", '<geom size="0.03" mass="0.04"/><freejoint')
+    with pytest.raises(CfbError, match="use Scene for such a world"):
+        MujocoBody(write(f"<mujoco>{text}</mujoco>", f"moved{len(text)}.xml"))
+
+
 def test_the_host_is_called_for_those_near_alone(drone, monkeypatch):
     calls = []
     take = scene_engines._Worker.take

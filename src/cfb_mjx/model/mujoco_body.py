@@ -47,7 +47,7 @@ class MujocoBody:
         mjcf: path of an MJCF with the drone and static geometry; default: ``assets/cfb.xml``, the drone and a floor.
 
     Raises:
-        CfbError: the MJCF cannot be compiled, or has other moving bodies (`Scene` has those).
+        CfbError: the MJCF cannot be compiled, or has other moving bodies or actuators (`Scene` has those).
     """
 
     name = "mujoco"
@@ -55,8 +55,12 @@ class MujocoBody:
     def __init__(self, mjcf: str | Path | None = None):
         self.mjcf = str(shipped("assets", "cfb.xml") if mjcf is None else mjcf)
         self.mujoco_model = compiled_scene(World(self.mjcf))
-        if self.mujoco_model.nq != 7:
-            raise CfbError(f"{self.mjcf}: other bodies than the drone move in this MJCF; use Scene for such a world.")
+        model = self.mujoco_model
+        if model.nq != 7 or model.nmocap or model.nu:
+            raise CfbError(
+                f"{self.mjcf}: other bodies than the drone move in this MJCF, or it has actuators; use Scene for such a "
+                "world."
+            )
         self.around = surroundings(self.mujoco_model)
 
     def prepare(self, parameters: Parameters, dt) -> _Prepared:
