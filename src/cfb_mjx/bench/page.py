@@ -152,7 +152,10 @@ and bound to one core. This library runs with the option that the `cfb` command 
 
 {first_call_section(result["first_call"])}
 {scaling_section(result.get("scaling"))}
-{section(result["roofline"]) if "roofline" in result else ""}"""
+{section(result["roofline"]) if "roofline" in result else ""}
+<!-- growth: begin -->
+<!-- growth: end -->
+"""
 
 
 def first_call_section(rows: list[dict]) -> str:
