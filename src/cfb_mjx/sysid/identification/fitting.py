@@ -31,7 +31,7 @@ from cfb_mjx.sysid.identification.innovation import (
     weights,
     whitened,
 )
-from cfb_mjx.sysid.identification.noise import SPARSITY, Noise
+from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.result import Fit, summarise
 from cfb_mjx.sysid.identification.shooting import shoot
 from cfb_mjx.sysid.identification.solver import (
@@ -271,7 +271,7 @@ def _likelihood(
         error, variance = innovations(parameters, Noise.from_vector(x), part, driven, use_measured, robust)
         return error, jnp.log(variance)
 
-    return likelihood(predicted, levels, robust, SPARSITY)
+    return likelihood(predicted, levels, robust)
 
 
 def _residual(

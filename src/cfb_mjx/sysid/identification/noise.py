@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.sysid.identification.flight_data import FlightData
-from cfb_mjx.sysid.identification.solver import Sparsity
 
 _SHORTEST, _LONGEST = 0.03, 3.0  # correlation time of the disturbance, s
 
@@ -95,20 +94,3 @@ class Noise(eqx.Module):
         )
         # Explicit dtype: with weakly typed numbers every program would be compiled twice.
         return Noise(**{name: jnp.asarray(level, jnp.result_type(float)) for name, level in levels.items()})
-
-
-def _channels(rate: bool, force: bool, rotor: bool) -> list[bool]:
-    return [rate] * 3 + [force] + [rotor] * 4
-
-
-SPARSITY = Sparsity(
-    direction=np.array([*range(10), 0, 1, 2, 0, 1, 2, 10]),
-    channels=np.array(
-        [_channels(True, False, False)] * 10
-        + [_channels(False, True, False)] * 3
-        + [_channels(False, False, True)] * 3
-        + [_channels(True, True, True)]
-    ),
-)
-"""Which levels (`Noise.to_vector`) move which innovations. Turning couples the axes of the body rate, so these share
-their levels; specific force and rotors have three levels of their own, and the command's error moves all."""

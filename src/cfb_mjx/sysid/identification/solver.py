@@ -189,20 +189,10 @@ def linearised(residual: Callable[[Array], PyTree], x: Float[Array, " k"]) -> Qu
     return Quadratic(cost, slope, curvature)
 
 
-class Sparsity(NamedTuple):
-    """Which unknowns move which channels (the last axis of a prediction), so that one derivative serves several."""
-
-    direction: np.ndarray
-    """(k,) number of the derivative that an unknown shares with others, which move other channels."""
-    channels: np.ndarray
-    """(k, c) whether an unknown moves a channel."""
-
-
 def likelihood(
     predicted: Callable[[Array], tuple[Array, Array]],
     x: Float[Array, " k"],
     robust: bool,
-    sparsity: Sparsity | None = None,
 ) -> Quadratic:
     """Minus the logarithm of a Gaussian likelihood whose variances move too, about ``x``: Fisher's scoring.
 
@@ -214,7 +204,7 @@ def likelihood(
     def surprising(whitened):
         return jnp.sum(surprise(whitened, robust))
 
-    (error, log_variance), (moved, spread) = _slopes(predicted, x, sparsity)
+    (error, log_variance), (moved, spread) = _slopes(predicted, x)
     weight = jnp.exp(-0.5 * log_variance)
     whitened = (error * weight).ravel()
     moved, spread = (moved * weight).reshape(len(x), -1), spread.reshape(len(x), -1)
@@ -259,20 +249,10 @@ def _tried(descent: Descent, data: Quadratic, x, ridge):
     return descent.advanced(jax.tree.map(jnp.add, data, own), x)
 
 
-def _slopes(function, x, sparsity: Sparsity | None = None):
+def _slopes(function, x):
     """Values at ``x`` and, in front, the derivatives by each unknown."""
 
     def both(direction):
         return jax.jvp(function, (x,), (direction,))
 
-    along = jax.vmap(both, out_axes=(None, 0))
-    if sparsity is None:
-        return along(jnp.eye(len(x), dtype=x.dtype))
-    shared = np.arange(max(sparsity.direction) + 1)[:, None] == sparsity.direction
-    values, found = along(jnp.asarray(shared, x.dtype))
-
-    def apart(slopes):
-        own = sparsity.channels.reshape(len(x), *[1] * (slopes.ndim - 2), -1)
-        return jnp.where(own, slopes[sparsity.direction], 0.0)
-
-    return values, jax.tree.map(apart, found)
+    return jax.vmap(both, out_axes=(None, 0))(jnp.eye(len(x), dtype=x.dtype))
