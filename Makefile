@@ -44,6 +44,7 @@ test-long: $(INSTALLED)
 
 bench: $(INSTALLED) .venv-peers/.installed
 	$(BIN)/cfb bench --roofline --peer-python .venv-peers/bin/python --json benchmarks/results.json --markdown docs/performance.md
+	$(BIN)/python benchmarks/growth.py
 
 # On a machine with an NVIDIA GPU, jax for CUDA and no network: what it lacks comes along in wheels/.
 GPU_PYTHON ?= python3

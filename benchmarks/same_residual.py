@@ -56,7 +56,8 @@ def of_shooting(logs: list[FlightLog], nominal: Parameters, names, use_measured:
 def of_innovations(logs: list[FlightLog], found: fitting.Fit, nominal: Parameters) -> Problem:
     """Return the problem of whitened innovations, with the noise levels of a finished fit."""
     unknowns = choose(found.names, nominal)
-    segments = jax.tree.map(jnp.asarray, flight_data.prepare(list(logs)).segments)
+    whole = flight_data.prepare(list(logs)).segments
+    segments, parts = jax.tree.map(jnp.asarray, whole), flight_data.parts(whole)
 
     @eqx.filter_jit
     def residual(vector, noise, segments):
@@ -66,7 +67,7 @@ def of_innovations(logs: list[FlightLog], found: fitting.Fit, nominal: Parameter
         unknowns,
         lambda x: np.asarray(residual(jnp.asarray(x), found.noise, segments)),
         lambda solver=None: np.asarray(
-            fitting._fit_vector(unknowns, unknowns.start, found.noise, segments, True, False, RIDGE, solver)
+            fitting._fit_vector(unknowns, unknowns.start, found.noise, parts, True, False, RIDGE, solver)
         ),
     )
 

@@ -19,7 +19,7 @@ from cfb_mjx.sysid.identification.fitting import fit
 from cfb_mjx.sysid.identification.flight_data import Segments, prepare
 from cfb_mjx.sysid.identification.innovation import as_held, drive, innovations
 from cfb_mjx.sysid.identification.noise import Noise
-from cfb_mjx.sysid.identification.uncertainty import assess, most_contradicted
+from cfb_mjx.sysid.identification.uncertainty import Scores, assess, most_contradicted
 from cfb_mjx.sysid.identification.unknowns import at_the_border
 
 PRESET = load_model_file("cfb-guards")
@@ -138,7 +138,7 @@ def test_a_product_less_sure_than_half_its_value_is_not_told():
     """Thrust scale / gain^0.33 is known to 42 %; as gain / thrust scale^3 to three times that."""
     told = np.array([-0.31, 0.95]) / np.hypot(0.31, 0.95)
     jacobian = np.full((4, 25, 1), 0.24) * told
-    found = assess(np.zeros((4, 25)), jacobian, ("motor_gain", "thrust_scale"))
+    found = assess(Scores.of(np.zeros((4, 25)), jacobian), ("motor_gain", "thrust_scale"))
     assert found.names == ["motor_gain", "thrust_scale"]
     assert found.products == []
 
@@ -148,7 +148,7 @@ def test_a_prior_bounds_what_the_data_leave_free_and_products_carry_their_std():
     shared, own = rng.normal(size=(20, 100)) * 30, rng.normal(size=(20, 100)) * 30
     jacobian = np.stack([2 * shared, shared, own, -own], axis=-1)  # motor_gain^2 thrust_scale, inertia_xx / mass
     names = ("motor_gain", "thrust_scale", "inertia_xx", "mass")
-    found = assess(rng.normal(size=(20, 100)), jacobian, names, {"mass": 0.05})
+    found = assess(Scores.of(rng.normal(size=(20, 100)), jacobian), names, {"mass": 0.05})
     assert found.names == ["motor_gain", "thrust_scale"]
     assert found.combinations == ["thrust_scale * motor_gain^2"]
     assert found.std[2:] == pytest.approx([0.05, 0.05], rel=0.02)
@@ -169,8 +169,8 @@ def test_only_what_the_data_contradict_is_named():
         return (residual - flat[:, :1] @ np.linalg.lstsq(flat[:, :1], residual, rcond=None)[0]).reshape(30, 50)
 
     held = ["motor_gain", "thrust_scale"]
-    assert most_contradicted(settled(np.zeros(3)), jacobian, names, free, held) is None
-    assert most_contradicted(settled(np.array([0, 0, 0.1])), jacobian, names, free, held) == "thrust_scale"
+    assert most_contradicted(Scores.of(settled(np.zeros(3)), jacobian), names, free, held) is None
+    assert most_contradicted(Scores.of(settled(np.array([0, 0, 0.1])), jacobian), names, free, held) == "thrust_scale"
 
 
 def test_an_inertia_at_the_border_of_the_possible_gets_no_number():

@@ -13,13 +13,13 @@ from scipy.integrate import solve_ivp
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.sysid.identification import fitting
+from cfb_mjx.sysid.identification import fitting, flight_data
 from cfb_mjx.sysid.identification.filters import detect
 from cfb_mjx.sysid.identification.fitting import fit
 from cfb_mjx.sysid.identification.flight_data import prepare
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.solver import OUTLIER, RIDGE, tempered
-from cfb_mjx.sysid.identification.uncertainty import assess
+from cfb_mjx.sysid.identification.uncertainty import Scores, assess
 from cfb_mjx.sysid.identification.unknowns import choose
 
 NOMINAL = load_model_file("cfb-guards").parameters()
@@ -89,6 +89,36 @@ def test_start_is_the_nominal_drone_and_names_are_checked():
         choose("", NOMINAL)
 
 
+def test_parts_of_the_data_say_what_all_say(campaign, monkeypatch):
+    """A fit's sums, part by part, are those of all rows at once; also where nothing counts in a part."""
+    data = prepare(campaign[1][:2])
+    unknowns, noise = choose("inertia,rotor_inertia,motor,command_hold", NOMINAL), Noise.first(data)
+    levels = noise.to_vector() + 0.1 * np.random.default_rng(3).normal(size=17)
+    whole = jax.tree.map(jnp.asarray, data.segments)
+    monkeypatch.setattr(flight_data, "_COUNTS", (3,))
+    some = flight_data.parts(data.segments)
+    assert len(some) > 2
+    assert sum(len(part.valid) for part in some) == len(whole.valid)
+
+    def sums(segments):
+        driven = fitting._driven(unknowns, unknowns.start, noise, segments, False, False)
+        weighed = fitting._weights(unknowns, unknowns.start, noise, segments, False, False)
+        return (
+            fitting._likelihood(levels, unknowns, unknowns.start, segments, driven, False, False),
+            fitting._squares(unknowns.start, unknowns, noise, segments, weighed, False, False),
+        )
+
+    once, each = sums(whole), [jax.tree.leaves(sums(part)) for part in some]
+    for a, b in zip(jax.tree.leaves(once), map(sum, zip(*each, strict=True)), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-9 * np.max(np.abs(b)))
+    fit_of_parts, fit_of_all = (
+        fitting._scores(unknowns, unknowns.start, noise, segments, False, False) for segments in (some, [whole])
+    )
+    np.testing.assert_allclose(fit_of_parts[0], fit_of_all[0], rtol=1e-9, atol=1e-9)
+    names = unknowns.names
+    np.testing.assert_allclose(*(assess(scores, names).std for _, scores in (fit_of_parts, fit_of_all)), rtol=1e-6)
+
+
 def test_what_a_fit_works_with_has_types_of_its_own(campaign):
     """A number as weakly typed as Python's becomes another in the first round, and the second compiles anew."""
     data = prepare(campaign[1][:1])
@@ -101,7 +131,7 @@ def test_what_a_fit_works_with_has_types_of_its_own(campaign):
 def test_uncertainty_of_a_linear_problem_matches_its_closed_form():
     rng = np.random.default_rng(2)
     jacobian = rng.normal(size=(40, 50, 3)) * [1.0, 5.0, 20.0]
-    found = assess(rng.normal(size=(40, 50)), jacobian, ("inertia_xx", "inertia_yy", "rotor_inertia"))
+    found = assess(Scores.of(rng.normal(size=(40, 50)), jacobian), ("inertia_xx", "inertia_yy", "rotor_inertia"))
     flat = jacobian.reshape(-1, 3)
     exact = np.sqrt(np.diag(np.linalg.inv(flat.T @ flat)))
     assert np.all(found.std >= exact * (1 - 1e-9))
@@ -112,8 +142,8 @@ def test_uncertainty_of_a_linear_problem_matches_its_closed_form():
 def test_correlated_blocks_widen_the_uncertainty():
     rng = np.random.default_rng(3)
     jacobian = np.ones((60, 50, 1))
-    independent = assess(rng.normal(size=(60, 50)), jacobian, ("motor_gain",)).std
-    shared = assess(np.repeat(rng.normal(size=(60, 1)), 50, axis=1), jacobian, ("motor_gain",)).std
+    independent = assess(Scores.of(rng.normal(size=(60, 50)), jacobian), ("motor_gain",)).std
+    shared = assess(Scores.of(np.repeat(rng.normal(size=(60, 1)), 50, axis=1), jacobian), ("motor_gain",)).std
     assert shared > 4 * independent  # the truth: sqrt(50) = 7
 
 
@@ -122,7 +152,7 @@ def test_what_cannot_be_told_is_named_with_what_can():
     ratio = rng.normal(size=(20, 100)) * 10
     other = rng.normal(size=(20, 100)) * 10
     jacobian = np.stack([-ratio, ratio, other], axis=-1)  # only thrust_scale / mass matters
-    found = assess(rng.normal(size=(20, 100)), jacobian, ("mass", "thrust_scale", "rotor_inertia"))
+    found = assess(Scores.of(rng.normal(size=(20, 100)), jacobian), ("mass", "thrust_scale", "rotor_inertia"))
     assert found.names == ["mass", "thrust_scale"]
     assert found.combinations == ["mass / thrust_scale"]
 
@@ -130,7 +160,7 @@ def test_what_cannot_be_told_is_named_with_what_can():
 def test_what_the_data_do_not_touch_is_named_without_a_combination():
     rng = np.random.default_rng(6)
     jacobian = np.stack([rng.normal(size=(20, 100)) * 10, np.zeros((20, 100))], axis=-1)
-    found = assess(rng.normal(size=(20, 100)), jacobian, ("inertia_xx", "inertia_yy"))
+    found = assess(Scores.of(rng.normal(size=(20, 100)), jacobian), ("inertia_xx", "inertia_yy"))
     assert found.names == ["inertia_yy"]
     assert found.combinations == []
 
@@ -191,7 +221,7 @@ def test_a_round_ends_at_its_minimum_where_commands_were_not_logged(campaign):
     segments, ridge = jax.tree.map(jnp.asarray, data.segments), jnp.full(len(unknowns.names), RIDGE)
     weighed = fitting._weights(unknowns, unknowns.start, noise, segments, True, False)
     assert jnp.max(weighed.doubt) > 0
-    vector = fitting._fit_vector(unknowns, unknowns.start, noise, segments, True, False, ridge)
+    vector = fitting._fit_vector(unknowns, unknowns.start, noise, [segments], True, False, ridge)
 
     def residual(x):
         return fitting._residual(x, unknowns, noise, segments, True, False, weighed).ravel()

@@ -15,6 +15,9 @@ from cfb_mjx.model import CATALOGUE, Quadrotor
 from cfb_mjx.sysid import replay
 from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.replay import Lane, remembered_along, replays, speeds_along
+from cfb_mjx.sysid.tracing import innovations
+from cfb_mjx.sysid.tracing.search import Search
+from cfb_mjx.sysid.tracing.sensors import check_sensors
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +44,7 @@ def test_rotor_speeds_alone_are_those_of_the_whole_model(model, flights):
 def test_one_program_serves_all_rows(model, flights):
     """A weak type in what is carried on would make the second group of rows a program of its own."""
     effects = jax.tree.map(lambda x: np.asarray(x)[None], model.effects)
-    rows = replay._rows([Lane(flights[0], flights[0].rotor_speed)], 0, 10)
+    rows = replay._rows([Lane(flights[0], flights[0].rotor_speed)], replay._READ, 0, 10)
     begun = replay._begin(model, effects, {key: x[:, :2] for key, x in rows.items()})
     after = jax.eval_shape(
         lambda carry: replay._advance(model, effects, np.zeros(1), np.zeros(1), rows, carry, "speed")[0], begun
@@ -59,6 +62,27 @@ def test_groups_on_several_cores_say_the_same(flights, monkeypatch):
         monkeypatch.setattr(devices, "cores", lambda count=count: count)
         found.append(list(replays(model, iter(lanes))))
     jax.tree.map(np.testing.assert_array_equal, *found)
+
+
+def test_a_flight_in_pieces_says_what_it_says_at_once(monkeypatch):
+    """A long flight is replayed and whitened in pieces, so that its memory is bounded; a search must not notice."""
+    logs = [read_log(path) for path in sorted(shipped("data", "flight_logs").glob("*.mcap"))[:2]]
+    parameters = Quadrotor.from_file("cfb-guards").parameters
+    delay = 0.008
+    search = Search.start(logs, parameters, delay, check_sensors(logs, delay, 0.0), named=("rotor_drag", "inflow"))
+    hypothesis = search.nothing()
+    wanted = [column for variant in search.candidates(hypothesis)[:6] for column in variant]
+    found = []
+    for most, piece in ((replay.MOST, innovations.PIECE), (0, 1)):
+        monkeypatch.setattr(innovations, "MOST", most)
+        monkeypatch.setattr(innovations, "PIECE", piece)
+        found.append([search.linearise(hypothesis, wanted), *search.linearise_terms(hypothesis, wanted[:2])[1:5:3]])
+    for whole, pieces in zip(*found, strict=True):
+        np.testing.assert_array_equal(whole.fold, pieces.fold)
+        np.testing.assert_allclose(pieces.scale, whole.scale, rtol=1e-12)
+        size = np.sqrt(np.einsum("bii->bi", whole.blocks)) + 1e-30
+        assert len(whole.blocks) > 8
+        assert np.max(np.abs(whole.blocks - pieces.blocks) / (size[:, :, None] * size[:, None, :])) < 1e-9
 
 
 def test_over_cores_keeps_order_precision_and_errors(monkeypatch):

@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares as scipys
 from scipy.optimize import minimize
 
-from cfb_mjx.sysid.identification.solver import RIDGE, GaussNewton, least_squares, most_likely
+from cfb_mjx.sysid.identification.solver import RIDGE, GaussNewton, descended, least_squares, likelihood
 
 TIME = np.linspace(0.0, 2.0, 200)
 DATA = 3.0 * np.exp(-2.0 * TIME) + 0.5 + 0.01 * np.random.default_rng(0).normal(size=TIME.shape)
@@ -100,6 +100,6 @@ def test_it_finds_the_most_likely_noise(start, robust):
         return jnp.sum(variance + squared) + jnp.sum((RIDGE * x) ** 2)
 
     theirs = minimize(jax.jit(cost), [np.log(0.3), np.log(2.0), 0.0], jac=jax.jit(jax.grad(cost)), tol=1e-10)
-    found = np.asarray(jax.jit(lambda x: most_likely(noisy, x, robust))(jnp.asarray(start)))
+    found = np.asarray(descended(lambda x: [likelihood(noisy, x, robust)], jnp.asarray(start)))
     assert float(cost(found)) - theirs.fun < 1e-4
     assert found == pytest.approx(theirs.x, abs=2e-3)

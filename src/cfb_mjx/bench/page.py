@@ -209,7 +209,10 @@ on CPU ([model.md](model.md#speed)): `XLA_FLAGS={flags}`.
 
 {first_call_section(result["first_call"], result.get("start_up", []))}
 {scaling_section(result.get("scaling"))}
-{section(result["roofline"]) if "roofline" in result else ""}"""
+{section(result["roofline"]) if "roofline" in result else ""}
+<!-- growth: begin -->
+<!-- growth: end -->
+"""
 
 
 def _goals_section(result: Mapping[str, Any]) -> str:

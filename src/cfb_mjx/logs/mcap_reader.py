@@ -7,6 +7,7 @@ import json
 import os
 from operator import attrgetter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,8 +17,15 @@ from cfb_mjx.logs import mcap_schema
 from cfb_mjx.logs.flight_log import FlightLog, from_nanoseconds
 from cfb_mjx.logs.mcap_stream import MAGIC, refuse_bombs
 
+if TYPE_CHECKING:
+    from mcap.records import Channel
+
+BATCH = 4096
+"""Number of messages of a topic that are decoded at once, because as objects they take ten times the memory of their
+numbers."""
 _STAMP = ("timestamp.seconds", "timestamp.nanos")
 _POSE_COLUMNS = tuple(f"pose.position.{c}" for c in "xyz") + tuple(f"pose.orientation.{c}" for c in "wxyz")
+_COLUMNS = {t.topic: t.columns for t in mcap_schema.TOPICS} | {mcap_schema.POSE: _POSE_COLUMNS}
 
 
 def read_mcap(path: str | os.PathLike) -> FlightLog:
@@ -35,12 +43,12 @@ def read_mcap(path: str | os.PathLike) -> FlightLog:
         raise CfbError(f"{path}: this is not an MCAP file; give a log written by cfb_mjx or a table (parquet, csv).")
     refuse_bombs(data, path)
     try:
-        schemas, channels, payloads, record = _records(data)
+        schemas, channels, batches, record = _records(data)
     except Exception as error:  # on damaged bytes, the MCAP library raises struct, codec and lookup errors
         raise CfbError(f"{path}: the MCAP file is {_diagnosis(data, error)}; copy or export it again.") from None
     _check_origin(path, schemas, channels, record)
     try:
-        columns = _decode(schemas, channels, payloads)
+        columns = _by_topic(channels, batches)
         metadata = json.loads(record["metadata"])
         if not isinstance(metadata, dict):
             raise ValueError("metadata is not an object")
@@ -53,21 +61,30 @@ def read_mcap(path: str | os.PathLike) -> FlightLog:
 
 
 def _records(data: bytes):
-    """Schemas, channels, message payloads per channel in file order, and the log's metadata record. Checks all CRCs."""
+    """Schemas, channels, decoded batches per channel in file order, and the log's metadata record. Checks all CRCs."""
     from mcap.records import Channel, Message, Metadata, Schema
     from mcap.stream_reader import StreamReader
 
-    schemas, channels, payloads, record = {}, {}, {}, {}
+    schemas, channels, waiting, batches, record = {}, {}, {}, {}, {}
+
+    def decode(identifier: int) -> None:
+        batches.setdefault(identifier, []).append(_decoded(schemas, channels[identifier], waiting.pop(identifier)))
+
     for item in StreamReader(io.BytesIO(data), validate_crcs=True, record_size_limit=len(data)).records:
         if isinstance(item, Message):
-            payloads.setdefault(item.channel_id, []).append(item.data)
+            waiting.setdefault(item.channel_id, []).append(item.data)
+            if len(waiting[item.channel_id]) == BATCH and item.channel_id in channels:
+                decode(item.channel_id)
         elif isinstance(item, Schema):
             schemas[item.id] = item
         elif isinstance(item, Channel):
             channels[item.id] = item
         elif isinstance(item, Metadata) and item.name == mcap_schema.METADATA_RECORD:
             record = item.metadata
-    return schemas, channels, payloads, record
+    for identifier in [*waiting]:
+        if identifier in channels:
+            decode(identifier)
+    return schemas, channels, batches, record
 
 
 def _diagnosis(data: bytes, error: Exception) -> str:
@@ -108,20 +125,31 @@ def _check_origin(path: Path, schemas: dict, channels: dict, record: dict) -> No
         )
 
 
-def _decode(schemas: dict, channels: dict, payloads: dict) -> dict[str, np.ndarray]:
-    """Topic to its (n, 2 + columns) table of rows: seconds, nanoseconds, values."""
-    columns = {t.topic: t.columns for t in mcap_schema.TOPICS} | {mcap_schema.POSE: _POSE_COLUMNS}
-    tables = {}
-    for identifier, channel in channels.items():
-        if channel.topic not in columns:
-            continue
+def _decoded(schemas: dict, channel: Channel, payloads: list[bytes]) -> np.ndarray | Exception:
+    """The (n, 2 + columns) table of messages of a topic: seconds, nanoseconds, values; or why there is none."""
+    columns = _COLUMNS.get(channel.topic, ())
+    try:
         schema = schemas[channel.schema_id]
         parse = mcap_schema.message_class(schema.name, schema.data).FromString
-        row = attrgetter(*_STAMP, *columns[channel.topic])
-        rows = [row(parse(data)) for data in payloads.get(identifier, [])]
-        table = np.array(rows, dtype=np.float64).reshape(len(rows), 2 + len(columns[channel.topic]))
-        tables[channel.topic] = np.concatenate([tables[channel.topic], table]) if channel.topic in tables else table
-    return tables
+        row = attrgetter(*_STAMP, *columns)
+        # Of another topic nothing is wanted, so that nothing can be wrong with it.
+        rows = [row(parse(data)) for data in payloads] if columns else []
+        return np.array(rows, dtype=np.float64).reshape(len(rows), 2 + len(columns))
+    except Exception as error:  # protobuf decoding of foreign or damaged content; the file's origin is checked first
+        return error
+
+
+def _by_topic(channels: dict, batches: dict[int, list]) -> dict[str, np.ndarray]:
+    """Topic to its table of rows, as of `_decoded`."""
+    tables: dict[str, list] = {}
+    for identifier, channel in channels.items():
+        if channel.topic in _COLUMNS:
+            empty = np.zeros((0, 2 + len(_COLUMNS[channel.topic])))
+            tables.setdefault(channel.topic, [empty]).extend(batches.get(identifier, ()))
+    for found in tables.values():
+        if failed := next((each for each in found if isinstance(each, Exception)), None):
+            raise failed
+    return {topic: np.concatenate(found) for topic, found in tables.items()}
 
 
 def _assemble(path: Path, tables: dict[str, np.ndarray], metadata: dict) -> FlightLog:

@@ -100,6 +100,7 @@ def descriptor_set(message: str) -> bytes:
     return result.SerializeToString(deterministic=True)
 
 
+@functools.lru_cache(maxsize=16)
 def message_class(name: str, descriptors: bytes) -> type[Any]:
     """The Python class of a message from a serialised FileDescriptorSet, in a separate descriptor pool.
 

@@ -147,9 +147,15 @@ def lengthened(flight: Flight, beside: Any) -> tuple[Flight, Any]:
 
 def _padded(flight: Flight, length: int) -> Flight:
     n = len(flight.time)
-    padded = jax.tree.map(lambda x: last_repeated(x, length) if np.ndim(x) else x, flight)
+    padded = jax.tree.map(lambda x: _longer(x, length) if np.ndim(x) else x, flight)
     own = np.arange(length) < n
     return dataclasses.replace(padded, valid=padded.valid * own, fresh=padded.fresh * own)
+
+
+def _longer(x: AnyArray, length: int) -> np.ndarray:
+    x = np.asarray(x)
+    # A column that is the same in all rows stays one row in memory.
+    return np.broadcast_to(x[:1], (length, *x.shape[1:])) if x.strides[0] == 0 else last_repeated(x, length)
 
 
 def _rotor_speed(log: FlightLog) -> tuple[np.ndarray, bool]:
@@ -171,7 +177,7 @@ def _other_of(log: FlightLog) -> np.ndarray:
     They are of the fifth degree, fitted to the time of a prediction after the row and that of a wake before it: the
     other drone's path is known, like the commands.
     """
-    nothing = np.full((len(log), 3 * sum(KNOWN)), np.nan)
+    nothing = np.broadcast_to(np.nan, (len(log), 3 * sum(KNOWN)))
     if log.other is None:
         return nothing
     known = np.asarray(np.isfinite(log.other).all(axis=1))

@@ -9,6 +9,7 @@ serves any number and length of flights.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -120,24 +121,50 @@ def _walked(model: Quadrotor, lanes: Iterable[Lane], wanted: Wanted) -> Iterator
 
 
 def _side_by_side(model: Quadrotor, some: list[Lane], wanted: Wanted) -> list:
+    together = _joined(_in_turn(model, some, wanted))
+    return [jax.tree.map(lambda x, i=i, n=len(lane.flight.time): x[i, :n], together) for i, lane in enumerate(some)]
+
+
+def _joined(pieces: Iterable):
+    return jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x], axis=1), *pieces)
+
+
+def _in_turn(model: Quadrotor, some: Sequence[Lane], wanted: Wanted) -> Iterator:
+    """Outputs of all lanes, `ROWS` rows at a time."""
     width = next(count for count in LANES if count >= len(some))
     # Fill up with copies of the last lane.
-    whole = some + some[-1:] * (width - len(some))
+    whole = [*some, *[some[-1]] * (width - len(some))]
     numbers = [model.effects if lane.effects is None else lane.effects for lane in whole]
     effects = jax.tree.map(lambda *x: np.stack([np.asarray(y) for y in x]), *numbers)
     lead = np.array([lane.lead for lane in whole], float)
     measured = np.array([lane.flight.measured for lane in whole], float)
-    longest = max(len(lane.flight.time) for lane in some)
-    carry, pieces = None, []
-    for first in range(0, longest, ROWS):
+    flights = {id(lane.flight): lane.flight for lane in some}.values()
+    read = _READ + (("other",) if any(np.isfinite(flight.other).any() for flight in flights) else ())
+    carry = None
+    for first in range(0, max(len(lane.flight.time) for lane in some), ROWS):
         # One more row, for the interval after the last one.
-        rows = _rows(whole, first, first + ROWS + 1)
+        rows = _rows(whole, read, first, first + ROWS + 1)
         if carry is None:
             carry = _begin(model, effects, {key: x[:, :2] for key, x in rows.items()})
         carry, found = _advance(model, effects, lead, measured, rows, carry, wanted)
-        pieces.append(found)
-    together = jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x], axis=1), *pieces)
-    return [jax.tree.map(lambda x, i=i, n=len(lane.flight.time): x[i, :n], together) for i, lane in enumerate(some)]
+        yield jax.tree.map(lambda x: np.asarray(x)[: len(some)], found)
+
+
+def replays_in_pieces(model: Quadrotor, lanes: Sequence[Lane], blocks: int) -> Iterator[Replay]:
+    """Replay one long flight by several models, some rows at a time, so that memory does not grow with the flight.
+
+    Args:
+        model: as for `replays`.
+        lanes: of the same flight.
+        blocks: size of a piece, in blocks of `ROWS` rows.
+
+    Returns:
+        Iterator over pieces; the arrays of each have the lanes as their leading axis.
+    """
+    groups = [_in_turn(model, lanes[i : i + LANES[-1]], "sensors") for i in range(0, len(lanes), LANES[-1])]
+    for _ in range(0, len(lanes[0].flight.time), blocks * ROWS):
+        found = [_joined(islice(group, blocks)) for group in groups]
+        yield jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 
 def _grouped(lanes: Iterable[Lane]) -> Iterator[list[Lane]]:
@@ -155,18 +182,15 @@ def _grouped(lanes: Iterable[Lane]) -> Iterator[list[Lane]]:
 _READ = ("time", "interval", "position", "velocity", "quaternion", "body_rate", "specific_force", "command", "voltage")
 
 
-def _rows(lanes: list[Lane], first: int, last: int) -> dict[str, np.ndarray]:
-    """Rows [first, last) of every lane's flight; beyond its end, the last row with zero intervals."""
+def _rows(lanes: list[Lane], read: Sequence[str], first: int, last: int) -> dict[str, np.ndarray]:
+    """Columns of rows [first, last) of every lane's flight; beyond its end, the last row with zero intervals."""
     rows = {id(lane.flight): np.minimum(np.arange(first, last), len(lane.flight.time) - 1) for lane in lanes}
     # Many lanes often share one flight.
     flights = {id(lane.flight): lane.flight for lane in lanes}
     found = {}
-    for key in _READ:
+    for key in read:
         some = {at: np.asarray(getattr(flight, key))[rows[at]] for at, flight in flights.items()}
         found[key] = np.stack([some[id(lane.flight)] for lane in lanes])
-    if any(np.isfinite(flight.other).any() for flight in flights.values()):
-        some = {at: np.asarray(flight.other)[rows[at]] for at, flight in flights.items()}
-        found["other"] = np.stack([some[id(lane.flight)] for lane in lanes])
     return found | {"driven": np.stack([np.asarray(lane.driven)[rows[id(lane.flight)]] for lane in lanes])}
 
 

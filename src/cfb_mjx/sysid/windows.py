@@ -82,15 +82,15 @@ def find_starts(log: FlightLog, horizons: tuple[float, ...], delay: float, gyro_
     count = int(np.floor((log.time[-1] - origin - reach - FIRST_START) / START_SPACING + 1e-9)) + 1
     starts = origin + FIRST_START + START_SPACING * np.arange(max(count, 0))
     gaps = np.asarray(log.gaps(), dtype=int)
-    begin, end = log.time[gaps], log.time[gaps + 1] if len(gaps) else log.time[gaps]
-    instants = np.array([start + age for start in (0.0, *horizons) for age in ages])
-    allowed = [
-        not np.any((begin >= t0 - GAP_BEFORE) & (begin <= t0 + GAP_AFTER))
-        # The edges of a gap count as part of it; otherwise a reading there would depend on rounding.
-        and not np.any((begin[:, None] < t0 + instants + 1e-6) & (t0 + instants - 1e-6 < end[:, None]))
-        for t0 in starts
-    ]
-    return starts[np.array(allowed, dtype=bool)]
+    if not len(gaps):
+        return starts
+    begin, end = log.time[gaps], log.time[gaps + 1]
+    near = np.searchsorted(begin, starts + GAP_AFTER, side="right") > np.searchsorted(begin, starts - GAP_BEFORE)
+    instants = starts[:, None] + np.array([start + age for start in (0.0, *horizons) for age in ages])
+    # The edges of a gap count as part of it; otherwise a reading there would depend on rounding.
+    before = np.searchsorted(begin, instants + 1e-6) - 1
+    inside = (before >= 0) & (instants - 1e-6 < end[before])
+    return starts[~near & ~inside.any(axis=1)]
 
 
 def find_windows(

@@ -30,13 +30,14 @@ from cfb_mjx.model.effects import CATALOGUE, SENSOR_FAULTS, Effect
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.rotors import thrust
 from cfb_mjx.model.state import AnyArray, State
+from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.excitation.experiment import TICK, Conditions, Experiment, follow
 from cfb_mjx.sysid.excitation.manoeuvres import PATHS, STEP, path
 from cfb_mjx.sysid.identification.fitting import fit_noise, fit_slopes, in_blocks
-from cfb_mjx.sysid.identification.flight_data import Segments, prepare
+from cfb_mjx.sysid.identification.flight_data import Segments, parts, prepare
 from cfb_mjx.sysid.identification.innovation import whitened
 from cfb_mjx.sysid.identification.noise import Noise
-from cfb_mjx.sysid.identification.uncertainty import LOOSEST, Uncertainty, assess
+from cfb_mjx.sysid.identification.uncertainty import LOOSEST, Scores, Uncertainty, assess
 from cfb_mjx.sysid.identification.unknowns import UNITS, Unknowns
 from cfb_mjx.sysid.tracing.jointly import confirm
 from cfb_mjx.sysid.tracing.search import Search
@@ -103,13 +104,16 @@ def linearise(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = Tr
     if "pose_delay" in unknowns.names:
         raise CfbError("--parameters pose_delay: a manoeuvre cannot be designed for it; leave it out.")
     data = prepare(list(logs))
-    segments = jax.tree.map(jnp.asarray, data.segments)
+    segments = parts(not_none(data.segments))
     noise = Noise.first(data)
     for _ in range(_ROUNDS):
         noise = fit_noise(unknowns, unknowns.start, noise, segments, use_measured, False)
-    residual, jacobian = fit_slopes(unknowns, unknowns.start, noise, segments, use_measured, False)
-    jacobian = np.asarray(jacobian) @ per_relative_change(unknowns)
-    return Linearised(*in_blocks(segments, np.asarray(residual), jacobian), noise)
+    blocks = []
+    for part in segments:
+        residual, jacobian = fit_slopes(unknowns, unknowns.start, noise, part, use_measured, False)
+        blocks.append(in_blocks(part, np.asarray(residual), np.asarray(jacobian) @ per_relative_change(unknowns)))
+    residuals, jacobians = zip(*blocks, strict=True)
+    return Linearised(np.concatenate(residuals), np.concatenate(jacobians), noise)
 
 
 def predict(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = True) -> Prediction:
@@ -124,7 +128,7 @@ def predict(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = True
         CfbError: as `linearise`.
     """
     at_truth = linearise(logs, unknowns, use_measured)
-    found = assess(at_truth.residual, at_truth.jacobian, unknowns.names)
+    found = assess(Scores.of(at_truth.residual, at_truth.jacobian), unknowns.names)
     values, std = np.asarray(unknowns.values(unknowns.start)), found.std * unknowns.scale(unknowns.start)
     known = {
         name: Expected(float(values[i]), float(std[i]), UNITS[name])

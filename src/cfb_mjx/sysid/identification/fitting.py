@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -13,16 +13,17 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array
 
-from cfb_mjx.devices import Devices
+from cfb_mjx.devices import Devices, over_cores
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import with_gyro_in_time
 from cfb_mjx.sysid.identification.filters import detect
-from cfb_mjx.sysid.identification.flight_data import Segments, prepare
+from cfb_mjx.sysid.identification.flight_data import Segments, parts, prepare
 from cfb_mjx.sysid.identification.innovation import (
     CHANNELS,
+    Drive,
     Weights,
     as_held,
     drive,
@@ -33,8 +34,17 @@ from cfb_mjx.sysid.identification.innovation import (
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.result import Fit, summarise
 from cfb_mjx.sysid.identification.shooting import shoot
-from cfb_mjx.sysid.identification.solver import RIDGE, least_squares, most_likely, surprise, tempered
-from cfb_mjx.sysid.identification.uncertainty import assess, most_contradicted
+from cfb_mjx.sysid.identification.solver import (
+    RIDGE,
+    Quadratic,
+    descended,
+    least_squares,
+    likelihood,
+    linearised,
+    surprise,
+    tempered,
+)
+from cfb_mjx.sysid.identification.uncertainty import Scores, assess, most_contradicted
 from cfb_mjx.sysid.identification.unknowns import GROUPS, OFFSETS, UNITS, Unknowns, at_the_border, choose
 
 ROUNDS = 8
@@ -113,14 +123,14 @@ def fit(
     if data.segments is None or data.rows < 100:
         names = ", ".join(log.name for log in logs)
         raise CfbError(f"{names}: too short a flight to fit; at least a second without a gap is needed.")
-    segments = _on_devices(data.segments, over)
+    segments = parts(data.segments, over)
     unknowns = choose(_playing(asked), nominal)
     vector, noise = unknowns.start, Noise.first(data)
     tried = [name for name in unknowns.names if name not in (*asked, "mass", "command_hold")]
-    if not (use_measured and bool(np.any(np.asarray(segments.measured)))):
+    if not (use_measured and bool(np.any(data.segments.measured))):
         tried = [name for name in tried if name not in NEED_ROTOR_SPEED]
     contradicted: list[str] = []
-    interval = float(np.median(np.asarray(segments.interval)[np.asarray(segments.interval) > 0]))
+    interval = float(np.median(data.segments.interval[data.segments.interval > 0]))
     while True:
         free = (*asked, *contradicted, "command_hold")
         ridge = jnp.asarray([1 / PRIORS.get(n, 1 / RIDGE) if n in free else HELD for n in unknowns.names])
@@ -137,12 +147,11 @@ def fit(
             timed = replace(unknowns, timed=jnp.ones(()))
             other = _settled(timed, vector, noise, segments, use_measured, robust, ridge, solver, progress)
             fits = (unknowns, vector, noise), (timed, *other)
-            free_hold, in_time = (float(_surprise(*each, segments, use_measured, robust)) for each in fits)
+            free_hold, in_time = (_surprise(*each, segments, use_measured, robust) for each in fits)
             if in_time <= free_hold:
                 unknowns, vector, noise = fits[1]
-        residual, jacobian = map(np.asarray, fit_slopes(unknowns, vector, noise, segments, use_measured, robust))
-        blocks = in_blocks(segments, residual, jacobian @ np.linalg.inv(unknowns.slope(vector)))
-        name = most_contradicted(*blocks, unknowns.names, free, [n for n in tried if n not in contradicted])
+        residual, scores = _scores(unknowns, vector, noise, segments, use_measured, robust)
+        name = most_contradicted(scores, unknowns.names, free, [n for n in tried if n not in contradicted])
         if name is None:
             break
         contradicted.append(name)
@@ -159,7 +168,7 @@ def fit(
     # Only where some commands were not logged, and nothing else says how fast the rotors turned.
     missing = 1 - min(max(float(not_none(unknowns.hold(vector))) / interval, 0.0), 1.0) ** 2
     blur *= (interval / 0.01) ** 2 * missing * (use_measured is False or not np.all(np.asarray(data.segments.measured)))
-    uncertainty = assess(blocks[0], blocks[1][..., columns], judged, priors, blur[columns])
+    uncertainty = assess(scores.columns(columns), judged, priors, blur[columns])
     axes = set(GROUPS["inertia"]) & set(fitted)
     # An axis that the flights cannot tell may have wandered to the border: they do not ask for that.
     asks = axes and not axes & set(uncertainty.names)
@@ -175,7 +184,7 @@ def fit(
         contradicted=tuple(contradicted),
         noise=noise,
         whiteness=dict(zip(CHANNELS, map(float, _lag_one(residual)), strict=True)),
-        feedback=detect(segments, residual),
+        feedback=detect(data.segments, residual),
     )
 
 
@@ -197,7 +206,7 @@ def _playing(asked: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _settled(
-    unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured, robust, ridge, solver, progress
+    unknowns: Unknowns, vector, noise: Noise, segments: list[Segments], use_measured, robust, ridge, solver, progress
 ) -> tuple[Array, Noise]:
     """Vector and noise levels of largest likelihood, found in turns."""
     for done in range(ROUNDS):
@@ -215,32 +224,54 @@ def _settled(
     return vector, noise
 
 
-def _on_devices(segments: Segments, over: Devices | None) -> Segments:
-    if over is None or not over.several:
-        return jax.tree.map(jnp.asarray, segments)
-    # What is added to divide evenly counts for nothing.
-    valid = np.concatenate([segments.valid, np.zeros((-len(segments.valid) % over.count, segments.valid.shape[1]))])
-    return eqx.tree_at(lambda s: s.valid, over.shared(segments), over.along(valid))
-
-
 def _at(unknowns: Unknowns, vector, segments: Segments) -> tuple[Parameters, Segments]:
     """The drone of a vector, and its commands as it says they acted."""
     parameters = unknowns.apply(vector)
     return parameters, as_held(parameters, unknowns.hold(vector), segments)
 
 
-@eqx.filter_jit
-def fit_noise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool) -> Noise:
-    """Noise levels of largest likelihood at ``vector``, from ``noise`` on."""
-    parameters, segments = _at(unknowns, vector, segments)
-    # The smoothed rotor speeds stay those of the last round's noise: the rotors' own readings say how noisy they are.
-    driven = drive(parameters, noise, segments, use_measured, robust)
+def _each(function: Callable, *pieces: Sequence) -> Iterator:
+    """Results of a compiled function of the parts of the data and what belongs to them, one after the other.
 
-    def predicted(levels):
-        error, variance = innovations(parameters, Noise.from_vector(levels), segments, driven, use_measured, robust)
+    All cores compute them, unless the parts are divided over devices.
+    """
+    several = any(piece.over is not None for piece in pieces[0])
+    along = zip(*pieces, strict=True)
+    return (function(*each) for each in along) if several else over_cores(lambda each: function(*each), along)
+
+
+def fit_noise(
+    unknowns: Unknowns, vector, noise: Noise, segments: Sequence[Segments], use_measured: bool, robust: bool
+) -> Noise:
+    """Noise levels of largest likelihood at ``vector``, from ``noise`` on; ``segments`` in `parts`."""
+    # The smoothed rotor speeds stay those of the last round's noise: the rotors' own readings say how noisy they are.
+    driven = list(_each(lambda part: _driven(unknowns, vector, noise, part, use_measured, robust), segments))
+
+    def about(levels):
+        return _each(
+            lambda part, own: _likelihood(levels, unknowns, vector, part, own, use_measured, robust), segments, driven
+        )
+
+    return Noise.from_vector(descended(about, noise.to_vector()))
+
+
+@eqx.filter_jit
+def _driven(unknowns: Unknowns, vector, noise: Noise, part: Segments, use_measured: bool, robust: bool) -> Drive:
+    parameters, part = _at(unknowns, vector, part)
+    return drive(parameters, noise, part, use_measured, robust)
+
+
+@eqx.filter_jit
+def _likelihood(
+    levels, unknowns: Unknowns, vector, part: Segments, driven: Drive, use_measured: bool, robust: bool
+) -> Quadratic:
+    parameters, part = _at(unknowns, vector, part)
+
+    def predicted(x):
+        error, variance = innovations(parameters, Noise.from_vector(x), part, driven, use_measured, robust)
         return error, jnp.log(variance)
 
-    return Noise.from_vector(most_likely(predicted, noise.to_vector(), robust))
+    return likelihood(predicted, levels, robust)
 
 
 def _residual(
@@ -256,33 +287,84 @@ def _residual(
     return tempered(whitened(parameters, noise, segments, use_measured, robust, weighed), robust)
 
 
+@eqx.filter_jit
 def _weights(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool) -> Weights:
     parameters, segments = _at(unknowns, vector, segments)
     return weights(parameters, noise, segments, use_measured, robust)
 
 
-@eqx.filter_jit
-def _surprise(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
+def _surprise(
+    unknowns: Unknowns, vector, noise: Noise, segments: Sequence[Segments], use_measured: bool, robust: bool
+) -> float:
     """Negative logarithm of the likelihood per row, of commands that are what `as_held` makes of them and no other."""
-    parameters, segments = _at(unknowns, vector, segments)
-    segments = eqx.tree_at(lambda s: s.doubt, segments, jnp.zeros_like(segments.doubt))
-    driven = drive(parameters, noise, segments, use_measured, robust)
-    error, variance = innovations(parameters, noise, segments, driven, use_measured, robust)
-    return 0.5 * jnp.sum(jnp.log(variance) + surprise(error / jnp.sqrt(variance), robust)) / jnp.sum(segments.valid)
+    found = list(_each(lambda part: _surprises(unknowns, vector, noise, part, use_measured, robust), segments))
+    return float(sum(nats for nats, _ in found)) / float(sum(rows for _, rows in found))
 
 
 @eqx.filter_jit
+def _surprises(unknowns: Unknowns, vector, noise: Noise, part: Segments, use_measured: bool, robust: bool):
+    parameters, part = _at(unknowns, vector, part)
+    part = eqx.tree_at(lambda s: s.doubt, part, jnp.zeros_like(part.doubt))
+    driven = drive(parameters, noise, part, use_measured, robust)
+    error, variance = innovations(parameters, noise, part, driven, use_measured, robust)
+    return 0.5 * jnp.sum(jnp.log(variance) + surprise(error / jnp.sqrt(variance), robust)), jnp.sum(part.valid)
+
+
 def _fit_vector(
-    unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool, ridge, solver=None
+    unknowns: Unknowns,
+    vector,
+    noise: Noise,
+    segments: Sequence[Segments],
+    use_measured: bool,
+    robust: bool,
+    ridge,
+    solver: optx.AbstractLeastSquaresSolver | None = None,
 ):
-    fixed = (noise, segments, use_measured, robust)
-    weighed = _weights(unknowns, vector, *fixed)
-    return least_squares(lambda x: _residual(x, unknowns, *fixed, weighed), vector, ridge, solver)
+    weighed = list(_each(lambda part: _weights(unknowns, vector, noise, part, use_measured, robust), segments))
+    if solver is not None:
+        return _solved(unknowns, vector, noise, list(segments), weighed, use_measured, robust, ridge, solver)
+
+    def about(x):
+        return _each(lambda part, own: _squares(x, unknowns, noise, part, own, use_measured, robust), segments, weighed)
+
+    return descended(about, vector, ridge)
+
+
+@eqx.filter_jit
+def _squares(
+    x, unknowns: Unknowns, noise: Noise, part: Segments, weighed: Weights, use_measured: bool, robust: bool
+) -> Quadratic:
+    return linearised(lambda x: _residual(x, unknowns, noise, part, use_measured, robust, weighed), x)
+
+
+@eqx.filter_jit
+def _solved(unknowns: Unknowns, vector, noise: Noise, segments, weighed, use_measured, robust, ridge, solver):
+    """The vector by a solver of optimistix, which needs all residuals at once."""
+
+    def residual(x):
+        pairs = zip(segments, weighed, strict=True)
+        return [_residual(x, unknowns, noise, part, use_measured, robust, own) for part, own in pairs]
+
+    return least_squares(residual, vector, ridge, solver)
+
+
+def _scores(
+    unknowns: Unknowns, vector, noise: Noise, segments: Sequence[Segments], use_measured: bool, robust: bool
+) -> tuple[np.ndarray, Scores]:
+    """Residuals (s, n, 8) of a fit, and its scores with respect to relative changes of the parameters."""
+    relative = np.linalg.inv(unknowns.slope(vector))
+
+    def one(part: Segments) -> tuple[np.ndarray, Scores]:
+        residual, jacobian = map(np.asarray, fit_slopes(unknowns, vector, noise, part, use_measured, robust))
+        return residual, Scores.of(*in_blocks(part, residual, jacobian @ relative))
+
+    residuals, scores = zip(*_each(one, segments), strict=True)
+    return np.concatenate(residuals), Scores.joined(scores)
 
 
 @eqx.filter_jit
 def fit_slopes(unknowns: Unknowns, vector, noise: Noise, segments: Segments, use_measured: bool, robust: bool):
-    """Residuals (s, n, 8) of the fit at ``vector``, and their derivatives (s, n, 8, k) by it."""
+    """Residuals (s, n, 8) of a part of the data at ``vector``, and their derivatives (s, n, 8, k) by it."""
 
     def residual(x):
         return _residual(x, unknowns, noise, segments, use_measured, robust)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -16,8 +17,9 @@ from cfb_mjx.model.state import AnyArray
 ROWS_PER_SEGMENT = 641
 """Long flights are cut into overlapping segments of this many rows, which are processed in parallel. With one shape for
 all flights, programs are compiled once and then come from the cache."""
-_COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-"""Numbers of segments to which the data are padded."""
+_COUNTS = (1, 2, 3, 4, 6, 8)
+"""Numbers of segments to which the data are padded. More segments are processed in parts of the largest number: few
+programs then serve flights of any length, and the numbers of a part fit into a core's cache."""
 
 
 class Segments(eqx.Module):
@@ -102,6 +104,20 @@ def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
         specific_force_noise=np.median([n[1] for n in noise], axis=0),
         rotor_speed_noise=float(np.median([n[2] for n in noise])),
     )
+
+
+def parts(segments: Segments, over: Devices | None = None) -> list[Segments]:
+    """Segments in parts of at most the largest of `_COUNTS`, as jax arrays, each divided over devices."""
+    found = []
+    for first in range(0, len(segments.valid), _COUNTS[-1]):
+        part = jax.tree.map(lambda x, f=first: x[f : f + _COUNTS[-1]], segments)
+        if over is None or not over.several:
+            found.append(jax.tree.map(jnp.asarray, part))
+            continue
+        # What is added to divide evenly counts for nothing.
+        valid = np.concatenate([part.valid, np.zeros((-len(part.valid) % over.count, part.valid.shape[1]))])
+        found.append(eqx.tree_at(lambda s: s.valid, over.shared(part), over.along(valid)))
+    return found
 
 
 def _padded(stacked: Segments) -> Segments:

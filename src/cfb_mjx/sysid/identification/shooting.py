@@ -38,7 +38,7 @@ from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.identification.flight_data import white_noise
 from cfb_mjx.sysid.identification.result import Fit, summarise
 from cfb_mjx.sysid.identification.solver import least_squares, tempered
-from cfb_mjx.sysid.identification.uncertainty import assess
+from cfb_mjx.sysid.identification.uncertainty import Scores, assess
 from cfb_mjx.sysid.identification.unknowns import Unknowns, choose
 from cfb_mjx.sysid.prediction import predict_one
 from cfb_mjx.sysid.windows import Windows, find_windows
@@ -262,7 +262,7 @@ def shoot(
     residual, jacobian = (np.concatenate([np.asarray(x) for x in parts]) for parts in (residual, jacobian))
     live = np.concatenate([np.asarray(batch.live) for batch in data]) > 0
     slope = np.linalg.inv(unknowns.slope(vector))
-    uncertainty = assess(residual[live], jacobian[live] @ slope, unknowns.names)
+    uncertainty = assess(Scores.of(residual[live], jacobian[live] @ slope), unknowns.names)
     return summarise(unknowns, vector, uncertainty, "shooting", int(live.sum()))
 
 

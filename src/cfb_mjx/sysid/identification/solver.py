@@ -10,12 +10,13 @@ Outliers, such as bad radio packets, are treated by Huber's loss or by a mixture
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -94,11 +95,8 @@ class Descent(NamedTuple):
         nothing = Quadratic(unknown, zero, jnp.eye(len(start), dtype=start.dtype))
         return cls(nothing, jnp.zeros_like(unknown), zero, unknown)
 
-    def advanced(
-        self, linearised: Callable[[Array], Quadratic], x: Float[Array, " k"]
-    ) -> tuple[Float[Array, " k"], Descent]:
-        """Try the step from ``x``: where it raises the cost (or makes it NaN) stay, and damp the next one."""
-        there = linearised(x + self.step)
+    def advanced(self, there: Quadratic, x: Float[Array, " k"]) -> tuple[Float[Array, " k"], Descent]:
+        """Take the step from ``x`` to ``there``: if that raises the cost (or makes it NaN) stay, and damp the next."""
         better = there.cost <= self.here.cost
         here = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, self.here)
         eased = jnp.where(self.damping > FIRST_DAMPING, 0.1 * self.damping, 0.0)
@@ -142,7 +140,8 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
 
     def step(self, fn, y, args, options, state, tags) -> tuple[Array, _State, Any]:
         """Linearise at the proposed point, accept it or not, propose another."""
-        y, descent = state.descent.advanced(lambda x: _linearised(lambda x: fn(x, args)[0], x), y)
+        there = linearised(lambda x: fn(x, args)[0], y + state.descent.step)
+        y, descent = state.descent.advanced(there, y)
         return y, _State(descent, state.aux), state.aux
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
@@ -180,7 +179,8 @@ def least_squares(
     return optx.least_squares(with_prior, solver, start).value
 
 
-def _linearised(residual: Callable[[Array], PyTree], x: Float[Array, " k"]) -> Quadratic:
+def linearised(residual: Callable[[Array], PyTree], x: Float[Array, " k"]) -> Quadratic:
+    """The sum of squares of a residual about ``x``, to be used within a compiled function."""
     values, slopes = _slopes(residual, x)
     cost, slope, curvature = jnp.zeros_like(x[0]), jnp.zeros_like(x), jnp.zeros((len(x), len(x)), x.dtype)
     for value, part in zip(jax.tree.leaves(values), jax.tree.leaves(slopes), strict=True):
@@ -189,10 +189,12 @@ def _linearised(residual: Callable[[Array], PyTree], x: Float[Array, " k"]) -> Q
     return Quadratic(cost, slope, curvature)
 
 
-def most_likely(
-    predicted: Callable[[Array], tuple[Array, Array]], start: Float[Array, " k"], robust: bool, ridge: float = RIDGE
-) -> Float[Array, " k"]:
-    """The maximum of a Gaussian likelihood whose variances move too, from ``start``: Fisher's scoring.
+def likelihood(
+    predicted: Callable[[Array], tuple[Array, Array]],
+    x: Float[Array, " k"],
+    robust: bool,
+) -> Quadratic:
+    """Minus the logarithm of a Gaussian likelihood whose variances move too, about ``x``: Fisher's scoring.
 
     ``predicted`` gives errors and the logarithms of their variances. A level that hardly counts has next to no slope;
     the expected curvature, which vanishes faster, still leads back from there, where a line search would stay. (BFGS,
@@ -202,28 +204,49 @@ def most_likely(
     def surprising(whitened):
         return jnp.sum(surprise(whitened, robust))
 
-    def linearised(x):
-        (error, log_variance), (moved, spread) = _slopes(predicted, x)
-        weight = jnp.exp(-0.5 * log_variance)
-        whitened = (error * weight).ravel()
-        moved, spread = (moved * weight).reshape(len(x), -1), spread.reshape(len(x), -1)
-        surprised, pull = jax.value_and_grad(surprising)(whitened)
-        cost, slope, curvature = _prior(ridge, x)
-        return Quadratic(
-            cost + jnp.sum(log_variance) + surprised,
-            slope + 0.5 * (jnp.sum(spread, axis=1) + (moved - 0.5 * whitened * spread) @ pull),
-            curvature + moved @ moved.T + 0.5 * spread @ spread.T,
-        )
+    (error, log_variance), (moved, spread) = _slopes(predicted, x)
+    weight = jnp.exp(-0.5 * log_variance)
+    whitened = (error * weight).ravel()
+    moved, spread = (moved * weight).reshape(len(x), -1), spread.reshape(len(x), -1)
+    surprised, pull = jax.value_and_grad(surprising)(whitened)
+    return Quadratic(
+        jnp.sum(log_variance) + surprised,
+        0.5 * (jnp.sum(spread, axis=1) + (moved - 0.5 * whitened * spread) @ pull),
+        moved @ moved.T + 0.5 * spread @ spread.T,
+    )
 
-    def advance(carry):
-        x, descent, done = carry
-        return *descent.advanced(linearised, x), done + 1
 
-    def unsettled(carry):
-        return (carry[2] < MAX_STEPS) & carry[1].going_on
+def descended(
+    about: Callable[[Array], Iterable[Quadratic]], start: Float[Array, " k"], ridge: Float[Array, " k"] | float = RIDGE
+) -> Float[Array, " k"]:
+    """The minimum of a sum of costs, from ``start``.
 
-    x, descent, _ = jax.lax.while_loop(unsettled, advance, (start, Descent.first(start), 0))
+    The parts are compiled and the loop is not, so that neither memory nor the number of programs grows with the data.
+
+    Args:
+        about: linearises the cost of every part of the data.
+        start: where to begin.
+        ridge: as for `least_squares`.
+    """
+    x, descent = start, Descent.first(start)
+    for _ in range(MAX_STEPS):
+        if not descent.going_on:
+            break
+        parts = jax.tree.map(lambda *terms: jnp.asarray(np.sum(terms, axis=0)), *map(_fetched, about(x + descent.step)))
+        x, descent = _tried(descent, parts, x, ridge)
     return descent.ended(x)
+
+
+def _fetched(quadratic: Quadratic) -> Quadratic:
+    return jax.tree.map(np.asarray, quadratic)
+
+
+@eqx.filter_jit
+def _tried(descent: Descent, data: Quadratic, x, ridge):
+    prior = jnp.broadcast_to(jnp.asarray(ridge) ** 2, x.shape)
+    there = x + descent.step
+    own = Quadratic(there @ (prior * there), prior * there, jnp.diag(prior))
+    return descent.advanced(jax.tree.map(jnp.add, data, own), x)
 
 
 def _slopes(function, x):
@@ -233,8 +256,3 @@ def _slopes(function, x):
         return jax.jvp(function, (x,), (direction,))
 
     return jax.vmap(both, out_axes=(None, 0))(jnp.eye(len(x), dtype=x.dtype))
-
-
-def _prior(ridge, x):
-    prior = jnp.broadcast_to(jnp.asarray(ridge) ** 2, x.shape)
-    return x @ (prior * x), prior * x, jnp.diag(prior)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -43,13 +46,47 @@ class Uncertainty:
         return np.sqrt(np.diag(self.covariance))
 
 
+class Scores(NamedTuple):
+    """What the uncertainty of a fit needs of residuals and Jacobians in B blocks of rows, which need not be kept."""
+
+    information: np.ndarray
+    """(B, k, k) sums of products of derivatives over each block."""
+    gradient: np.ndarray
+    """(B, k) sums of derivatives times residuals over each block."""
+    triangle: np.ndarray
+    """(k, k) R of the QR decomposition of all derivatives."""
+
+    @classmethod
+    def of(cls, residual: np.ndarray, jacobian: np.ndarray) -> Scores:
+        """Sum whitened residuals (B, ...) and their derivatives (B, ..., k)."""
+        blocks, k = len(residual), jacobian.shape[-1]
+        # Not -1, because there may be no block in which anything counts.
+        rows = math.prod(residual.shape[1:])
+        residual, jacobian = residual.reshape(blocks, rows), jacobian.reshape(blocks, rows, k)
+        turned = np.swapaxes(jacobian, 1, 2)
+        return cls(turned @ jacobian, (turned @ residual[..., None])[..., 0], _triangle(jacobian.reshape(-1, k)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Scores]) -> Scores:
+        """The scores of several parts of the data."""
+        information, gradient, triangle = (np.concatenate(x) for x in zip(*parts, strict=True))
+        return cls(information, gradient, _triangle(triangle))
+
+    def columns(self, chosen: list[int]) -> Scores:
+        """The scores of some of the quantities."""
+        return Scores(self.information[:, chosen][..., chosen], self.gradient[:, chosen], self.triangle[:, chosen])
+
+
+def _triangle(rows: np.ndarray) -> np.ndarray:
+    return np.asarray(np.linalg.qr(rows, mode="r"))
+
+
 CLEAR = 4.0
 """A fixed value is contradicted if a fit would move it by at least this many of its standard deviations."""
 
 
 def assess(
-    residual: np.ndarray,
-    jacobian: np.ndarray,
+    scores: Scores,
     names: tuple[str, ...],
     priors: dict[str, float] | None = None,
     blur: np.ndarray | float = 0.0,
@@ -61,24 +98,22 @@ def assess(
     larger: the bootstrap accounts for correlation within blocks and for an imperfect noise model.
 
     Args:
-        residual: (blocks, ...) whitened; the first axis is what the bootstrap resamples.
-        jacobian: (blocks, ..., k) its derivatives with respect to relative changes of the quantities.
+        scores: of the derivatives with respect to relative changes of the quantities. The blocks are what the bootstrap
+            resamples.
         names: of the k quantities.
         priors: standard deviations of normal priors about the optimum, by name.
         blur: (k,) standard deviations that are added and do not decrease with more data.
         bootstraps: number of resamples of the blocks.
     """
     k = len(names)
-    residual, jacobian = residual.reshape(len(residual), -1), jacobian.reshape(len(residual), -1, k)
-    flat = jacobian.reshape(-1, k)
     known = np.diag([1 / (priors or {}).get(name, np.inf) for name in names])
     # QR first: the SVD of the small triangle has the same singular values without squaring the condition number.
-    triangle = np.linalg.qr(np.concatenate([flat, known]), mode="r")
+    triangle = _triangle(np.concatenate([scores.triangle, known]))
     _, singular, rows = np.linalg.svd(triangle)
     loose = singular < max(1 / LOOSEST, 1e-7 * singular[0])
     keep = rows[~loose].T
     covariance = keep @ np.diag(singular[~loose] ** -2.0) @ keep.T
-    covariance = np.maximum(1.0, _inflation(jacobian, residual, known**2, keep, covariance, bootstraps)) * covariance
+    covariance = np.maximum(1.0, _inflation(scores, known**2, keep, covariance, bootstraps)) * covariance
     covariance = covariance + np.diag(np.broadcast_to(blur, k) ** 2)
     deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     free = [row for row, is_loose in zip(rows, loose, strict=True) if is_loose]
@@ -91,25 +126,19 @@ def assess(
     return Uncertainty(covariance, correlation, free, moved, [_told(p) for p, _ in products], names, products)
 
 
-def most_contradicted(
-    residual: np.ndarray, jacobian: np.ndarray, names: tuple[str, ...], free: tuple[str, ...], held: list[str]
-) -> str | None:
+def most_contradicted(scores: Scores, names: tuple[str, ...], free: tuple[str, ...], held: list[str]) -> str | None:
     """Name of the fixed quantity whose value the data contradict most, if by `CLEAR` standard deviations or more.
 
     A score test (Rao 1948) of each fixed quantity alone, with all free quantities adjusting to it. The variance of the
     score is the larger of the model's and that of the scatter between blocks.
 
     Args:
-        residual: (blocks, ...) whitened, at the optimum of the free quantities.
-        jacobian: (blocks, ..., k) its derivatives.
+        scores: at the optimum of the free quantities.
         names: of the k quantities.
         free: names of the quantities that were fitted.
         held: names of the fixed quantities to test.
     """
-    k = len(names)
-    residual, jacobian = residual.reshape(len(residual), -1), jacobian.reshape(len(residual), -1, k)
-    information = np.einsum("bni,bnj->ij", jacobian, jacobian)
-    gradient = np.einsum("bni,bn->bi", jacobian, residual)
+    information, gradient = scores.information.sum(axis=0), scores.gradient
     columns = [names.index(name) for name in free]
     following = np.linalg.lstsq(information[np.ix_(columns, columns)], information[columns], rcond=1e-9)[0]
     strongest, found = CLEAR, None
@@ -118,20 +147,19 @@ def most_contradicted(
         left = information[i, i] - information[i, columns] @ following[:, i]
         if left < max(1 / LOOSEST**2, 1e-7 * information[i, i]):
             continue  # not distinguishable from the free quantities
-        scores = gradient[:, i] - gradient[:, columns] @ following[:, i]
-        z = abs(scores.sum()) / np.sqrt(max(left, len(scores) * np.var(scores)))
+        each = gradient[:, i] - gradient[:, columns] @ following[:, i]
+        z = abs(each.sum()) / np.sqrt(max(left, len(each) * np.var(each)))
         if z > strongest:
             strongest, found = z, name
     return found
 
 
-def _inflation(jacobian, residual, known, keep, covariance, bootstraps) -> np.ndarray:
+def _inflation(scores: Scores, known, keep, covariance, bootstraps) -> np.ndarray:
     """Factors (k, k) that widen the model's covariance to that of the block bootstrap; at least 1."""
-    blocks, k = jacobian.shape[0], jacobian.shape[2]
+    blocks, k = scores.gradient.shape
     if blocks < 8 or keep.shape[1] == 0:
         return np.ones((k, k))
-    information = np.einsum("bni,bnj->bij", jacobian, jacobian)
-    gradient = np.einsum("bni,bn->bi", jacobian, residual)
+    information, gradient = scores.information, scores.gradient
     rng = np.random.default_rng(0)
     draws = rng.integers(0, blocks, (bootstraps, blocks))
     moves = []

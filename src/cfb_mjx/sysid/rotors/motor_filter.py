@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.logs.bench_tables import MotorRecord
 from cfb_mjx.model.state import AnyArray
 from cfb_mjx.sysid.identification.flight_data import white_noise
-from cfb_mjx.sysid.identification.uncertainty import Uncertainty, assess
+from cfb_mjx.sysid.identification.uncertainty import Scores, Uncertainty, assess
 
 ROWS = 512
 """Rows per piece. As the number of pieces is rounded up to a power of two, most fits share one compiled program."""
@@ -469,7 +469,7 @@ def _judge(data, tracks, names, basis, vector, loss) -> Optimum:
     residual, jacobian = error / root, (slope / root[..., None]) @ basis * grain * judged[..., None]
     used = judged.reshape(-1, BLOCK).any(axis=1)
     jacobian_blocks = jacobian.reshape(-1, BLOCK, len(names))[used]
-    uncertainty = assess(residual.reshape(-1, BLOCK)[used], jacobian_blocks, names)
+    uncertainty = assess(Scores.of(residual.reshape(-1, BLOCK)[used], jacobian_blocks), names)
     flat = jacobian_blocks.reshape(-1, len(names))
     plain = np.sqrt(np.maximum(np.diag(np.linalg.pinv(flat.T @ flat)), 1e-300))
     white = [row[mask > 0] for row, mask in zip(residual, judged, strict=True)]

@@ -9,7 +9,7 @@ The filters are linear, so the derivative of a residual with respect to a parame
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import islice
+from itertools import groupby, islice
 from typing import NamedTuple
 
 import equinox as eqx
@@ -30,7 +30,16 @@ from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.flight import ROWS, Flight, lengthened
 from cfb_mjx.sysid.identification.flight_data import white_noise
-from cfb_mjx.sysid.replay import Lane, Replay, between, replays, smoothed_rotor_speed, speeds_along
+from cfb_mjx.sysid.replay import (
+    MOST,
+    Lane,
+    Replay,
+    between,
+    replays,
+    replays_in_pieces,
+    smoothed_rotor_speed,
+    speeds_along,
+)
 
 CHANNELS = 10
 DOMAINS = {"rotor_speed": range(6, 10), "force": (*range(3, 6), *range(10, 13)), "torque": range(3)}
@@ -69,12 +78,13 @@ def predicted(flight: Flight, said: Replay, gravity: float) -> Signals:
     """Sensor readings that a model predicts, integrated from its accelerations; constant offsets have no meaning.
 
     Args:
-        flight: n rows.
-        said: replay of the model; or of several models, along leading axes.
+        flight: n rows, or one more.
+        said: replay (n rows) of the model; or of several models, along leading axes.
         gravity: m/s^2; zero for an increment to other accelerations.
     """
-    dt = flight.interval[:, None]
-    middle = between(flight.quaternion)
+    count = said.rotor_speed.shape[-2]
+    dt = flight.interval[:count, None]
+    middle = between(flight.quaternion)[:count]
     middle = middle / np.linalg.norm(middle, axis=1, keepdims=True)
     world = to_world(np.asarray(middle), np.asarray(said.specific_force))
     up = np.array([0.0, 0.0, gravity])
@@ -292,9 +302,41 @@ class Moved(NamedTuple):
     """Size of the step, in the parameter's unit."""
 
 
+class Piece(NamedTuple):
+    """Some blocks of a flight."""
+
+    flight: Flight
+    """Their rows."""
+    ahead: Flight
+    """The same rows and the one after them, which counts for nothing; at the flight's end, the same rows."""
+    driven: np.ndarray
+    """Rotor speeds that drive the body in the rows of ``ahead``, rad/s."""
+    signals: Signals | None = None
+    """The residual and its derivatives, side by side along the last axis (c)."""
+
+
+PIECE = 14
+"""Number of blocks of a piece. With one row more it is a length of `lengthened`."""
+
+
+def pieces(flight: Flight, driven: np.ndarray) -> Iterator[Piece]:
+    """Cut a flight into pieces of `PIECE` blocks."""
+    count = len(flight.time)
+    for first in range(0, count, PIECE * ROWS):
+        last = min(first + PIECE * ROWS, count)
+        own, ahead = (_rows_of(flight, first, end) for end in (last, last + 1))
+        counts = np.arange(len(ahead.time)) < last - first
+        ahead = eqx.tree_at(lambda f: f.valid, ahead, ahead.valid * counts)
+        yield Piece(own, ahead, driven[first : last + 1])
+
+
+def _rows_of(flight: Flight, first: int, last: int) -> Flight:
+    return jax.tree.map(lambda x: x[first:last] if np.ndim(x) else x, flight)
+
+
 def with_slopes(
     model: Quadrotor, lead: float, moves: Sequence[Moved], flights: Sequence[Flight], driven: Sequence[np.ndarray]
-) -> Iterator[Signals]:
+) -> Iterator[Piece]:
     """Residual of each flight and its finite-difference derivatives, side by side along the last axis (c).
 
     Args:
@@ -305,31 +347,39 @@ def with_slopes(
         driven: rotor speeds of each flight, from `driven_by`.
 
     Returns:
-        Iterator over flights. Column 0 is the residual; the others are the change of the model's prediction per unit
-        of each parameter.
+        Iterator over flights; those that would need much memory come in pieces. Column 0 is the residual; the others
+        are the change of the model's prediction per unit of each parameter.
     """
-    steps = np.array([move.step for move in moves])
 
-    def lanes() -> Iterator[Lane]:
-        for flight, speed in zip(flights, driven, strict=True):
-            yield Lane(flight, speed, lead, model.effects)
-            slope = np.gradient(speed, axis=0) / np.maximum(np.gradient(flight.time), 1e-4)[:, None]
-            # Late commands and late rotor speeds agree with each other; only the body's motion is then early.
-            row = np.sum(flight.interval) / max(np.count_nonzero(flight.interval > 0), 1)
-            for move in moves:
-                late, early = flight.measured * move.shift, (1 - flight.measured) * move.shift / row
-                yield Lane(flight, speed + late * slope if late else speed, move.lead + early, move.effects)
+    def lanes(flight: Flight, speed: np.ndarray) -> Iterator[Lane]:
+        yield Lane(flight, speed, lead, model.effects)
+        slope = np.gradient(speed, axis=0) / np.maximum(np.gradient(flight.time), 1e-4)[:, None]
+        # Late commands and late rotor speeds agree with each other; only the body's motion is then early.
+        row = np.sum(flight.interval) / max(np.count_nonzero(flight.interval > 0), 1)
+        for move in moves:
+            late, early = flight.measured * move.shift, (1 - flight.measured) * move.shift / row
+            yield Lane(flight, speed + late * slope if late else speed, move.lead + early, move.effects)
 
-    said = replays(model, lanes())
-    for flight in flights:
-        stacked = Replay(*(np.stack(x) for x in zip(*islice(said, 1 + len(moves)), strict=True)))
-        found = []
+    def sloped(piece: Piece, said: Replay) -> Piece:
+        found, steps = [], np.array([move.step for move in moves])
         for seen, told in zip(
-            measured(flight), predicted(flight, stacked, float(model.parameters.gravity)), strict=True
+            measured(piece.flight), predicted(piece.ahead, said, float(model.parameters.gravity)), strict=True
         ):
             slopes = (told[1:] - told[:1]) / steps[:, None, None]
             found.append(np.moveaxis(np.concatenate([(seen - told[0])[None], slopes]), 0, -1))
-        yield Signals(*found)
+        return piece._replace(signals=Signals(*found))
+
+    count = 1 + len(moves)
+    for long, some in groupby(zip(flights, driven, strict=True), lambda pair: count * len(pair[0].time) > MOST):
+        if long:
+            for pair in some:
+                yield from map(sloped, pieces(*pair), replays_in_pieces(model, list(lanes(*pair)), PIECE))
+            continue
+        pairs = list(some)
+        every = replays(model, (lane for pair in pairs for lane in lanes(*pair)))
+        for flight, speed in pairs:
+            said = Replay(*(np.stack(x) for x in zip(*islice(every, count), strict=True)))
+            yield sloped(Piece(flight, flight, speed), said)
 
 
 def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, Condition]:
@@ -342,25 +392,26 @@ def _seen(model: Quadrotor, flight: Flight, driven: Array) -> tuple[Parameters, 
 
 def term_squares(model: Quadrotor, flight: Flight, driven: np.ndarray) -> Float[np.ndarray, " c"]:
     """Mean squares of the signals of the formula library over a flight: body terms, then places."""
-    return np.asarray(_term_squares(model, *lengthened(flight, driven)))
+    each = [_term_squares(model, *lengthened(piece.ahead, piece.driven)) for piece in pieces(flight, driven)]
+    return np.sum(each, axis=0) / max(np.sum(flight.valid), 1.0)
 
 
 @eqx.filter_jit
 def _term_squares(model: Quadrotor, flight: Flight, driven: Array) -> Array:
     _, seen = _seen(model, flight, driven)
     signals = jnp.stack([*body_signals(seen), *place_signals(seen)], axis=-1)
-    return jnp.asarray(flight.valid) @ signals**2 / jnp.maximum(jnp.sum(flight.valid), 1.0)
+    return jnp.asarray(flight.valid) @ signals**2
 
 
-def term_slopes(model: Quadrotor, flight: Flight, driven: np.ndarray, axis: int) -> Signals:
+def term_slopes(model: Quadrotor, piece: Piece, axis: int) -> Signals:
     """Predicted signals of each term of the formula library (c: body terms, then places) along one axis (0 to 5).
 
     They equal the derivatives with respect to the coefficients of a `ResidualFormula`, but need no replay of the model
     for every term, because a wrench on the body does not affect the rotors.
     """
-    found = _term_accelerations(model, *lengthened(flight, driven), jnp.asarray(axis))
-    spin, push = (np.asarray(x)[:, : len(flight.time)] for x in found)
-    told = predicted(flight, Replay(np.zeros((*spin.shape[:2], 4)), spin, push), 0.0)
+    found = _term_accelerations(model, *lengthened(piece.ahead, piece.driven), jnp.asarray(axis))
+    spin, push = (np.asarray(x)[:, : len(piece.flight.time)] for x in found)
+    told = predicted(piece.ahead, Replay(np.zeros((*spin.shape[:2], 4)), spin, push), 0.0)
     return Signals(*(np.moveaxis(x, 0, -1) for x in told))
 
 

@@ -17,8 +17,9 @@ import numpy as np
 
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.effects import CATALOGUE, Effect
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.flight import Flight, prepare_flight
+from cfb_mjx.sysid.flight import ROWS, Flight, prepare_flight
 from cfb_mjx.sysid.sensor_faults import SensorFaults
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, covariance, dealt, evidence, solve
 from cfb_mjx.sysid.tracing.hypothesis import (
@@ -47,6 +48,7 @@ from cfb_mjx.sysid.tracing.innovations import (
     DOMAINS,
     SIDE_BY_SIDE,
     Blocks,
+    Piece,
     Signals,
     cut,
     driven_by,
@@ -207,24 +209,22 @@ class Search:
     def linearise(self, hypothesis: Hypothesis, wanted: list[Column]) -> Linear:
         """Linearise the residual at a hypothesis, with respect to the command lead and the ``wanted`` columns."""
         columns = [lead_column(), *wanted]
-        return self._linear(hypothesis, columns, self._slopes(hypothesis, columns))
+        pools = _pooled(self._slopes(hypothesis, columns))
+        return self._linear(hypothesis, columns, [self._products(hypothesis, pool) for pool in pools])
 
     def linearise_terms(self, hypothesis: Hypothesis, own: list[Column]) -> list[Linear]:
         """`linearise` with respect to ``own`` and the library of formula terms, for each axis of `formula.AXES`."""
         model, driven = hypothesis.model(self.parameters), self._driven(hypothesis)
         flights, columns = self.flights(hypothesis), [lead_column(), *own]
-        beside = list(self._slopes(hypothesis, columns, driven))
         squares = [term_squares(model, *pair) for pair in zip(flights, driven, strict=True)]
         sizes = np.sqrt(np.mean(squares, axis=0))
-        found = []
-        for axis in range(6):
-            terms = (term_slopes(model, *pair, axis) for pair in zip(flights, driven, strict=True))
-            signals = (
-                Signals(*(np.concatenate(pair, axis=-1) for pair in zip(some, more, strict=True)))
-                for some, more in zip(beside, terms, strict=True)
-            )
-            found.append(self._linear(hypothesis, columns + term_columns(axis, sizes), signals))
-        return found
+        found: list[list[np.ndarray]] = [[] for _ in range(6)]
+        for pool in _pooled(self._slopes(hypothesis, columns, driven)):
+            for axis, products in enumerate(found):
+                found_here = [_beside(piece, term_slopes(model, piece, axis)) for piece in pool]
+                products.append(self._products(hypothesis, found_here))
+        every = [columns + term_columns(axis, sizes) for axis in range(6)]
+        return [self._linear(hypothesis, *pair) for pair in zip(every, found, strict=True)]
 
     def _driven(self, hypothesis: Hypothesis) -> list[np.ndarray]:
         kept = self._kept(hypothesis)
@@ -232,19 +232,15 @@ class Search:
             return [driven for _, driven in kept]
         return driven_by(hypothesis.model(self.parameters), self.flights(hypothesis), hypothesis.lead)
 
-    def _linear(self, hypothesis: Hypothesis, columns: list[Column], signals: Iterable[Signals]) -> Linear:
+    def _products(self, hypothesis: Hypothesis, pool: list[Piece]) -> np.ndarray:
+        """Inner products of the columns in every block of some pieces of flights."""
         levels = levels_from(jnp.asarray(hypothesis.levels), self.noise)
-        found, waiting, counts = [], [], []
-        for pair in zip(self.flights(hypothesis), signals, strict=True):
-            waiting.append(self._looked_at(cut(*pair)))
-            counts.append(len(waiting[-1].interval))
-            # Pool short flights to fill the fixed batch that is whitened at once.
-            if sum(len(blocks.interval) for blocks in waiting) >= SIDE_BY_SIDE[0]:
-                found.append(inner_products(joined(waiting), levels))
-                waiting = []
-        if waiting:
-            found.append(inner_products(joined(waiting), levels))
-        return Linear(columns, np.concatenate(found), dealt(counts))
+        blocks = joined(self._looked_at(cut(piece.flight, not_none(piece.signals))) for piece in pool)
+        return inner_products(blocks, levels)
+
+    def _linear(self, hypothesis: Hypothesis, columns: list[Column], products: list[np.ndarray]) -> Linear:
+        counts = [len(flight.time) // ROWS for flight in self.flights(hypothesis)]
+        return Linear(columns, np.concatenate(products), dealt(counts))
 
     def _looked_at(self, blocks: Blocks) -> Blocks:
         """The blocks with the channels that this search ignores marked as invalid."""
@@ -254,8 +250,8 @@ class Search:
 
     def _slopes(
         self, hypothesis: Hypothesis, columns: list[Column], driven: list[np.ndarray] | None = None
-    ) -> Iterator[Signals]:
-        """Residual and its derivatives with respect to ``columns``, for every flight."""
+    ) -> Iterator[Piece]:
+        """Residual and its derivatives with respect to ``columns``, for every flight or piece of a long one."""
         changes = moves(hypothesis.effects, hypothesis.lead, columns, set(hypothesis.present))
         driven = self._driven(hypothesis) if driven is None else driven
         model, flights = hypothesis.model(self.parameters), self.flights(hypothesis)
@@ -404,6 +400,24 @@ class Search:
         for column, value in zip(variant, found.values, strict=True):
             effect = moved(effect, column, float(value) * column.scale, False)
         return hypothesis.having(effect)
+
+
+def _pooled(pieces: Iterable[Piece]) -> Iterator[list[Piece]]:
+    """Pool short flights to fill the fixed batch that is whitened at once."""
+    waiting: list[Piece] = []
+    for piece in pieces:
+        waiting.append(piece)
+        if sum(len(each.flight.time) for each in waiting) >= SIDE_BY_SIDE[0] * ROWS:
+            yield waiting
+            waiting = []
+    if waiting:
+        yield waiting
+
+
+def _beside(piece: Piece, more: Signals) -> Piece:
+    """A piece with more columns."""
+    pairs = zip(not_none(piece.signals), more, strict=True)
+    return piece._replace(signals=Signals(*(np.concatenate(pair, axis=-1) for pair in pairs)))
 
 
 def _alike(a: Hypothesis, b: Hypothesis) -> bool:

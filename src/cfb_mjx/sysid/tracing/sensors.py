@@ -113,10 +113,11 @@ def compare_sensors(log: FlightLog, delay: float, gyro_delay: float, gravity: fl
 
 def _covered(log: FlightLog, grid: np.ndarray) -> np.ndarray:
     """Whether each instant lies outside all gaps."""
-    inside = np.ones(len(grid), dtype=bool)
-    for i in log.gaps():
-        inside &= ~((grid > log.time[i] - 0.02) & (grid < log.time[i + 1] + 0.02))
-    return inside
+    gaps = log.gaps()
+    edges = np.zeros(len(grid) + 1, dtype=int)
+    np.add.at(edges, np.searchsorted(grid, log.time[gaps] - 0.02, side="right"), 1)
+    np.add.at(edges, np.searchsorted(grid, log.time[gaps + 1] + 0.02), -1)
+    return np.cumsum(edges[:-1]) == 0
 
 
 def _spans(covered: np.ndarray, rows: int, margin: float, step: float) -> np.ndarray:
