@@ -7,6 +7,7 @@ a batch pass through one long loop, which a CPU computes sixteen at a time.
 from __future__ import annotations
 
 import math
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +30,9 @@ def normal(key: PRNGKeyArray, shape: tuple[int, ...] = (), dtype=jnp.float32) ->
         dtype: floating dtype.
     """
     raw = jnp.issubdtype(key.dtype, jnp.uint32) and key.shape == (2,)
-    threefry = jax.config.jax_default_prng_impl == "threefry2x32" and jax.config.jax_threefry_partitionable
+    # jax adds these as it loads.
+    settings = cast(Any, jax.config)
+    threefry = settings.jax_default_prng_impl == "threefry2x32" and settings.jax_threefry_partitionable
     if not (raw and threefry and jnp.dtype(dtype) == jnp.float32 and jax.default_backend() == "cpu"):
         return jax.random.normal(key, shape, dtype)
     count = math.prod(shape)

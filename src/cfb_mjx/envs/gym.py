@@ -30,6 +30,7 @@ from cfb_mjx.envs.task import Task, with_room
 from cfb_mjx.errors import CfbError
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.model.randomised import require_possible
+from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import SPECIFICATIONS
 
 try:
@@ -186,7 +187,8 @@ class TargetVectorEnv(VectorEnv):
         self.single_observation_space, self.single_action_space = _spaces(self.task)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._keys = self._episodes = None
+        self._keys: Array | None = None
+        self._episodes: Leaves | None = None
         self._over = np.zeros(num_envs, bool)
         # In a forked process raise in reset: Gymnasium reports errors of a reset to the parent, not errors of this.
         if _cut_off:
@@ -258,7 +260,7 @@ class TargetVectorEnv(VectorEnv):
         """
         if (which & self._taken).any():
             self._redraw()
-        self._episodes, shown = self._programs.begin(which, self._waiting, self._episodes)
+        self._episodes, shown = self._programs.begin(which, self._waiting, not_none(self._episodes))
         self._taken, self._over = self._taken | which, self._over & ~which
         return shown
 
@@ -272,7 +274,7 @@ class TargetVectorEnv(VectorEnv):
             which[some], places[some] = True, np.arange(len(some))
             padded = np.concatenate([some, np.full(block - len(some), some[0])])
             self._keys, self._waiting = self._programs.redraw(
-                self.nominal, self._keys, self._waiting, which, padded, places
+                self.nominal, not_none(self._keys), self._waiting, which, padded, places
             )
         self._taken = np.zeros(self.num_envs, bool)
 
@@ -292,7 +294,7 @@ class TargetVectorEnv(VectorEnv):
             raise NotReset(f"{who}: call reset before step{over}.")
         actions = _checked(actions, (self.num_envs, 4), who)
         self._episodes, outcome, before, shown = self._programs.fly(
-            self._episodes, self._waiting, ~self._taken, anew, actions
+            not_none(self._episodes), self._waiting, ~self._taken, anew, actions
         )
         # If the last step ended an episode, this one begins the next, and its action is ignored.
         failed = np.asarray(outcome.failed) & ~anew

@@ -58,8 +58,8 @@ class MujocoBody:
         model = self.mujoco_model
         if model.nq != 7 or model.nmocap or model.nu:
             raise CfbError(
-                f"{self.mjcf}: other bodies than the drone move in this MJCF, or it has actuators; use Scene for such a "
-                "world."
+                f"{self.mjcf}: other bodies than the drone move in this MJCF, or it has actuators; use Scene for such "
+                "a world."
             )
         self.around = surroundings(self.mujoco_model)
 
