@@ -103,3 +103,27 @@ def test_it_finds_the_most_likely_noise(start, robust):
     found = np.asarray(descended(lambda x: [likelihood(noisy, x, robust)], jnp.asarray(start)))
     assert float(cost(found)) - theirs.fun < 1e-4
     assert found == pytest.approx(theirs.x, abs=2e-3)
+
+
+def test_a_level_that_falls_to_its_bound_holds_up_no_other():
+    """The readings have less noise than the bound of one level; the others were damped with it, for ever."""
+
+    def quiet(x):
+        bound, level = jnp.exp(x[0]) + 0.4, jnp.exp(x[1])
+        return ERRORS, jnp.log(bound**2 + level**2 * (0.1 + TIME) ** 2)
+
+    def cost(x):
+        error, log_variance = quiet(x)
+        return jnp.sum(log_variance + error**2 * jnp.exp(-log_variance)) + jnp.sum((RIDGE * x) ** 2)
+
+    tried = []
+
+    def about(x):
+        tried.append(x)
+        return [likelihood(quiet, x, False)]
+
+    found = np.asarray(descended(about, jnp.array([3.0, 3.0]), levels=True))
+    theirs = minimize(jax.jit(cost), found, jac=jax.jit(jax.grad(cost)), tol=1e-10)
+    assert float(cost(found)) - theirs.fun < 1e-4
+    assert found[0] < -2
+    assert len(tried) < 25

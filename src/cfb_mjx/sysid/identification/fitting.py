@@ -252,7 +252,7 @@ def fit_noise(
             lambda part, own: _likelihood(levels, unknowns, vector, part, own, use_measured, robust), segments, driven
         )
 
-    return Noise.from_vector(descended(about, noise.to_vector()))
+    return Noise.from_vector(descended(about, noise.to_vector(), levels=True))
 
 
 @eqx.filter_jit

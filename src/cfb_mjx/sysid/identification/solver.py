@@ -217,7 +217,10 @@ def likelihood(
 
 
 def descended(
-    about: Callable[[Array], Iterable[Quadratic]], start: Float[Array, " k"], ridge: Float[Array, " k"] | float = RIDGE
+    about: Callable[[Array], Iterable[Quadratic]],
+    start: Float[Array, " k"],
+    ridge: Float[Array, " k"] | float = RIDGE,
+    levels: bool = False,
 ) -> Float[Array, " k"]:
     """The minimum of a sum of costs, from ``start``.
 
@@ -227,14 +230,23 @@ def descended(
         about: linearises the cost of every part of the data.
         start: where to begin.
         ridge: as for `least_squares`.
+        levels: whether the unknowns are logarithms of levels, which may fall towards a lower bound.
     """
     x, descent = start, Descent.first(start)
     for _ in range(MAX_STEPS):
         if not descent.going_on:
             break
         parts = jax.tree.map(lambda *terms: jnp.asarray(np.sum(terms, axis=0)), *map(_fetched, about(x + descent.step)))
-        x, descent = _tried(descent, parts, x, ridge)
+        x, descent = _tried(descent, _of_levels(parts) if levels else parts, x, ridge)
     return descent.ended(x)
+
+
+def _of_levels(about: Quadratic) -> Quadratic:
+    """Slopes by logarithms are curvatures, too: nearly all of it where a level falls towards its lower bound.
+
+    Without them the steps of such a level are many times too long, and the steps of all are damped.
+    """
+    return about._replace(curvature=about.curvature + jnp.diag(jnp.maximum(about.slope, 0.0)))
 
 
 def _fetched(quadratic: Quadratic) -> Quadratic:
