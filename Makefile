@@ -79,7 +79,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	fi
 	@touch $@
 
-.venv-peers/.installed:
+.venv-peers/.installed: Makefile
 	"$(PYTHON)" -m venv .venv-peers
 	.venv-peers/bin/python -m pip install --quiet --disable-pip-version-check 'crazyflow==0.4.0' 'l2f==2.0.18'
 	@touch $@

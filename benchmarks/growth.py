@@ -85,21 +85,8 @@ def measure(folder: Path, arguments: argparse.Namespace, old: list[dict]) -> dic
         "each_s": EACH,
         "limit_s": arguments.limit,
         "cores": len(os.sched_getaffinity(0)),
-        "load": {name: _best([sys.executable, *words]) for name, words in LOADED.items()},
         "rows": sorted(rows, key=lambda row: COMMANDS.index(row["command"])),
     }
-
-
-LOADED = {
-    "`import cfb_mjx`": ("-c", "import cfb_mjx"),
-    "`cfb --version`": ("-m", "cfb_mjx.cli", "--version"),
-    "`cfb help evaluate`": ("-m", "cfb_mjx.cli", "help", "evaluate"),
-    "`import jax`": ("-c", "import jax"),
-}
-
-
-def _best(line: list[str], tries: int = 3) -> float:
-    return min(timed(line, LIMIT, dict(os.environ))["wall_s"] for _ in range(tries))
 
 
 def _series(name: str, series: str, folder: Path, arguments: argparse.Namespace) -> list[dict]:
@@ -303,7 +290,6 @@ def section(results: dict) -> str:
             ]
             if all(cells):
                 grown.append(f"| `cfb {name}` | {what} | {' | '.join(cells)} |")
-    loads = "\n".join(f"| {name} | {seconds:.2f} |" for name, seconds in results["load"].items())
     facts = ", ".join(f"{name} {value}" for name, value in results["environment"].items())
     head = "| command | what grows | wall, all | last two | CPU, all | last two | memory, all | last two |"
     return f"""## How cost grows with the flights
@@ -326,10 +312,6 @@ between the last two: 1 is linear, less is sublinear because of what every proce
 {head}
 |---|---|---:|---:|---:|---:|---:|---:|
 {chr(10).join(grown)}
-
-| what a process does first | wall, s |
-|---|---:|
-{loads}
 """
 
 

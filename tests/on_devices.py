@@ -15,9 +15,11 @@ from cfb_mjx.devices import Devices  # noqa: E402
 from cfb_mjx.files import shipped  # noqa: E402
 from cfb_mjx.logs import read_log  # noqa: E402
 from cfb_mjx.model import Quadrotor, in_chunks, rollout_final  # noqa: E402
+from cfb_mjx.optional import not_none  # noqa: E402
 from cfb_mjx.parameters import load_randomisation, sample_parameters  # noqa: E402
 from cfb_mjx.sysid import evaluate  # noqa: E402
 from cfb_mjx.sysid.identification.fitting import fit  # noqa: E402
+from cfb_mjx.sysid.identification.flight_data import prepare  # noqa: E402
 
 over = Devices.take(DEVICES)
 assert over.count == DEVICES
@@ -41,8 +43,10 @@ def rollouts():
 
 
 def fitted(estimator):
-    """Value and uncertainty of what is fitted to one flight; its segments need not divide by two."""
-    result = fit([log], model.parameters, "inertia,motor_gain", estimator=estimator, over=over)
+    """Value and uncertainty of what is fitted to one flight, whose segments do not divide by two."""
+    odd = read_log(shipped("data", "flight_logs") / "yaw.mcap")
+    assert len(not_none(prepare([odd]).segments).valid) % 2
+    result = fit([odd], model.parameters, "inertia,motor_gain", estimator=estimator, over=over)
     # Each over its own size: they are of very different units.
     sizes = np.array([[e.preset, e.preset] for e in result.estimates.values()])
     return np.array([[e.value, e.std] for e in result.estimates.values()]) / sizes

@@ -135,7 +135,7 @@ class Devices:
         """Return ``function`` with its work divided over the devices.
 
         Args:
-            function: function of pytrees of arrays that treats examples independently.
+            function: function of pytrees of arrays that treats examples independently, but for `total`.
             in_axes: axis to divide of every argument; None for arguments that every device gets whole.
             out_axes: the same for the results, a pytree prefix; None for results that are the same on every device.
 

@@ -260,3 +260,33 @@ def test_environments_in_forked_processes_say_so_instead_of_waiting():
 def test_seeds_count():
     env = TargetVectorEnv(2, SHORT)
     assert not np.allclose(env.reset(seed=1)[0], env.reset(seed=2)[0])
+
+
+def test_only_episodes_that_were_used_are_drawn_again():
+    many = TargetVectorEnv(100, TargetTask(), autoreset_mode="Disabled")
+    many.reset(seed=0)
+    drawn, redraw = [], many._programs.redraw
+
+    def counted(nominal, keys, waiting, which, numbers, places):
+        drawn.append((which.nonzero()[0].tolist(), len(numbers)))
+        return redraw(nominal, keys, waiting, which, numbers, places)
+
+    many._programs = many._programs._replace(redraw=counted)
+    # The first reset has used all; then three of them are needed, and three again.
+    few = np.isin(np.arange(100), (3, 50, 99))
+    for _ in range(2):
+        many.reset(options={"reset_mask": few})
+    assert drawn == [(list(range(100)), 100), ([3, 50, 99], 64)]
+
+
+def test_drones_fly_the_same_episodes_however_many_are_drawn_again_at_once():
+    """80 of 200 take two blocks; the last drone's episodes are those of a drone alone."""
+    many, alone = (TargetVectorEnv(n, TargetTask(), autoreset_mode="Disabled") for n in (200, 1))
+    seeds = list(range(200))
+    many.reset(seed=seeds)
+    alone.reset(seed=seeds[-1:])
+    ended = np.arange(200) >= 120
+    for _ in range(3):
+        seen, _ = many.reset(options={"reset_mask": ended})
+        only, _ = alone.reset()
+        np.testing.assert_allclose(seen[-1], only[0], rtol=1e-6, atol=1e-6)

@@ -19,7 +19,7 @@ from cfb_mjx.bench import page, workloads
 from cfb_mjx.bench.first_call import first_call, start_up
 from cfb_mjx.bench.roofline import roofline as roofline_of_machine
 from cfb_mjx.bench.scaling import braxs_ppo, scaling
-from cfb_mjx.bench.timed_process import TimedProcess
+from cfb_mjx.bench.timed_process import TimedProcess, without_options
 from cfb_mjx.devices import Devices
 from cfb_mjx.engine.gpu import kernel_is_chosen
 from cfb_mjx.errors import CfbError
@@ -61,15 +61,14 @@ class Peer(TimedProcess):
                     stdout=subprocess.PIPE,
                     stderr=subprocess.PIPE,
                     text=True,
-                    # As its users run it, without the compiler options that the cfb command sets.
-                    env={key: value for key, value in os.environ.items() if key != "XLA_FLAGS"},
+                    env=without_options(),
                 )
         except OSError as error:
             raise CfbError(f"--peer-python {python}: cannot be run ({error.strerror}).") from None
         answer = not_none(self.process.stdout).readline().split()
         if len(answer) != 4 or answer[0] != "ready":
             last = (self.process.communicate()[1].strip().splitlines() or ["no output"])[-1]
-            raise CfbError(f"--peer-python {python}: {name} does not run there ({last}).")
+            raise CfbError(f"{python}: {name} does not run there ({last}); give another --peer-python, or none.")
         self.name, self.what, self.drones = name, what, drones
         self.version, self.compile_s, self.steps = answer[1], float(answer[2]), int(answer[3])
         self.cores = (cores() if core is None else 1) if jax.default_backend() == "cpu" else None
@@ -96,7 +95,8 @@ def benchmark(
 
     Args:
         drones: batch sizes.
-        peer_python: Python of an environment with crazyflow, to measure it as well; also l2f, if it has that.
+        peer_python: Python of an environment with crazyflow, to measure it as well; and l2f, if it has that, MuJoCo's
+            C alone, and Brax's own PPO.
         quick: measure fewer workloads with fewer repetitions.
         roofline: also compare the speed with the limits of the machine.
 
@@ -117,7 +117,7 @@ def benchmark(
             groups = [_open_loop(count, several, peer_python)]
             if not quick:
                 groups += [_closed_loop(count, several, peer_python, network), _environments(count, peer_python)]
-                groups += [_contact(count), _derivatives(count)]
+                groups += [_contact(count, peer_python), _derivatives(count)]
             for group in filter(None, groups):
                 best = _alternate(group, QUICK_TURNS) if quick else _alternate(group, TURNS, TURNS_S)
                 for item, seconds in zip(group, best, strict=True):
@@ -137,8 +137,9 @@ def benchmark(
     if not quick:
         say("measuring one core and two cores")
         result["scaling"] = scaling()
-        say("measuring Brax's own PPO")
-        peers += braxs_ppo()
+        if peer_python is not None:
+            say("measuring Brax's own PPO")
+            peers += braxs_ppo()
     if roofline:
         say("measuring the limits of the machine")
         result["roofline"] = roofline_of_machine()
@@ -172,15 +173,20 @@ def _environments(count: int, python: Path | None) -> list:
     return [workloads.gymnasium(count), *_peers("crazyflow", python, "gymnasium", count, "environment")]
 
 
-def _contact(count: int) -> list:
+def _contact(count: int, python: Path | None) -> list:
     """Bodies with a floor that is rarely touched, and MuJoCo's C alone."""
     found = [workloads.rollout(count, body) for body in ("mjx", "mjx-floor", "mujoco-floor")]
-    path = str(shipped("assets", "cfb.xml"))
-    return found + _peers("mujoco.batch", Path(sys.executable), "rollout", count, path, str(workloads.HEIGHT_M))
+    arguments = str(shipped("assets", "cfb.xml")), str(workloads.HEIGHT_M)
+    # With the MuJoCo of this library.
+    python = None if python is None else Path(sys.executable)
+    return found + _peers("mujoco.batch", python, "rollout", count, *arguments)
 
 
 def _has(python: Path, module: str) -> bool:
-    return subprocess.run([str(python), "-c", f"import {module}"], capture_output=True).returncode == 0
+    found = subprocess.run([str(python), "-c", f"import {module}"], capture_output=True).returncode == 0
+    if not found:
+        say(f"{python} has no {module}, which is left out")
+    return found
 
 
 def _peers(
@@ -228,4 +234,4 @@ def _row(item: workloads.Workload | Peer, drones: int, seconds: float) -> dict:
         of = {"name": item.name, "version": item.version, "what": item.what, "drones": drones, "cores": item.cores}
         return of | speed
     of = {"what": item.what, "body": item.body, "drones": drones, "devices": item.devices}
-    return of | speed | ({} if item.peak_mb is None else {"peak_mb": item.peak_mb})
+    return of | speed | {"peak_mb": item.peak_mb}

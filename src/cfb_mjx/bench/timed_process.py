@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 from typing import IO
 
 from cfb_mjx.optional import not_none
+
+
+def without_options() -> dict[str, str]:
+    """The environment in which users of other programs run them: without the options of `configure_jax`."""
+    return {key: value for key, value in os.environ.items() if key != "XLA_FLAGS"} | {"TF_CPP_MIN_LOG_LEVEL": "3"}
 
 
 class TimedProcess:

@@ -30,7 +30,8 @@ from cfb_mjx.parameters import load_randomisation, sample_parameters
 
 STEPS = 500
 MJX_WORK = 200_000
-"""Steps of all drones together in one MJX measurement; MJX is about a hundred times slower than the closed form."""
+"""Steps of all drones together in one MJX measurement; without a floor MJX is a hundred times slower than the closed
+form."""
 
 ENVIRONMENT_STEPS = 20
 """Steps of an environment in one measurement."""

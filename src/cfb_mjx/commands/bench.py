@@ -40,7 +40,8 @@ class Bench(Command):
         drones: batch sizes, at least 1 each. Default: 1 64 1024 8192 65536.
         json: JSON file for the results.
         markdown: Markdown file for the results.
-        peer_python: Python interpreter in whose environment crazyflow is installed; crazyflow is then measured too.
+        peer_python: Python interpreter in whose environment crazyflow is installed; it is then measured too, and l2f if
+            that is installed there, MuJoCo's C alone, and Brax's own PPO.
         quick: measure fewer cases with fewer repetitions, for a quick look.
         roofline: also measure the peak speed of this machine, and what share of it the main computations reach.
     """

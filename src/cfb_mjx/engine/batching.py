@@ -111,7 +111,7 @@ def for_some(function: Callable[..., Sequence], needed: Array, leaves: Sequence,
             block, and its results are not used. It must not close over arrays that are being traced.
         needed: whether the results are needed; for one example, as the leaves.
         leaves: arguments of the function.
-        block: number of examples per call.
+        block: number of examples per call on a CPU; elsewhere at least `MANY`, and a quarter of them.
     """
 
     def together(own: tuple[bool, ...], needed: Array, *leaves: Array) -> list[Array]:

@@ -33,7 +33,7 @@ class _Prepared(eqx.Module):
 
 
 BLOCK = 512
-"""Largest number of drones per call of the host."""
+"""Largest number of drones per call of the host, where jax computes on a CPU."""
 
 
 class MujocoBody:

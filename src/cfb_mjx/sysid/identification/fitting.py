@@ -184,7 +184,7 @@ def fit(
         contradicted=tuple(contradicted),
         noise=noise,
         whiteness=dict(zip(CHANNELS, map(float, _lag_one(residual)), strict=True)),
-        feedback=detect(data.segments, residual),
+        feedback=detect(_joined(segments), residual),
     )
 
 
@@ -340,12 +340,16 @@ def _squares(
 @eqx.filter_jit
 def _solved(unknowns: Unknowns, vector, noise: Noise, segments, weighed, use_measured, robust, ridge, solver):
     """The vector by a solver of optimistix, which needs all residuals at once."""
+    (_, doubt, variance), whole = zip(*weighed, strict=True), _joined(segments)
+    own = Weights(weighed[0].parameters, jnp.concatenate(doubt), jnp.concatenate(variance))
+    return least_squares(
+        lambda x: _residual(x, unknowns, noise, whole, use_measured, robust, own), vector, ridge, solver
+    )
 
-    def residual(x):
-        pairs = zip(segments, weighed, strict=True)
-        return [_residual(x, unknowns, noise, part, use_measured, robust, own) for part, own in pairs]
 
-    return least_squares(residual, vector, ridge, solver)
+def _joined(segments: Sequence[Segments]) -> Segments:
+    """All parts in one, with what was added to divide them evenly."""
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *segments)
 
 
 def _scores(

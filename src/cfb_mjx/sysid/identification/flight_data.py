@@ -107,10 +107,10 @@ def prepare(logs: list[FlightLog], warm_up: float = 0.4) -> FlightData:
 
 
 def parts(segments: Segments, over: Devices | None = None) -> list[Segments]:
-    """Segments in parts of at most the largest of `_COUNTS`, as jax arrays, each divided over devices."""
-    found = []
-    for first in range(0, len(segments.valid), _COUNTS[-1]):
-        part = jax.tree.map(lambda x, f=first: x[f : f + _COUNTS[-1]], segments)
+    """Segments in parts of at most the largest of `_COUNTS` per device, as jax arrays, each divided over devices."""
+    found, most = [], _COUNTS[-1] * (1 if over is None else over.count)
+    for first in range(0, len(segments.valid), most):
+        part = jax.tree.map(lambda x, f=first: x[f : f + most], segments)
         if over is None or not over.several:
             found.append(jax.tree.map(jnp.asarray, part))
             continue
