@@ -207,6 +207,7 @@ def page(result: dict) -> str:
     if "machine" in sections:
         copied = sections["machine"]["rows"][0]["per_s"]
         text += [f"Memory bandwidth, measured in the same way: `x + 1` reads and writes {copied / 1e12:.1f} TB/s.", ""]
+    text += _goals(sections)
     for name, title in TITLES.items():
         if name in sections:
             text += [f"## {title}", "", WORDS[name], "", *_table(sections[name]), ""]
@@ -221,6 +222,49 @@ def page(result: dict) -> str:
         "",
     ]
     return "\n".join(text)
+
+
+def _goals(sections: dict) -> list[str]:
+    """What was aimed at, what was measured, and what holds what was not reached."""
+
+    def best(section: str, what: str, body: str = "rigid") -> float:
+        rows = sections.get(section, {}).get("rows", [])
+        return max((r["steps_per_s"] for r in rows if (r.get("what"), r.get("body")) == (what, body)), default=0.0)
+
+    rows = []
+    if opened := best("open_loop", "rollout"):
+        rows.append(("open loop, 2e10 steps/s", f"{opened:.2g}", ""))
+    if looped := best("policy", "rollout_policy"):
+        rows.append(("a policy of 4 x 32 in the loop, 1e9 steps/s", f"{looped:.2g}", ""))
+    if backward := best("gradient", "rollout_gradient"):
+        ratio, plain = (
+            best("gradient", "rollout_hundred") / backward,
+            best("open_loop", "rollout", "rigid-plain") / backward,
+        )
+        held = (
+            f"the reverse pass has no kernel, so that the states of all steps pass through memory; the gradient costs "
+            f"{plain:.0f} times XLA's own program of the forward pass"
+        )
+        rows.append(("a gradient, 4 times the forward pass", f"{ratio:.0f} times", held if ratio > 4 else ""))
+    points = [
+        (point["seconds"], row["what"])
+        for row in sections.get("hover", {}).get("rows", [])
+        for point in row["curve"]
+        if point["hover_mm"] < HOVER_MM
+    ]
+    if points:
+        seconds, what = min(points)
+        compiling = max(
+            (r["compile_s"] for r in sections.get("ppo", {}).get("rows", []) if "compile_s" in r), default=0.0
+        )
+        held = f"compiling one update of PPO takes {compiling:.0f} s of it"
+        rows.append(
+            (f"a hover policy ({HOVER_MM:.0f} mm) in 10 s", f"{seconds:.0f} s by {what}", held if seconds > 10 else "")
+        )
+    if not rows:
+        return []
+    table = [f"| {goal} | {number} | {held or 'reached'} |" for goal, number, held in rows]
+    return ["## Goals", "", "| aimed at | measured | what holds it |", "|---|---|---|", *table, ""]
 
 
 def _table(section: dict) -> list[str]:
