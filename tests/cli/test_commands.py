@@ -94,7 +94,7 @@ for _ in sys.stdin:
 
 
 def test_bench_writes_its_rows(cfb, tmp_path):
-    # In place of a Python with crazyflow; it takes 20 ms for 100 steps.
+    # In place of a Python with crazyflow and l2f; they take 20 ms for 100 steps.
     (tmp_path / "peer").write_text(PEER.format(python=sys.executable))
     (tmp_path / "peer").chmod(0o755)
     files = ("--json", tmp_path / "b.json", "--markdown", tmp_path / "b.md")
@@ -102,7 +102,8 @@ def test_bench_writes_its_rows(cfb, tmp_path):
     assert done.returncode == 0, done.stderr
     result = json.loads((tmp_path / "b.json").read_text())
     assert {(p["name"], p["version"], p["what"], p["drones"]) for p in result["peers"]} == {
-        ("crazyflow", "9.9", "rollout", 8)
+        ("crazyflow", "9.9", "rollout", 8),
+        ("l2f", "9.9", "rollout", 8),
     }
     assert [p["steps_per_s"] for p in result["peers"]] == pytest.approx([8 * 100 / 0.02] * len(result["peers"]))
     assert "crazyflow 9.9" in done.stdout
