@@ -47,14 +47,7 @@ WHY = {
     "pyarrow": "tables of flights; rerun needs it",
     "scipy": "statistics, filters",
     "tensorstore": "Brax needs it",
-    "mujoco-core": "bodies, contact, scenes",
-    "mujoco-studio": "a part of MuJoCo",
-    "mujoco-mjx": "MuJoCo in JAX",
     "numpy": "arrays",
-    "matplotlib": "figures",
-    "fonttools": "matplotlib needs it",
-    "zstandard": "compressed logs",
-    "jax": "the language of the simulator",
 }
 """What the largest packages are for."""
 
@@ -73,7 +66,7 @@ def weighed(sizes: dict[str, float]) -> str:
     most = [f"{name} {size:.0f} ({WHY.get(name, 'needed by others')})" for name, size in list(sizes.items())[:6]]
     return (
         f"An installation takes {sum(sizes.values()) / 1024:.1f} GB in {len(sizes)} packages, of which in MB: "
-        f"{', '.join(most)}. No package has a smaller build."
+        f"{', '.join(most)}."
     )
 
 

@@ -159,12 +159,12 @@ class Devices:
 
         return call
 
-    def own(self, x: Any, axis: int = 0) -> Any:
-        """Within `divided`: this device's part of an array that every device holds, along ``axis``."""
+    def own(self, x: Any) -> Any:
+        """Within `divided`: this device's rows of an array that every device holds."""
         if not self.several:
             return x
-        length = x.shape[axis] // self.count
-        return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * length, length, axis)
+        length = len(x) // self.count
+        return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(AXIS) * length, length)
 
     def total(self, tree: Any) -> Any:
         """Within `divided`: the sum of every array over the devices, in one exchange."""

@@ -54,11 +54,12 @@ def test_every_peer_is_compared_with_what_is_like_it():
     assert "MJX 1 m above a floor 20.0 x (one device of ours, 1 core of it) mujoco.batch 1.2" in said
     assert "environment for Gymnasium 2.0 x (1 core each) crazyflow 1.2" in said
     assert dict(goals(RESULT | {"peers": PEERS, "scaling": PPO})) == {
-        "1 M steps/s a core above a floor that is rarely touched": "10.0 M; `mujoco.batch` alone 0.50 M",
+        "1 M steps/s a core above a floor that is rarely touched": "10.0 M on one device; `mujoco.batch` alone 0.50 M "
+        "on one core",
         "PPO: 276 k commands/s on two cores, flights and learning": "400 k (one core: 200 k); Brax's own PPO on the "
         "same task, networks, batches and epochs 10 k",
-        "environment for Gymnasium beside crazyflow's, the best batch on one core": "0.20 M steps/s of 8 ms; "
-        "crazyflow's 0.10 M of 2 ms, without delay, noise and randomised drones",
+        "environment for Gymnasium beside crazyflow's, the best batch": "0.20 M steps/s of 8 ms on one device; "
+        "crazyflow's 0.10 M of 2 ms on one core, without delay, noise and randomised drones",
         "`cfb --help` in under 0.3 s": "0.10 s",
     }
 

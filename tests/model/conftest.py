@@ -12,6 +12,18 @@ from cfb_mjx.model import rollout
 from cfb_mjx.parameters import Parameters, load_model_file, load_randomisation, sample_parameters
 
 
+@pytest.fixture(scope="module")
+def write(tmp_path_factory):
+    """Write a text into a file of the module's own folder; returns its path."""
+    folder = tmp_path_factory.mktemp("mjcf")
+
+    def write(text: str, name: str) -> str:
+        (folder / name).write_text(text)
+        return str(folder / name)
+
+    return write
+
+
 @pytest.fixture(scope="session")
 def guards() -> Parameters:
     return load_model_file("cfb-guards").parameters()

@@ -53,17 +53,6 @@ BODIES = pytest.mark.parametrize("kind", [MjxBody, MujocoBody])
 
 
 @pytest.fixture(scope="module")
-def write(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("near")
-
-    def write(text: str, name: str) -> str:
-        (folder / name).write_text(text)
-        return str(folder / name)
-
-    return write
-
-
-@pytest.fixture(scope="module")
 def drone():
     return Quadrotor.from_file("cfb-guards")
 

@@ -70,17 +70,6 @@ def test_scenes_in_a_process_of_their_own():
 
 
 @pytest.fixture(scope="module")
-def write(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("scenes")
-
-    def write(text: str, name: str) -> str:
-        (folder / name).write_text(text)
-        return str(folder / name)
-
-    return write
-
-
-@pytest.fixture(scope="module")
 def drone():
     return Quadrotor.from_file("cfb-guards", dt=0.002, integrator="euler")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.util
 import os
 import subprocess
@@ -182,6 +183,7 @@ def _contact(count: int, python: Path | None) -> list:
     return found + _peers("mujoco.batch", python, "rollout", count, *arguments)
 
 
+@functools.cache
 def _has(python: Path, module: str) -> bool:
     found = subprocess.run([str(python), "-c", f"import {module}"], capture_output=True).returncode == 0
     if not found:

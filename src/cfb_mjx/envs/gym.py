@@ -105,7 +105,8 @@ class _Programs(NamedTuple):
 
     fly: Callable[[Leaves, Leaves, np.ndarray, np.ndarray, Any], tuple]
     """Fly actions. Then begin the waiting episodes, as far as they are ready, of drones whose time for it has come: in
-    the same step or in the next. Returns the episodes, the outcome, and what is seen before and after that."""
+    the same step or in the next. Returns the episodes, the outcome, what is seen before that if in the same, and
+    what is seen then."""
     begin: Callable[[np.ndarray, Leaves, Leaves], tuple]
     """Begin the waiting episodes of some drones; also returns what is seen of all."""
     redraw: Callable[[Quadrotor, Array, Leaves, np.ndarray, np.ndarray, np.ndarray], tuple]
@@ -119,12 +120,12 @@ def _programs(task: Task, mode: AutoresetMode, structure: Any) -> _Programs:
 
     def fly(flying, waiting, ready, anew, actions):
         after, outcome = jax.vmap(partial(step, task))(structure.unflatten(flying), 0.5 * (1 + actions))
-        seen = _show(task, after)
-        if mode == AutoresetMode.DISABLED:
-            return jax.tree.leaves(after), outcome, seen, seen
-        now = anew if mode == AutoresetMode.NEXT_STEP else (outcome.failed | outcome.timed_out) & ~anew
-        begun = choose(now & ready, structure.unflatten(waiting), after)
-        return jax.tree.leaves(begun), outcome, seen, _show(task, begun)
+        begun = after
+        if mode != AutoresetMode.DISABLED:
+            now = anew if mode == AutoresetMode.NEXT_STEP else (outcome.failed | outcome.timed_out) & ~anew
+            begun = choose(now & ready, structure.unflatten(waiting), after)
+        shown = _show(task, begun)
+        return jax.tree.leaves(begun), outcome, _show(task, after) if mode == AutoresetMode.SAME_STEP else shown, shown
 
     def begin(which, waiting, flying):
         begun = choose(which, structure.unflatten(waiting), structure.unflatten(flying))

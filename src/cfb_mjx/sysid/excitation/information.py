@@ -33,7 +33,7 @@ from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.excitation.experiment import TICK, Conditions, Experiment, follow
 from cfb_mjx.sysid.excitation.manoeuvres import PATHS, STEP, path
-from cfb_mjx.sysid.identification.fitting import fit_noise, fit_slopes, in_blocks
+from cfb_mjx.sysid.identification.fitting import fit_noise, slopes_in_blocks
 from cfb_mjx.sysid.identification.flight_data import Segments, parts, prepare
 from cfb_mjx.sysid.identification.innovation import whitened
 from cfb_mjx.sysid.identification.noise import Noise
@@ -108,11 +108,8 @@ def linearise(logs: list[FlightLog], unknowns: Unknowns, use_measured: bool = Tr
     noise = Noise.first(data)
     for _ in range(_ROUNDS):
         noise = fit_noise(unknowns, unknowns.start, noise, segments, use_measured, False)
-    blocks = []
-    for part in segments:
-        residual, jacobian = fit_slopes(unknowns, unknowns.start, noise, part, use_measured, False)
-        blocks.append(in_blocks(part, np.asarray(residual), np.asarray(jacobian) @ per_relative_change(unknowns)))
-    residuals, jacobians = zip(*blocks, strict=True)
+    found = slopes_in_blocks(unknowns, unknowns.start, noise, segments, use_measured, False)
+    _, residuals, jacobians = zip(*found, strict=True)
     return Linearised(np.concatenate(residuals), np.concatenate(jacobians), noise)
 
 

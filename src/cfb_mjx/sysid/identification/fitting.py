@@ -356,14 +356,23 @@ def _scores(
     unknowns: Unknowns, vector, noise: Noise, segments: Sequence[Segments], use_measured: bool, robust: bool
 ) -> tuple[np.ndarray, Scores]:
     """Residuals (s, n, 8) of a fit, and its scores with respect to relative changes of the parameters."""
+    found = slopes_in_blocks(unknowns, vector, noise, segments, use_measured, robust)
+    residuals, scores = zip(*((residual, Scores.of(*blocks)) for residual, *blocks in found), strict=True)
+    return np.concatenate(residuals), Scores.joined(scores)
+
+
+def slopes_in_blocks(
+    unknowns: Unknowns, vector, noise: Noise, segments: Sequence[Segments], use_measured: bool, robust: bool
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """For each part of the data its residuals (s, n, 8), and `in_blocks` residuals and their derivatives with respect
+    to relative changes of the parameters."""
     relative = np.linalg.inv(unknowns.slope(vector))
 
-    def one(part: Segments) -> tuple[np.ndarray, Scores]:
+    def one(part: Segments) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         residual, jacobian = map(np.asarray, fit_slopes(unknowns, vector, noise, part, use_measured, robust))
-        return residual, Scores.of(*in_blocks(part, residual, jacobian @ relative))
+        return residual, *in_blocks(part, residual, jacobian @ relative)
 
-    residuals, scores = zip(*_each(one, segments), strict=True)
-    return np.concatenate(residuals), Scores.joined(scores)
+    return _each(one, segments)
 
 
 @eqx.filter_jit

@@ -236,7 +236,7 @@ def descended(
     for _ in range(MAX_STEPS):
         if not descent.going_on:
             break
-        parts = jax.tree.map(lambda *terms: jnp.asarray(np.sum(terms, axis=0)), *map(_fetched, about(x + descent.step)))
+        parts = jax.tree.map(lambda *terms: jnp.asarray(sum(map(np.asarray, terms))), *about(x + descent.step))
         x, descent = _tried(descent, _of_levels(parts) if levels else parts, x, ridge)
     return descent.ended(x)
 
@@ -247,10 +247,6 @@ def _of_levels(about: Quadratic) -> Quadratic:
     Without them the steps of such a level are many times too long, and the steps of all are damped.
     """
     return about._replace(curvature=about.curvature + jnp.diag(jnp.maximum(about.slope, 0.0)))
-
-
-def _fetched(quadratic: Quadratic) -> Quadratic:
-    return jax.tree.map(np.asarray, quadratic)
 
 
 @eqx.filter_jit
