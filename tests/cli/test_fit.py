@@ -1,8 +1,11 @@
 """``cfb fit`` from the logs to a model the other commands take."""
 
 import json
+from collections import defaultdict
 from pathlib import Path
+from types import SimpleNamespace
 
+from cfb_mjx.commands.fit import Fitted
 from cfb_mjx.parameters import load_model_file
 
 LOG = Path(__file__).resolve().parents[2] / "data" / "flight_logs" / "figure8.mcap"
@@ -35,3 +38,24 @@ def test_a_parameter_that_does_not_exist_is_refused(cfb, tmp_path):
     assert "colour" in done.stderr
     assert "inertia_xx" in done.stderr
     assert not (tmp_path / "m.yaml").exists()
+
+
+class Errors:
+    """Held-out errors that are all the same."""
+
+    logs = ()
+
+    def __init__(self, error: float):
+        self.error = error
+
+    def metrics(self, variant: str):
+        return defaultdict(lambda: 1.0 if variant == "hold" else self.error)
+
+
+def test_a_model_that_predicts_worse_than_before_is_said_to():
+    def said(before: float, after: float) -> str:
+        found = SimpleNamespace(before=Errors(before), after=Errors(after))
+        return "\n".join(Fitted._held_out(found))
+
+    assert "12 of 12 held-out errors grew" in said(1.0, 2.0)
+    assert "grew" not in said(2.0, 1.0)

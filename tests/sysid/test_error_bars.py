@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
@@ -19,6 +20,7 @@ from cfb_mjx.sysid.identification.fitting import fit
 from cfb_mjx.sysid.identification.flight_data import Segments, prepare
 from cfb_mjx.sysid.identification.innovation import as_held, drive, innovations
 from cfb_mjx.sysid.identification.noise import Noise
+from cfb_mjx.sysid.identification.solver import descended
 from cfb_mjx.sysid.identification.uncertainty import Scores, assess, most_contradicted
 from cfb_mjx.sysid.identification.unknowns import at_the_border
 
@@ -80,6 +82,38 @@ def test_what_was_to_be_held_and_is_contradicted_is_freed_and_named(flight):
     found = fit([flight], NOMINAL, "inertia,rotor_inertia,motor", mass_std=0.0)
     assert {"thrust_scale", "torque_scale"} <= set(found.contradicted)
     assert max(map(abs, scores(found).values())) < 3.5, scores(found)
+
+
+def test_an_inertia_that_is_contradicted_is_freed_as_a_whole(flight):
+    """What moves one axis in the coordinates of the fit moves the two others: they moved, and were not named."""
+    found = fit([flight], NOMINAL, "rotor_inertia,motor,thrust_scale,torque_scale", mass_std=0.0)
+    assert {"inertia_xx", "inertia_yy", "inertia_zz"} == set(found.contradicted)
+    assert max(map(abs, scores(found).values())) < 3.5, scores(found)
+
+
+def test_a_contradiction_that_no_possible_value_explains_is_named_and_nothing_is_freed():
+    """A fit that had asked for neither ended in an error, or in an inertia that no rigid body has."""
+    twisted = replace(drone(), torque_scale=np.array([11.0]))
+    found = fit(fly(twisted, 12.0, seed=5), NOMINAL, "thrust_scale,rotor_inertia,motor")
+    assert "torque_scale" in found.unexplained
+    assert found.parameters.torque_scale[0] == pytest.approx(1, abs=1e-6)
+    assert found.model_file(PRESET, "a test").entries["thrust_scale"].std[0] > 0
+    assert found.to_json()["held_fixed_unexplained"] == list(found.unexplained)
+
+
+def test_commands_that_act_later_than_logged_do_not_hold_up_a_fit(monkeypatch):
+    """How long a command acted is then at its bound, where every interval between rows had a corner of its own."""
+    log = fly(drone(), 4.0, seed=8, row=1)[0]
+    scattered = log.time + np.random.default_rng(1).uniform(-2e-4, 2e-4, len(log))
+    late = log.rows(np.arange(len(log)) < len(log) - 6).replace(time=scattered[:-6], command=log.command[6:])
+    tried = []
+
+    def counted(about, *rest, **more):
+        return descended(lambda x: tried.append(x) or about(x), *rest, **more)
+
+    monkeypatch.setattr("cfb_mjx.sysid.identification.fitting.descended", counted)
+    fit([late], NOMINAL)
+    assert len(tried) < 250
 
 
 def test_a_mass_that_is_off_is_in_the_error_bars_and_what_is_known_is_the_ratio(flight):

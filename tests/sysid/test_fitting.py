@@ -117,7 +117,7 @@ def test_parts_of_the_data_say_what_all_say(campaign, monkeypatch):
     )
     np.testing.assert_allclose(fit_of_parts[0], fit_of_all[0], rtol=1e-9, atol=1e-9)
     # Any other solver sees all parts, too.
-    fixed = unknowns, unknowns.start, noise, some, False, False, 1.0
+    fixed = unknowns, unknowns.start, noise, some, False, False, fitting.Prior(jnp.ones(len(unknowns.names)))
     ours, theirs = (
         fitting._fit_vector(*fixed, solver) for solver in (None, optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9))
     )
@@ -228,7 +228,7 @@ def test_a_round_ends_at_its_minimum_where_commands_were_not_logged(campaign):
     segments, ridge = jax.tree.map(jnp.asarray, data.segments), jnp.full(len(unknowns.names), RIDGE)
     weighed = fitting._weights(unknowns, unknowns.start, noise, segments, True, False)
     assert jnp.max(weighed.doubt) > 0
-    vector = fitting._fit_vector(unknowns, unknowns.start, noise, [segments], True, False, ridge)
+    vector = fitting._fit_vector(unknowns, unknowns.start, noise, [segments], True, False, fitting.Prior(ridge))
 
     def residual(x):
         return fitting._residual(x, unknowns, noise, segments, True, False, weighed).ravel()

@@ -6,9 +6,17 @@ import numpy as np
 import optimistix as optx
 import pytest
 from scipy.optimize import least_squares as scipys
-from scipy.optimize import minimize
+from scipy.optimize import lsq_linear, minimize
 
-from cfb_mjx.sysid.identification.solver import RIDGE, GaussNewton, descended, least_squares, likelihood
+from cfb_mjx.sysid.identification.solver import (
+    RIDGE,
+    GaussNewton,
+    Quadratic,
+    descended,
+    least_squares,
+    likelihood,
+    linearised,
+)
 
 TIME = np.linspace(0.0, 2.0, 200)
 DATA = 3.0 * np.exp(-2.0 * TIME) + 0.5 + 0.01 * np.random.default_rng(0).normal(size=TIME.shape)
@@ -127,3 +135,31 @@ def test_a_level_that_falls_to_its_bound_holds_up_no_other():
     assert float(cost(found)) - theirs.fun < 1e-4
     assert found[0] < -2
     assert len(tried) < 25
+
+
+@pytest.mark.parametrize("high", [0.5, 5.0])
+def test_within_bounds_it_finds_what_scipy_finds(high):
+    rng = np.random.default_rng(4)
+    slopes, wanted = rng.normal(size=(30, 3)), np.array([2.0, -1.0, 0.3])
+    values = slopes @ wanted + 0.1 * rng.normal(size=30)
+    bounds = (jnp.array([-jnp.inf, -0.2, -jnp.inf]), jnp.array([high, jnp.inf, jnp.inf]))
+
+    def about(x):
+        return [linearised(lambda y: slopes @ y - values, x)]
+
+    found = descended(about, jnp.array([9.0, 9.0, 9.0]), ridge=1e-6, bounds=bounds)
+    np.testing.assert_allclose(found, lsq_linear(slopes, values, bounds).x, atol=1e-6)
+
+
+def test_a_cost_that_curves_twice_as_much_as_is_thought_takes_few_steps():
+    """Steps of twice the length never end: real flights are not as noisy as their own noise model says."""
+    tried, weight = [], jnp.array([100.0, 3.0])
+
+    def about(x):
+        tried.append(x)
+        away = x - jnp.array([1.0, -2.0])
+        return [Quadratic(away @ (weight * away), weight * away, jnp.diag(weight) / 2)]
+
+    found = descended(about, jnp.zeros(2), ridge=0.0)
+    np.testing.assert_allclose(found, [1.0, -2.0], atol=1e-3)
+    assert len(tried) < 20

@@ -97,6 +97,11 @@ class Fitted(Result):
             yield f"known better in combination: {name} = {e.value:.6g} +- {e.std:.2g}"
         for name in self.fit.contradicted:
             yield f"{name} was meant to stay fixed, but the flights contradict its value; it was fitted too."
+        for name in self.fit.unexplained:
+            yield (
+                f"{name} stayed fixed: the flights contradict its value, but no possible value fits them. "
+                "The model lacks something else; 'cfb close-loop' looks for it."
+            )
         feedback = self.fit.feedback or (self.other and self.other.feedback)
         if feedback and feedback.present:
             yield (
@@ -108,6 +113,7 @@ class Fitted(Result):
         windows = sum(len(log.windows) for log in self.before.logs)
         yield f"\nheld-out RMS error, {windows} windows    before       after        hold"
         hold = self.before.metrics("hold")
+        grown = []
         for variant, label in (("commands_in", "commands in"), ("rotor_speed_in", "rotor speed in")):
             old, new = self.before.metrics(variant), self.after.metrics(variant)
             if old is None:
@@ -119,7 +125,13 @@ class Fitted(Result):
                     name = f"{key}@{horizon}s"
                     quantity, _, unit = key.split("_")
                     text = f"{label}, {quantity} {unit}, {horizon} s"
+                    grown.append(new[name] > old[name])
                     yield f"{text:<40}{old[name]:>10.4g}{new[name]:>12.4g}{still[name]:>12.4g}"
+        if 2 * sum(grown) > len(grown):
+            yield (
+                f"{sum(grown)} of {len(grown)} held-out errors grew: the fitted model is worse than the one before. It "
+                "lacks something that these flights show; 'cfb close-loop' looks for it."
+            )
 
 
 @command

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from cfb_mjx.devices import Devices, over_cores
 from cfb_mjx.errors import CfbError
@@ -32,10 +32,13 @@ from cfb_mjx.sysid.identification.innovation import (
     whitened,
 )
 from cfb_mjx.sysid.identification.noise import Noise
-from cfb_mjx.sysid.identification.result import Fit, summarise
+from cfb_mjx.sysid.identification.result import Fit, is_possible, summarise
 from cfb_mjx.sysid.identification.shooting import shoot
 from cfb_mjx.sysid.identification.solver import (
     RIDGE,
+    SOLVED,
+    UNBOUNDED,
+    Bounds,
     Quadratic,
     descended,
     least_squares,
@@ -49,6 +52,13 @@ from cfb_mjx.sysid.identification.unknowns import GROUPS, OFFSETS, UNITS, Unknow
 
 ROUNDS = 8
 """Noise levels and parameters are found in turns, at most so often."""
+ACCURACY = (1e-2, 1e-4, SOLVED)
+"""Squared error of a round's parameters, in standard deviations of the estimate; the last also of later rounds."""
+LEVELS = 1e-3
+"""Least squared error of noise levels: a few per cent of a standard deviation do not move the parameters."""
+FEW = 2
+"""Number of `parts`, spread over the flights, to which long flights are fitted first: from there all of them need few
+steps."""
 SETTLED = 5e-4
 """A round that changes no parameter by more than this share is the last."""
 BLOCK = 128
@@ -91,7 +101,8 @@ def fit(
     """Fit parameters to flights; what the flights cannot tell gets no number.
 
     What is held is tested (innovation only): a value that the flights contradict by `CLEAR` standard deviations is
-    freed and named in ``contradicted``. How long a logged command acted is always fitted, see `as_held`.
+    freed and named in ``contradicted``; if no possible value fits the flights, it stays and is named in
+    ``unexplained``. How long a logged command acted is always fitted, see `as_held`.
 
     Args:
         logs: flights; run with x64 enabled.
@@ -125,36 +136,55 @@ def fit(
         raise CfbError(f"{names}: too short a flight to fit; at least a second without a gap is needed.")
     segments = parts(data.segments, over)
     unknowns = choose(_playing(asked), nominal)
-    vector, noise = unknowns.start, Noise.first(data)
     tried = [name for name in unknowns.names if name not in (*asked, "mass", "command_hold")]
     if not (use_measured and bool(np.any(data.segments.measured))):
         tried = [name for name in tried if name not in NEED_ROTOR_SPEED]
     contradicted: list[str] = []
+    unexplained: list[str] = []
     interval = float(np.median(data.segments.interval[data.segments.interval > 0]))
-    while True:
-        free = (*asked, *contradicted, "command_hold")
+    bounds = unknowns.bounds(max(float(np.median(each[each > 0])) for each in data.segments.interval))
+
+    def settled(free: tuple[str, ...], unknowns: Unknowns, vector, noise: Noise, some: list[Segments] | None = None):
         ridge = jnp.asarray([1 / PRIORS.get(n, 1 / RIDGE) if n in free else HELD for n in unknowns.names])
+        prior = Prior(ridge, bounds)
         if over is not None:  # placed as the rounds return it, or the second would compile anew
-            vector, noise, ridge = over.whole((vector, noise, ridge))
-        vector, noise = _settled(unknowns, vector, noise, segments, use_measured, robust, ridge, solver, progress)
-        if (
-            not contradicted
-            and "command_hold" not in asked
-            and float(not_none(unknowns.hold(vector))) > NEARLY * interval
-        ):
-            # A free hold takes every step of a command for uncertain, and so the rotors' own readings for better than
-            # they are: where commands come in time with the rows, all motor constants lean by several deviations.
-            timed = replace(unknowns, timed=jnp.ones(()))
-            other = _settled(timed, vector, noise, segments, use_measured, robust, ridge, solver, progress)
-            fits = (unknowns, vector, noise), (timed, *other)
-            free_hold, in_time = (_surprise(*each, segments, use_measured, robust) for each in fits)
-            if in_time <= free_hold:
-                unknowns, vector, noise = fits[1]
-        residual, scores = _scores(unknowns, vector, noise, segments, use_measured, robust)
-        name = most_contradicted(scores, unknowns.names, free, [n for n in tried if n not in contradicted])
-        if name is None:
+            vector, noise, prior = over.whole((vector, noise, prior))
+        how = use_measured, robust, prior, solver, progress
+        return unknowns, *_settled(unknowns, vector, noise, some or segments, *how)
+
+    def in_time_or_not(free: tuple[str, ...], at: tuple[Unknowns, Array, Noise]):
+        # A free hold takes every step of a command for uncertain, and so the rotors' own readings for better than they
+        # are: where commands come in time with the rows, all motor constants lean by several deviations.
+        if "command_hold" in asked:
+            return at
+        is_timed = float(at[0].timed) > 0
+        held = settled(free, replace(at[0], timed=jnp.zeros(())), *at[1:]) if is_timed else at
+        if float(not_none(held[0].hold(held[1]))) <= NEARLY * interval:
+            return held
+        timed = at if is_timed else settled(free, replace(at[0], timed=jnp.ones(())), *at[1:])
+        return min(timed, held, key=lambda fit: _surprise(*fit, segments, use_measured, robust))
+
+    free, at = (*asked, "command_hold"), (unknowns, unknowns.start, Noise.first(data))
+    if len(segments) > FEW:
+        at = settled(free, *at, segments[:: -(-len(segments) // FEW)])
+    at = settled(free, *at)
+    while True:
+        at, asked_with = in_time_or_not(free, at), free
+        residual, scores = _scores(*at, segments, use_measured, robust)
+        while (name := most_contradicted(scores, unknowns.names, free, tried)) is not None:
+            # With none of its axes asked for, what moves one axis of the inertia moves the others (`unknowns`).
+            names = GROUPS["inertia"] if name in GROUPS["inertia"] else (name,)
+            tried = [n for n in tried if n not in names]
+            moved = settled((*free, *names), *at)
+            if not all(is_possible(n, unknowns.apply(moved[1])) for n in (*contradicted, *names)):
+                unexplained += names
+                continue
+            contradicted += names
+            free, at = (*free, *names), moved
+            residual, scores = _scores(*at, segments, use_measured, robust)
+        if free == asked_with:  # what was freed may change whether commands acted until the next row
             break
-        contradicted.append(name)
+    unknowns, vector, noise = at
     if progress is not None:
         progress(ROUNDS, ROUNDS)
     is_timed = float(unknowns.timed) > 0
@@ -182,6 +212,7 @@ def fit(
         names=tuple(name for name in fitted if name != "command_hold" or name in asked),
         impossible=impossible,
         contradicted=tuple(contradicted),
+        unexplained=tuple(unexplained),
         noise=noise,
         whiteness=dict(zip(CHANNELS, map(float, _lag_one(residual)), strict=True)),
         feedback=detect(_joined(segments), residual),
@@ -205,21 +236,38 @@ def _playing(asked: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(name for name in UNITS if name not in left)
 
 
+class Prior(NamedTuple):
+    """What is known of the unknowns beside the flights: see `solver.descended`."""
+
+    ridge: Float[Array, " k"]
+    bounds: Bounds = UNBOUNDED
+
+
 def _settled(
-    unknowns: Unknowns, vector, noise: Noise, segments: list[Segments], use_measured, robust, ridge, solver, progress
+    unknowns: Unknowns,
+    vector,
+    noise: Noise,
+    segments: list[Segments],
+    use_measured,
+    robust,
+    prior: Prior,
+    solver,
+    progress,
 ) -> tuple[Array, Noise]:
     """Vector and noise levels of largest likelihood, found in turns."""
     for done in range(ROUNDS):
         before, levels = vector, noise
-        noise = fit_noise(unknowns, vector, noise, segments, use_measured, robust)
-        vector = _fit_vector(unknowns, vector, noise, segments, use_measured, robust, ridge, solver)
+        accuracy = ACCURACY[min(done, len(ACCURACY) - 1)]
+        noise = fit_noise(unknowns, vector, noise, segments, use_measured, robust, max(accuracy, LEVELS))
+        vector = _fit_vector(unknowns, vector, noise, segments, use_measured, robust, prior, solver, accuracy)
         if progress is not None:
             progress(min(done + 1, ROUNDS - 1), ROUNDS)
         # A vector that the flights hardly tell may creep for ever; what creeps under the same noise is of no matter.
         changed = max(
             float(jnp.max(jnp.abs(a / b - 1))) for a, b in zip(*map(jax.tree.leaves, (noise, levels)), strict=True)
         )
-        if done and (changed < SETTLED or float(jnp.max(jnp.abs(vector - before))) < SETTLED):
+        still = changed < SETTLED or float(jnp.max(jnp.abs(vector - before))) < SETTLED
+        if still and accuracy == ACCURACY[-1]:
             break
     return vector, noise
 
@@ -241,7 +289,13 @@ def _each(function: Callable, *pieces: Sequence) -> Iterator:
 
 
 def fit_noise(
-    unknowns: Unknowns, vector, noise: Noise, segments: Sequence[Segments], use_measured: bool, robust: bool
+    unknowns: Unknowns,
+    vector,
+    noise: Noise,
+    segments: Sequence[Segments],
+    use_measured: bool,
+    robust: bool,
+    accuracy: float = SOLVED,
 ) -> Noise:
     """Noise levels of largest likelihood at ``vector``, from ``noise`` on; ``segments`` in `parts`."""
     # The smoothed rotor speeds stay those of the last round's noise: the rotors' own readings say how noisy they are.
@@ -252,7 +306,7 @@ def fit_noise(
             lambda part, own: _likelihood(levels, unknowns, vector, part, own, use_measured, robust), segments, driven
         )
 
-    return Noise.from_vector(descended(about, noise.to_vector(), levels=True))
+    return Noise.from_vector(descended(about, noise.to_vector(), levels=True, bounds=Noise.bounds(), accuracy=accuracy))
 
 
 @eqx.filter_jit
@@ -317,17 +371,19 @@ def _fit_vector(
     segments: Sequence[Segments],
     use_measured: bool,
     robust: bool,
-    ridge,
+    prior: Prior,
     solver: optx.AbstractLeastSquaresSolver | None = None,
+    accuracy: float = SOLVED,
 ):
     weighed = list(_each(lambda part: _weights(unknowns, vector, noise, part, use_measured, robust), segments))
     if solver is not None:
-        return _solved(unknowns, vector, noise, list(segments), weighed, use_measured, robust, ridge, solver)
+        return _solved(unknowns, vector, noise, list(segments), weighed, use_measured, robust, prior.ridge, solver)
 
     def about(x):
         return _each(lambda part, own: _squares(x, unknowns, noise, part, own, use_measured, robust), segments, weighed)
 
-    return descended(about, vector, ridge)
+    factors = jnp.asarray([name not in OFFSETS for name in unknowns.names])
+    return descended(about, vector, prior.ridge, factors, prior.bounds, accuracy)
 
 
 @eqx.filter_jit

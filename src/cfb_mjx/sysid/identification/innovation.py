@@ -194,7 +194,7 @@ def as_held(parameters: Parameters, hold: Float[Array, ""] | None, segments: Seg
     interval = segments.interval[:, 1:, None]
     safe = jnp.where(interval > 0, interval, 1.0)
     timed = jnp.isinf(hold)
-    held = jnp.where(timed, 1.0, jnp.clip(jnp.where(timed, 0.0, hold) / safe, -0.5, 1.5))
+    held = jnp.where(timed, 1.0, _share(jnp.where(timed, 0.0, hold) / safe))
     later = (1 - held**2) * interval / (12 * parameters.motor_time_constant)
     share = 0.5 * (1 - held) + later
     step = jnp.diff(segments.command, axis=1)
@@ -207,6 +207,15 @@ def as_held(parameters: Parameters, hold: Float[Array, ""] | None, segments: Seg
     unsure = jnp.sqrt(jnp.clip(1 - held**2, 0.0, 1.0)) * segments.doubt[:, :-1]
     doubt = jnp.asarray(segments.doubt).at[:, :-1].set(jax.lax.stop_gradient(unsure))
     return eqx.tree_at(lambda s: (s.command, s.excess, s.doubt), segments, (command, excess, doubt))
+
+
+def _share(ratio: Array) -> Array:
+    """The share of an interval for which a command acted, of the ratio of their lengths: equal from 0 to 1.
+
+    Beyond, it tends to -0.5 and 1.5, smoothly: intervals scatter, and a corner at every interval would stop a descent.
+    """
+    possible = jnp.clip(ratio, 0.0, 1.0)
+    return possible + 0.5 * jnp.tanh((ratio - possible) / 0.5)
 
 
 class Weights(NamedTuple):

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.sysid.identification.flight_data import FlightData
+from cfb_mjx.sysid.identification.solver import UNBOUNDED
 
 _SHORTEST, _LONGEST = 0.03, 3.0  # correlation time of the disturbance, s
+_MIDDLE = math.sqrt(_SHORTEST * _LONGEST)
 
 UNTIMED = 0.3
 """Lower bound of `Noise.command`: a step may occur at any moment between two rows (1 / sqrt(12) of it), however smooth
@@ -46,26 +50,24 @@ class Noise(eqx.Module):
     """Error of the mean command between two rows due to commands not logged, as a share of `Segments.doubt`."""
 
     def to_vector(self) -> Float[Array, "17"]:
-        """Unconstrained vector for optimisation."""
-        middle = jnp.sqrt(_SHORTEST * _LONGEST)
-        time = jnp.log(self.correlation_time / middle) / jnp.log(_LONGEST / middle)
+        """Vector for optimisation, within `bounds`."""
+        time = jnp.log(self.correlation_time / _MIDDLE)
         levels = (self.gyro, self.rate_walk, self.disturbance, self.accelerometer, self.accelerometer_lag)
         levels = (*levels, self.force_disturbance, self.rotor, self.rotor_walk, self.rotor_disturbance, self.command)
         levels = jnp.concatenate([jnp.atleast_1d(level) for level in levels])
         # A level at its bound is placed slightly above it, so that its logarithm stays finite.
         logs = jnp.log(jnp.maximum(levels - _FLOORS, 1e-3 * _FLOORS))
-        return jnp.concatenate([logs[:9], jnp.arctanh(jnp.clip(time, -0.999, 0.999))[None], logs[9:]])
+        return jnp.concatenate([logs[:9], time[None], logs[9:]])
 
     @staticmethod
     def from_vector(vector: Float[Array, "17"]) -> Noise:
         """Inverse of `to_vector`; lower bounds on the levels avoid the flat likelihood where a level vanishes."""
         x = jnp.exp(jnp.concatenate([vector[:9], vector[10:]])) + _FLOORS
-        middle = jnp.sqrt(_SHORTEST * _LONGEST)
         return Noise(
             gyro=x[0:3],
             rate_walk=x[3:6],
             disturbance=x[6:9],
-            correlation_time=middle * jnp.exp(jnp.tanh(vector[9]) * jnp.log(_LONGEST / middle)),
+            correlation_time=_MIDDLE * jnp.exp(vector[9]),
             accelerometer=x[9],
             accelerometer_lag=x[10],
             force_disturbance=x[11],
@@ -74,6 +76,13 @@ class Noise(eqx.Module):
             rotor_disturbance=x[14],
             command=x[15],
         )
+
+    @staticmethod
+    def bounds() -> tuple[Float[Array, "17"], Float[Array, "17"]]:
+        """Smallest and largest vector: only the correlation time is bounded, to what a flight's segments can tell."""
+        ends = (math.log(time / _MIDDLE) for time in (_SHORTEST, _LONGEST))
+        low, high = (jnp.full(17, free).at[9].set(end) for free, end in zip(UNBOUNDED, ends, strict=True))
+        return low, high
 
     @staticmethod
     def first(data: FlightData) -> Noise:

@@ -12,7 +12,7 @@ from cfb_mjx.sysid.fitted import Estimate, numbers_of
 from cfb_mjx.sysid.identification.filters import Feedback
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.uncertainty import Uncertainty, power_product
-from cfb_mjx.sysid.identification.unknowns import OFFSETS, UNITS, Unknowns
+from cfb_mjx.sysid.identification.unknowns import OFFSETS, UNITS, Unknowns, at_the_border
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,8 @@ class Fit:
         hold: how long a logged command acted, s (innovation); None: until the next row.
         contradicted: parameters that were not requested but are fitted too, because the flights contradict their fixed
             values.
+        unexplained: parameters whose fixed values the flights contradict, but for which no possible value fits them:
+            the model lacks something else.
         noise: noise levels (innovation).
         whiteness: lag-one correlation of the innovations per channel; near 0 if the noise model is right (innovation).
         feedback: test of whether the commands responded to the gyro (innovation).
@@ -51,6 +53,7 @@ class Fit:
     rows: int
     hold: float | None = None
     contradicted: tuple[str, ...] = ()
+    unexplained: tuple[str, ...] = ()
     noise: Noise | None = None
     whiteness: dict[str, float] | None = None
     feedback: Feedback | None = None
@@ -78,6 +81,7 @@ class Fit:
             "unidentifiable_because": self.unidentifiable,
             "combinations": numbers_of(self.combinations),
             "held_fixed_contradicted": list(self.contradicted),
+            "held_fixed_unexplained": list(self.unexplained),
             "command_hold_s": self.hold,
             "correlation": {"names": self.uncertainty.order, "matrix": self.uncertainty.correlation},
             "estimator": self.estimator,
@@ -170,6 +174,15 @@ _FILE_KEYS = (
     "pose_delay",
 )
 _AXES = ("inertia_xx", "inertia_yy", "inertia_zz")
+
+
+def is_possible(name: str, parameters: Parameters) -> bool:
+    """Whether a parameter of a fit (`unknowns.UNITS`) has a value that a drone may have."""
+    if name in at_the_border(parameters):
+        return False
+    groups = {**dict.fromkeys(_AXES, "inertia"), **dict.fromkeys(("cog_x", "cog_y"), "center_of_gravity")}
+    key = (groups | {"thrust_linear": "thrust_polynomial"}).get(name, name)
+    return bool(np.all(SPECIFICATIONS[key].limits.holds(np.asarray(getattr(parameters, key)))))
 
 
 def _describe(base: ModelFile, result: Fit, source: str) -> ModelFile:

@@ -63,10 +63,15 @@ def surprise(whitened: Array, robust: bool) -> Array:
 RIDGE = 0.1
 """Every unknown has a prior of 1 / RIDGE = 10 units about the preset (a factor of e^10): far too wide to matter where
 data say anything, and enough to keep the normal equations regular where they say nothing."""
-SETTLED = 1e-6
+SOLVED = 1e-6
 """Squared length of the last step in standard deviations of the estimate: a thousandth of one."""
 FIRST_DAMPING = 1e-3
 MAX_STEPS = 60
+POOR = 0.25
+"""A step that lowers the cost by less than this share of what was expected was much too long."""
+EDGE = 1e-9
+"""An unknown that is nearer to a bound than this is at the bound."""
+UNBOUNDED = (-jnp.inf, jnp.inf)
 
 
 class Quadratic(NamedTuple):
@@ -75,6 +80,10 @@ class Quadratic(NamedTuple):
     cost: Float[Array, ""]
     slope: Float[Array, " k"]
     curvature: Float[Array, "k k"]
+
+
+Bounds = tuple[Float[Array, " k"] | float, Float[Array, " k"] | float]
+"""Smallest and largest value of the unknowns."""
 
 
 class Descent(NamedTuple):
@@ -95,24 +104,41 @@ class Descent(NamedTuple):
         nothing = Quadratic(unknown, zero, jnp.eye(len(start), dtype=start.dtype))
         return cls(nothing, jnp.zeros_like(unknown), zero, unknown)
 
-    def advanced(self, there: Quadratic, x: Float[Array, " k"]) -> tuple[Float[Array, " k"], Descent]:
-        """Take the step from ``x`` to ``there``: if that raises the cost (or makes it NaN) stay, and damp the next."""
+    def advanced(
+        self, there: Quadratic, x: Float[Array, " k"], bounds: Bounds = UNBOUNDED
+    ) -> tuple[Float[Array, " k"], Descent]:
+        """Take the step from ``x`` to ``there``: if that raises the cost (or makes it NaN) stay, and damp the next.
+
+        An unknown at a bound that the cost pushes outwards is held there while the others step.
+        """
+        low, high = bounds
         better = there.cost <= self.here.cost
+        x = jnp.where(better, x + self.step, x)
+        expected = self.step @ self.here.curvature @ self.step
+        linear = 2 * self.here.slope @ self.step
+        gained = (self.here.cost - there.cost) / -(linear + expected)
+        # The cost curves so much more along the step than was expected; a step shorter by this factor would be right.
+        curved = (there.cost - self.here.cost - linear) / expected
+        short = jnp.where(jnp.isfinite(curved), curved - 1, 0.0)
         here = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, self.here)
-        eased = jnp.where(self.damping > FIRST_DAMPING, 0.1 * self.damping, 0.0)
-        damping = jnp.where(better, eased, jnp.maximum(10 * self.damping, FIRST_DAMPING))
+        damping = jnp.where(better, 0.1 * self.damping, jnp.maximum(10 * self.damping, FIRST_DAMPING))
+        # At most 1, which halves the step: what is known of the curvature farther away says little nearby.
+        damping = jnp.where(gained < POOR, jnp.maximum(damping, jnp.minimum(short, 1.0)), damping)
+        damping = jnp.where(damping < FIRST_DAMPING, 0.0, damping)
         raised = here.curvature + damping * jnp.diag(jnp.diag(here.curvature))
-        step = -jnp.linalg.solve(raised, here.slope)
-        return jnp.where(better, x + self.step, x), Descent(here, damping, step, -here.slope @ step)
+        out = ((x <= low + EDGE) & (here.slope > 0)) | ((x >= high - EDGE) & (here.slope < 0))
+        raised = jnp.where(out[:, None] | out, jnp.eye(len(x), dtype=x.dtype), raised)
+        step = -jnp.linalg.solve(raised, jnp.where(out, 0.0, here.slope))
+        step = jnp.clip(x + step, low, high) - x
+        return x, Descent(here, damping, step, -here.slope @ step)
 
-    @property
-    def going_on(self) -> Bool[Array, ""]:
+    def going_on(self, accuracy: float = SOLVED) -> Bool[Array, ""]:
         """Whether the step is worth trying; False where its gain is NaN."""
-        return self.gain > SETTLED
+        return self.gain > accuracy
 
-    def ended(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
+    def ended(self, x: Float[Array, " k"], accuracy: float = SOLVED) -> Float[Array, " k"]:
         """The last step is too short to be worth another linearisation, and is taken on trust."""
-        return jnp.where(self.gain <= SETTLED, x + self.step, x)
+        return jnp.where(self.gain <= accuracy, x + self.step, x)
 
 
 class _State(eqx.Module):
@@ -146,7 +172,7 @@ class GaussNewton(optx.AbstractLeastSquaresSolver):
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Whether the next step is too short to matter."""
-        return ~state.descent.going_on, optx.RESULTS.successful
+        return ~state.descent.going_on(), optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result) -> tuple[Array, Any, dict[str, Any]]:
         """Take the last step."""
@@ -220,7 +246,9 @@ def descended(
     about: Callable[[Array], Iterable[Quadratic]],
     start: Float[Array, " k"],
     ridge: Float[Array, " k"] | float = RIDGE,
-    levels: bool = False,
+    levels: Bool[Array, " k"] | bool = False,
+    bounds: Bounds = UNBOUNDED,
+    accuracy: float = SOLVED,
 ) -> Float[Array, " k"]:
     """The minimum of a sum of costs, from ``start``.
 
@@ -230,31 +258,34 @@ def descended(
         about: linearises the cost of every part of the data.
         start: where to begin.
         ridge: as for `least_squares`.
-        levels: whether the unknowns are logarithms of levels, which may fall towards a lower bound.
+        levels: which unknowns are logarithms of levels, which may fall towards a lower bound.
+        bounds: of the unknowns.
+        accuracy: end where the squared length of the next step, in standard deviations of the estimate, is below.
     """
-    x, descent = start, Descent.first(start)
+    x = jnp.clip(start, *bounds)
+    descent = Descent.first(x)
     for _ in range(MAX_STEPS):
-        if not descent.going_on:
+        if not descent.going_on(accuracy):
             break
         parts = jax.tree.map(lambda *terms: jnp.asarray(sum(map(np.asarray, terms))), *about(x + descent.step))
-        x, descent = _tried(descent, _of_levels(parts) if levels else parts, x, ridge)
-    return descent.ended(x)
+        x, descent = _tried(descent, _of_levels(parts, levels), x, ridge, bounds)
+    return descent.ended(x, accuracy)
 
 
-def _of_levels(about: Quadratic) -> Quadratic:
+def _of_levels(about: Quadratic, levels: Bool[Array, " k"] | bool) -> Quadratic:
     """Slopes by logarithms are curvatures, too: nearly all of it where a level falls towards its lower bound.
 
     Without them the steps of such a level are many times too long, and the steps of all are damped.
     """
-    return about._replace(curvature=about.curvature + jnp.diag(jnp.maximum(about.slope, 0.0)))
+    return about._replace(curvature=about.curvature + jnp.diag(jnp.where(levels, jnp.maximum(about.slope, 0.0), 0.0)))
 
 
 @eqx.filter_jit
-def _tried(descent: Descent, data: Quadratic, x, ridge):
+def _tried(descent: Descent, data: Quadratic, x, ridge, bounds: Bounds):
     prior = jnp.broadcast_to(jnp.asarray(ridge) ** 2, x.shape)
     there = x + descent.step
     own = Quadratic(there @ (prior * there), prior * there, jnp.diag(prior))
-    return descent.advanced(jax.tree.map(jnp.add, data, own), x)
+    return descent.advanced(jax.tree.map(jnp.add, data, own), x, bounds)
 
 
 def _slopes(function, x):

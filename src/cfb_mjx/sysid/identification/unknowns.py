@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.errors import CfbError
 from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
+from cfb_mjx.sysid.identification.solver import UNBOUNDED
 
 UNITS = {
     "mass": "kg",
@@ -109,6 +110,16 @@ class Unknowns(eqx.Module):
         if "command_hold" not in self.names:
             return None
         return jnp.where(self.timed > 0, jnp.inf, self._hold(vector))
+
+    def bounds(self, interval: float) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+        """Smallest and largest vector: a command acts for -0.5 to 1.5 intervals between rows, s.
+
+        Beyond 0 to 1 only so that an estimate near them is not pushed to one side.
+        """
+        held = [name == "command_hold" for name in self.names]
+        ends = ((share * interval - HOLD) / OFFSETS["command_hold"] for share in (-0.5, 1.5))
+        low, high = (jnp.where(jnp.asarray(held), end, free) for end, free in zip(ends, UNBOUNDED, strict=True))
+        return low, high
 
     def _hold(self, vector):
         return HOLD + OFFSETS["command_hold"] * vector[self.names.index("command_hold")]
