@@ -56,7 +56,7 @@ ACCURACY = (1e-2, 1e-4, SOLVED)
 """Squared error of a round's parameters, in standard deviations of the estimate; the last also of later rounds."""
 LEVELS = 1e-3
 """Least squared error of noise levels: a few per cent of a standard deviation do not move the parameters."""
-FEW = 2
+FEW = 4
 """Number of `parts`, spread over the flights, to which long flights are fitted first: from there all of them need few
 steps."""
 SETTLED = 5e-4

@@ -17,7 +17,7 @@ from cfb_mjx.model.state import AnyArray
 ROWS_PER_SEGMENT = 641
 """Long flights are cut into overlapping segments of this many rows, which are processed in parallel. With one shape for
 all flights, programs are compiled once and then come from the cache."""
-_COUNTS = (1, 2, 3, 4, 6, 8)
+_COUNTS = (1, 2, 4)
 """Numbers of segments to which the data are padded. More segments are processed in parts of the largest number: few
 programs then serve flights of any length, and the numbers of a part fit into a core's cache."""
 
