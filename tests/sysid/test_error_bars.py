@@ -111,7 +111,7 @@ def test_commands_that_act_later_than_logged_do_not_hold_up_a_fit(monkeypatch):
     def counted(about, *rest, **more):
         return descended(lambda x: tried.append(x) or about(x), *rest, **more)
 
-    monkeypatch.setattr("cfb_mjx.sysid.identification.fitting.descended", counted)
+    monkeypatch.setattr("cfb_mjx.sysid.identification.likelihood.descended", counted)
     fit([late], NOMINAL)
     assert len(tried) < 250
 

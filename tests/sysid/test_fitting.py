@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from cfb_mjx.errors import CfbError
 from cfb_mjx.logs.resample import interpolate
 from cfb_mjx.parameters import load_model_file
-from cfb_mjx.sysid.identification import fitting, flight_data
+from cfb_mjx.sysid.identification import flight_data, likelihood
 from cfb_mjx.sysid.identification.filters import detect
 from cfb_mjx.sysid.identification.fitting import fit
 from cfb_mjx.sysid.identification.flight_data import prepare
@@ -102,24 +102,24 @@ def test_parts_of_the_data_say_what_all_say(campaign, monkeypatch):
     assert sum(len(part.valid) for part in some) == len(whole.valid)
 
     def sums(segments):
-        driven = fitting._driven(unknowns, unknowns.start, noise, segments, False, False)
-        weighed = fitting._weights(unknowns, unknowns.start, noise, segments, False, False)
+        driven = likelihood._driven(unknowns, unknowns.start, noise, segments, False, False)
+        weighed = likelihood._weights(unknowns, unknowns.start, noise, segments, False, False)
         return (
-            fitting._likelihood(levels, unknowns, unknowns.start, segments, driven, False, False),
-            fitting._squares(unknowns.start, unknowns, noise, segments, weighed, False, False),
+            likelihood._likelihood(levels, unknowns, unknowns.start, segments, driven, False, False),
+            likelihood._squares(unknowns.start, unknowns, noise, segments, weighed, False, False),
         )
 
     once, each = sums(whole), [jax.tree.leaves(sums(part)) for part in some]
     for a, b in zip(jax.tree.leaves(once), map(sum, zip(*each, strict=True)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-9 * np.max(np.abs(b)))
     fit_of_parts, fit_of_all = (
-        fitting._scores(unknowns, unknowns.start, noise, segments, False, False) for segments in (some, [whole])
+        likelihood.scores_of(unknowns, unknowns.start, noise, segments, False, False) for segments in (some, [whole])
     )
     np.testing.assert_allclose(fit_of_parts[0], fit_of_all[0], rtol=1e-9, atol=1e-9)
     # Any other solver sees all parts, too.
-    fixed = unknowns, unknowns.start, noise, some, False, False, fitting.Prior(jnp.ones(len(unknowns.names)))
+    fixed = unknowns, unknowns.start, noise, some, False, False, likelihood.Prior(jnp.ones(len(unknowns.names)))
     ours, theirs = (
-        fitting._fit_vector(*fixed, solver) for solver in (None, optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9))
+        likelihood._fit_vector(*fixed, solver) for solver in (None, optx.LevenbergMarquardt(rtol=1e-9, atol=1e-9))
     )
     np.testing.assert_allclose(ours, theirs, atol=3e-3)
     names = unknowns.names
@@ -226,12 +226,12 @@ def test_a_round_ends_at_its_minimum_where_commands_were_not_logged(campaign):
     data = prepare(logs[:1])
     unknowns, noise = choose("inertia,rotor_inertia,motor,command_hold", NOMINAL), Noise.first(data)
     segments, ridge = jax.tree.map(jnp.asarray, data.segments), jnp.full(len(unknowns.names), RIDGE)
-    weighed = fitting._weights(unknowns, unknowns.start, noise, segments, True, False)
+    weighed = likelihood._weights(unknowns, unknowns.start, noise, segments, True, False)
     assert jnp.max(weighed.doubt) > 0
-    vector = fitting._fit_vector(unknowns, unknowns.start, noise, [segments], True, False, fitting.Prior(ridge))
+    vector = likelihood._fit_vector(unknowns, unknowns.start, noise, [segments], True, False, likelihood.Prior(ridge))
 
     def residual(x):
-        return fitting._residual(x, unknowns, noise, segments, True, False, weighed).ravel()
+        return likelihood._residual(x, unknowns, noise, segments, True, False, weighed).ravel()
 
     jacobian = np.asarray(jax.jacfwd(residual)(vector))
     slope = jacobian.T @ np.asarray(residual(vector)) + RIDGE**2 * vector

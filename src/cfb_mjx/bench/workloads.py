@@ -231,8 +231,8 @@ def _of_ten_parameters(drones: int):
 def fit_jacobian() -> Workload:
     """Residuals of a fit to the shipped logs and their derivatives with respect to its parameters; a step is a row."""
     from cfb_mjx.logs import read_log
-    from cfb_mjx.sysid.identification.fitting import fit_slopes
     from cfb_mjx.sysid.identification.flight_data import prepare
+    from cfb_mjx.sysid.identification.likelihood import fit_slopes
     from cfb_mjx.sysid.identification.noise import Noise
     from cfb_mjx.sysid.identification.unknowns import choose
 

@@ -33,9 +33,9 @@ from cfb_mjx.model.state import AnyArray, State
 from cfb_mjx.optional import not_none
 from cfb_mjx.sysid.excitation.experiment import TICK, Conditions, Experiment, follow
 from cfb_mjx.sysid.excitation.manoeuvres import PATHS, STEP, path
-from cfb_mjx.sysid.identification.fitting import fit_noise, slopes_in_blocks
 from cfb_mjx.sysid.identification.flight_data import Segments, parts, prepare
 from cfb_mjx.sysid.identification.innovation import whitened
+from cfb_mjx.sysid.identification.likelihood import fit_noise, slopes_in_blocks
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.uncertainty import LOOSEST, Scores, Uncertainty, assess
 from cfb_mjx.sysid.identification.unknowns import UNITS, Unknowns
