@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.model.bodies import RigidBody
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.identification import fitting, flight_data, shooting
+from cfb_mjx.sysid.identification import Fit, flight_data, likelihood, shooting
 from cfb_mjx.sysid.identification.solver import RIDGE
 from cfb_mjx.sysid.identification.unknowns import Unknowns, choose
 
@@ -53,7 +53,7 @@ def of_shooting(logs: list[FlightLog], nominal: Parameters, names, use_measured:
     )
 
 
-def of_innovations(logs: list[FlightLog], found: fitting.Fit, nominal: Parameters) -> Problem:
+def of_innovations(logs: list[FlightLog], found: Fit, nominal: Parameters) -> Problem:
     """Return the problem of whitened innovations, with the noise levels of a finished fit."""
     unknowns = choose(found.names, nominal)
     whole = flight_data.prepare(list(logs)).segments
@@ -61,13 +61,15 @@ def of_innovations(logs: list[FlightLog], found: fitting.Fit, nominal: Parameter
 
     @eqx.filter_jit
     def residual(vector, noise, segments):
-        return fitting._residual(vector, unknowns, noise, segments, True, False).ravel()
+        return likelihood._residual(vector, unknowns, noise, segments, True, False).ravel()
 
     return Problem(
         unknowns,
         lambda x: np.asarray(residual(jnp.asarray(x), found.noise, segments)),
         lambda solver=None: np.asarray(
-            fitting._fit_vector(unknowns, unknowns.start, found.noise, parts, True, False, RIDGE, solver)
+            likelihood._fit_vector(
+                unknowns, unknowns.start, found.noise, parts, True, False, likelihood.Prior(RIDGE), solver
+            )
         ),
     )
 

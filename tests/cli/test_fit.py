@@ -59,3 +59,4 @@ def test_a_model_that_predicts_worse_than_before_is_said_to():
 
     assert "12 of 12 held-out errors grew" in said(1.0, 2.0)
     assert "grew" not in said(2.0, 1.0)
+    assert "grew" not in said(1.0, 1.001)

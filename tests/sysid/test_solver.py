@@ -138,9 +138,12 @@ def test_a_level_that_falls_to_its_bound_holds_up_no_other():
 
 
 @pytest.mark.parametrize("high", [0.5, 5.0])
-def test_within_bounds_it_finds_what_scipy_finds(high):
+@pytest.mark.parametrize("alike", [0.0, 0.99])
+def test_within_bounds_it_finds_what_scipy_finds(high, alike):
+    """With unknowns that do alike, what the others do depends on one that is stopped at its bound."""
     rng = np.random.default_rng(4)
     slopes, wanted = rng.normal(size=(30, 3)), np.array([2.0, -1.0, 0.3])
+    slopes = alike * slopes[:, :1] + np.sqrt(1 - alike**2) * slopes
     values = slopes @ wanted + 0.1 * rng.normal(size=30)
     bounds = (jnp.array([-jnp.inf, -0.2, -jnp.inf]), jnp.array([high, jnp.inf, jnp.inf]))
 
@@ -151,15 +154,16 @@ def test_within_bounds_it_finds_what_scipy_finds(high):
     np.testing.assert_allclose(found, lsq_linear(slopes, values, bounds).x, atol=1e-6)
 
 
-def test_a_cost_that_curves_twice_as_much_as_is_thought_takes_few_steps():
+@pytest.mark.parametrize("factor", [2.0, 3.9, 4.0, 10.0])
+def test_a_cost_that_curves_more_than_is_thought_takes_few_steps(factor):
     """Steps of twice the length never end: real flights are not as noisy as their own noise model says."""
     tried, weight = [], jnp.array([100.0, 3.0])
 
     def about(x):
         tried.append(x)
         away = x - jnp.array([1.0, -2.0])
-        return [Quadratic(away @ (weight * away), weight * away, jnp.diag(weight) / 2)]
+        return [Quadratic(away @ (weight * away), weight * away, jnp.diag(weight) / factor)]
 
     found = descended(about, jnp.zeros(2), ridge=0.0)
     np.testing.assert_allclose(found, [1.0, -2.0], atol=1e-3)
-    assert len(tried) < 20
+    assert len(tried) < 30

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
 FITTED_SHARE = 0.75
 """Without --held-out, this first share of every log is fitted, and the rest is used for the evaluation."""
+GROWN = 1.02
+"""A held-out error that is larger than before by less than this factor counts as the same."""
 _NAMES = {"innovation": "innovations", "shooting": "multiple shooting"}
 
 
@@ -95,11 +97,11 @@ class Fitted(Result):
             yield f"not identifiable: {reason}"
         for name, e in self.fit.combinations.items():
             yield f"known better in combination: {name} = {e.value:.6g} +- {e.std:.2g}"
-        for name in self.fit.contradicted:
-            yield f"{name} was meant to stay fixed, but the flights contradict its value; it was fitted too."
-        for name in self.fit.unexplained:
+        if freed := ", ".join(self.fit.contradicted):
+            yield f"fitted too, because the flights contradict what was meant to stay fixed: {freed}"
+        if fixed := ", ".join(self.fit.unexplained):
             yield (
-                f"{name} stayed fixed: the flights contradict its value, but no possible value fits them. "
+                f"fixed, though the flights contradict it, because no possible value fits them: {fixed}. "
                 "The model lacks something else; 'cfb close-loop' looks for it."
             )
         feedback = self.fit.feedback or (self.other and self.other.feedback)
@@ -125,12 +127,12 @@ class Fitted(Result):
                     name = f"{key}@{horizon}s"
                     quantity, _, unit = key.split("_")
                     text = f"{label}, {quantity} {unit}, {horizon} s"
-                    grown.append(new[name] > old[name])
+                    grown.append(new[name] > GROWN * old[name])
                     yield f"{text:<40}{old[name]:>10.4g}{new[name]:>12.4g}{still[name]:>12.4g}"
         if 2 * sum(grown) > len(grown):
             yield (
                 f"{sum(grown)} of {len(grown)} held-out errors grew: the fitted model is worse than the one before. It "
-                "lacks something that these flights show; 'cfb close-loop' looks for it."
+                "lacks something that the held-out flights show; 'cfb close-loop' looks for it."
             )
 
 

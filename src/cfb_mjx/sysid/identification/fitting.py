@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -22,7 +22,7 @@ from cfb_mjx.sysid.identification.flight_data import Segments, parts, prepare
 from cfb_mjx.sysid.identification.innovation import CHANNELS
 from cfb_mjx.sysid.identification.likelihood import ROUNDS, Prior, joined, scores_of, settled, surprise_of
 from cfb_mjx.sysid.identification.noise import Noise
-from cfb_mjx.sysid.identification.result import Fit, is_possible, summarise
+from cfb_mjx.sysid.identification.result import Fit, impossible, summarise
 from cfb_mjx.sysid.identification.shooting import shoot
 from cfb_mjx.sysid.identification.solver import RIDGE
 from cfb_mjx.sysid.identification.uncertainty import Scores, assess, most_contradicted
@@ -85,8 +85,8 @@ def fit(
         over: devices to divide the segments of the flights over.
         mass_std: standard deviation of the nominal mass, kg, which the intervals of all that scales with it take up
             (innovation only); None takes `MASS_STD` of the mass, 0 an exact one. Without meaning if the mass is fitted.
-        solver: least-squares solver of optimistix, such as ``optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)``; None
-            takes `GaussNewton`.
+        solver: least-squares solver of optimistix, such as ``optx.LevenbergMarquardt(rtol=1e-8, atol=1e-8)``, which
+            knows no bounds; None takes `solver.descended`.
 
     Raises:
         CfbError: unknown parameters, or logs without enough contiguous data.
@@ -108,16 +108,18 @@ def fit(
         asked=asked,
         interval=float(np.median(interval[interval > 0])),
         slowest=max(float(np.median(each[each > 0])) for each in interval),
+        measured=np.asarray(data.segments.measured) if use_measured else np.zeros(1),
         use_measured=use_measured,
         robust=robust,
         solver=solver,
         progress=progress,
         over=over,
     )
-    found = flights.freed(_At(choose(_playing(asked), nominal), Noise.first(data)))
+    unknowns = choose(_playing(asked), nominal)
+    found = flights.freed(_At(unknowns, Noise.first(data), unknowns.start))
     if progress is not None:
         progress(ROUNDS, ROUNDS)
-    (unknowns, noise, vector), names = found.at, found.at.unknowns.names
+    (unknowns, noise, vector), names = found.at, unknowns.names
     is_timed = float(unknowns.timed) > 0
     fitted = tuple(name for name in names if name in found.free and not (is_timed and name == "command_hold"))
     deviation = MASS_STD if mass_std is None else mass_std / float(nominal.mass)
@@ -128,12 +130,12 @@ def fit(
     blur = np.array([_blur(name, float(v)) for name, v in zip(names, unknowns.values(vector), strict=True)])
     # Only where some commands were not logged, and nothing else says how fast the rotors turned.
     missing = 1 - min(max(found.at.hold / flights.interval, 0.0), 1.0) ** 2
-    blur *= (flights.interval / 0.01) ** 2 * missing * (not flights.has_rotor_speed(all))
+    blur *= (flights.interval / 0.01) ** 2 * missing * (not np.all(flights.measured))
     uncertainty = assess(found.scores.columns(columns), judged, priors, blur[columns])
     axes = set(GROUPS["inertia"]) & set(fitted)
     # An axis that the flights cannot tell may have wandered to the border: they do not ask for that.
     asks = axes and not axes & set(uncertainty.names)
-    impossible = at_the_border(unknowns.apply(vector)) if asks else {}
+    refused = at_the_border(found.at.drone) if asks else {}
     return summarise(
         unknowns,
         vector,
@@ -141,7 +143,7 @@ def fit(
         "innovation",
         data.rows,
         names=tuple(name for name in fitted if name != "command_hold" or name in asked),
-        impossible=impossible,
+        impossible=refused,
         contradicted=found.contradicted,
         unexplained=found.unexplained,
         noise=noise,
@@ -158,13 +160,18 @@ class _At(NamedTuple):
     vector: Array
 
     @property
+    def drone(self) -> Parameters:
+        """The drone at this point."""
+        return self.unknowns.apply(self.vector)
+
+    @property
     def hold(self) -> float:
         """Time for which a logged command acted, s."""
         return float(not_none(self.unknowns.hold(self.vector)))
 
     def timed(self, is_timed: bool) -> _At:
         """The same, with every command acting until the next row or not."""
-        return self._replace(unknowns=replace(self.unknowns, timed=jnp.asarray(float(is_timed))))
+        return self._replace(unknowns=replace(self.unknowns, timed=float(is_timed)))
 
 
 class _Found(NamedTuple):
@@ -188,23 +195,23 @@ class _Flights:
     """Median time between rows, s."""
     slowest: float
     """That of the segment whose rows are farthest apart, s."""
+    measured: np.ndarray
+    """Whether rotor speed is used, of each segment."""
     use_measured: bool
     robust: bool
     solver: optx.AbstractLeastSquaresSolver | None
     progress: Callable[[int, int], None] | None
     over: Devices | None
 
-    def has_rotor_speed(self, which: Callable[[Iterable], bool]) -> bool:
-        """Whether rotor speed is used in ``any`` or ``all`` of the segments."""
-        return self.use_measured and which(bool(x) for part in self.segments for x in np.asarray(part.measured))
-
     def freed(self, at: _At) -> _Found:
         """Fit what was asked for, and what proves to be contradicted."""
         tried = [name for name in at.unknowns.names if name not in (*self.asked, "mass", "command_hold")]
-        if not self.has_rotor_speed(any):
+        if not np.any(self.measured):
             tried = [name for name in tried if name not in NEED_ROTOR_SPEED]
-        free, contradicted, unexplained = (*self.asked, "command_hold"), (), ()
-        if len(self.segments) > FEW:
+        free, contradicted, unexplained = (*self.asked, "command_hold"), (), {}
+        # Where only some flights say how fast the rotors turned, a few parts may say nothing of it.
+        alike = np.all(self.measured) or not np.any(self.measured)
+        if len(self.segments) > FEW and alike and self.solver is None:
             at = self.settled(free, at, self.segments[:: -(-len(self.segments) // FEW)])
         at = self.settled(free, at)
         while True:
@@ -215,14 +222,17 @@ class _Flights:
                 names = GROUPS["inertia"] if name in GROUPS["inertia"] else (name,)
                 tried = [n for n in tried if n not in names]
                 moved = self.settled((*free, *names), at)
-                drone = moved.unknowns.apply(moved.vector)
-                if not all(is_possible(n, drone) for n in (*contradicted, *names)):
-                    unexplained = (*unexplained, *names)
+                if impossible((*free, *names), moved.drone) - impossible(free, at.drone):
+                    unexplained |= dict.fromkeys(names, free)
                     continue
                 free, contradicted, at = (*free, *names), (*contradicted, *names), moved
                 residual, scores = self.scores(at)
-            if free == timed_with:  # what was freed may change whether commands acted until the next row
-                return _Found(at, free, contradicted, unexplained, residual, scores)
+            # What was freed later may change whether a value is explained, and whether commands acted until the next
+            # row.
+            tried = [*tried, *(name for name, then in unexplained.items() if then != free)]
+            unexplained = {name: then for name, then in unexplained.items() if then == free}
+            if free == timed_with:
+                return _Found(at, free, contradicted, tuple(unexplained), residual, scores)
 
     def settled(self, free: tuple[str, ...], at: _At, some: list[Segments] | None = None) -> _At:
         """The likeliest noise levels and parameters, of which those that are ``free`` move."""
@@ -248,7 +258,7 @@ class _Flights:
         if held.hold <= NEARLY * self.interval:
             return held
         timed = at if is_timed else self.settled(free, at.timed(True))
-        return min(timed, held, key=self.surprise)
+        return timed if self.surprise(timed) <= self.surprise(held) else held
 
     def surprise(self, at: _At) -> float:
         """Negative logarithm of the likelihood per row, of commands that are what they are taken for and no other."""

@@ -81,7 +81,9 @@ class Noise(eqx.Module):
     def bounds() -> tuple[Float[Array, "17"], Float[Array, "17"]]:
         """Smallest and largest vector: only the correlation time is bounded, to what a flight's segments can tell."""
         ends = (math.log(time / _MIDDLE) for time in (_SHORTEST, _LONGEST))
-        low, high = (jnp.full(17, free).at[9].set(end) for free, end in zip(UNBOUNDED, ends, strict=True))
+        low, high = (
+            jnp.full(17, free, jnp.result_type(float)).at[9].set(end) for free, end in zip(UNBOUNDED, ends, strict=True)
+        )
         return low, high
 
     @staticmethod

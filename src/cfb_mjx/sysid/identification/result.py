@@ -12,7 +12,7 @@ from cfb_mjx.sysid.fitted import Estimate, numbers_of
 from cfb_mjx.sysid.identification.filters import Feedback
 from cfb_mjx.sysid.identification.noise import Noise
 from cfb_mjx.sysid.identification.uncertainty import Uncertainty, power_product
-from cfb_mjx.sysid.identification.unknowns import OFFSETS, UNITS, Unknowns, at_the_border
+from cfb_mjx.sysid.identification.unknowns import GROUPS, OFFSETS, UNITS, Unknowns, at_the_border
 
 
 @dataclass(frozen=True)
@@ -173,16 +173,30 @@ _FILE_KEYS = (
     "torque_scale",
     "pose_delay",
 )
-_AXES = ("inertia_xx", "inertia_yy", "inertia_zz")
+_AXES = GROUPS["inertia"]
+_KEYS = {
+    **dict.fromkeys(_AXES, "inertia"),
+    **dict.fromkeys(GROUPS["cog"], "center_of_gravity"),
+    "thrust_linear": "thrust_polynomial",
+}
+"""Keys of a model file, where they are not the names in a fit."""
 
 
-def is_possible(name: str, parameters: Parameters) -> bool:
-    """Whether a parameter of a fit (`unknowns.UNITS`) has a value that a drone may have."""
-    if name in at_the_border(parameters):
+def impossible(names: tuple[str, ...], parameters: Parameters) -> set[str]:
+    """Those parameters of a fit (`unknowns.UNITS`) that have values which no drone has."""
+    border = set(GROUPS["inertia"]) & set(at_the_border(parameters))
+    return {name for name in names if name in border or not _is_possible(name, parameters)}
+
+
+def _is_possible(name: str, parameters: Parameters) -> bool:
+    key = _KEYS.get(name, name)
+    if key not in SPECIFICATIONS:  # of the log, not of the drone
+        return True
+    try:
+        SPECIFICATIONS[key].check(np.asarray(getattr(parameters, key)), name)
+    except CfbError:
         return False
-    groups = {**dict.fromkeys(_AXES, "inertia"), **dict.fromkeys(("cog_x", "cog_y"), "center_of_gravity")}
-    key = (groups | {"thrust_linear": "thrust_polynomial"}).get(name, name)
-    return bool(np.all(SPECIFICATIONS[key].limits.holds(np.asarray(getattr(parameters, key)))))
+    return True
 
 
 def _describe(base: ModelFile, result: Fit, source: str) -> ModelFile:

@@ -1,4 +1,4 @@
-"""Gauss-Newton and Fisher's scoring, damped only where a step fails.
+"""Gauss-Newton and Fisher's scoring, damped only where a step fails or lowers the cost far less than expected.
 
 `GaussNewton` is an optimistix solver: `least_squares` takes any other in its place, and
 ``optx.least_squares(residual, GaussNewton(), start)`` works on anybody's residual. Residuals come by the hundred
@@ -94,7 +94,8 @@ class Descent(NamedTuple):
     step: Float[Array, " k"]
     """To be tried next."""
     gain: Float[Array, ""]
-    """What the step lowers the quadratic by: its squared length in standard deviations of the estimate."""
+    """What the step lowers the quadratic by: its squared length in standard deviations of the estimate, if neither
+    damped nor bounded."""
 
     @classmethod
     def first(cls, start: Float[Array, " k"]) -> Descent:
@@ -109,7 +110,7 @@ class Descent(NamedTuple):
     ) -> tuple[Float[Array, " k"], Descent]:
         """Take the step from ``x`` to ``there``: if that raises the cost (or makes it NaN) stay, and damp the next.
 
-        An unknown at a bound that the cost pushes outwards is held there while the others step.
+        An unknown stays at a bound that it would pass.
         """
         low, high = bounds
         better = there.cost <= self.here.cost
@@ -122,15 +123,13 @@ class Descent(NamedTuple):
         short = jnp.where(jnp.isfinite(curved), curved - 1, 0.0)
         here = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, self.here)
         damping = jnp.where(better, 0.1 * self.damping, jnp.maximum(10 * self.damping, FIRST_DAMPING))
-        # At most 1, which halves the step: what is known of the curvature farther away says little nearby.
-        damping = jnp.where(gained < POOR, jnp.maximum(damping, jnp.minimum(short, 1.0)), damping)
+        # From none to 1 at most, which halves the step: the curvature farther away says little about that nearby.
+        most = jnp.maximum(10 * self.damping, 1.0)
+        damping = jnp.where(gained < POOR, jnp.maximum(damping, jnp.minimum(short, most)), damping)
         damping = jnp.where(damping < FIRST_DAMPING, 0.0, damping)
         raised = here.curvature + damping * jnp.diag(jnp.diag(here.curvature))
-        out = ((x <= low + EDGE) & (here.slope > 0)) | ((x >= high - EDGE) & (here.slope < 0))
-        raised = jnp.where(out[:, None] | out, jnp.eye(len(x), dtype=x.dtype), raised)
-        step = -jnp.linalg.solve(raised, jnp.where(out, 0.0, here.slope))
-        step = jnp.clip(x + step, low, high) - x
-        return x, Descent(here, damping, step, -here.slope @ step)
+        step = _bounded(raised, here.slope, low - x, high - x)
+        return x, Descent(here, damping, step, -step @ (2 * here.slope + here.curvature @ step))
 
     def going_on(self, accuracy: float = SOLVED) -> Bool[Array, ""]:
         """Whether the step is worth trying; False where its gain is NaN."""
@@ -138,7 +137,31 @@ class Descent(NamedTuple):
 
     def ended(self, x: Float[Array, " k"], accuracy: float = SOLVED) -> Float[Array, " k"]:
         """The last step is too short to be worth another linearisation, and is taken on trust."""
-        return jnp.where(self.gain <= accuracy, x + self.step, x)
+        return jnp.where((self.gain >= 0) & (self.gain <= accuracy), x + self.step, x)
+
+
+def _bounded(
+    curvature: Float[Array, "k k"], slope: Float[Array, " k"], low: Float[Array, " k"], high: Float[Array, " k"]
+) -> Float[Array, " k"]:
+    """The step to the minimum of a quadratic; what would leave its bounds stays at them, and the others follow.
+
+    Exact if one unknown would leave; of several, the one that leaves first is stopped first.
+    """
+
+    def others(step, stopped):
+        # Those that are stopped have their steps; the equations of the others hold, given these.
+        held = jnp.where(stopped, jnp.clip(step, low, high), 0.0)
+        matrix = jnp.where(stopped[:, None] | stopped, jnp.eye(len(slope), dtype=slope.dtype), curvature)
+        return jnp.where(stopped, held, -jnp.linalg.solve(matrix, jnp.where(stopped, 0.0, slope + curvature @ held)))
+
+    stopped = ((low > -EDGE) & (slope > 0)) | ((high < EDGE) & (slope < 0))
+    step = others(jnp.zeros_like(slope), stopped)
+    for _ in range(2):
+        leaves = ~stopped & ((step < low) | (step > high))
+        part = jnp.where(leaves, jnp.where(step < low, low, high) / jnp.where(leaves, step, 1.0), jnp.inf)
+        stopped = stopped | (leaves & (part == jnp.min(part)))
+        step = others(step, stopped)
+    return jnp.clip(step, low, high)
 
 
 class _State(eqx.Module):
@@ -148,7 +171,7 @@ class _State(eqx.Module):
 
 
 class GaussNewton(optx.AbstractLeastSquaresSolver):
-    """Full Gauss-Newton steps on the normal equations, damped as in Marquardt (1963) where one raises the cost.
+    """Full Gauss-Newton steps on the normal equations, damped as in Marquardt (1963) where one is too long.
 
     A solver for `optimistix.least_squares` whose unknowns are one vector. Jacobians are forward-mode. It ends where the
     next step is shorter than a thousandth of the estimate's standard deviation, if residuals are divided by their
@@ -258,7 +281,7 @@ def descended(
         about: linearises the cost of every part of the data.
         start: where to begin.
         ridge: as for `least_squares`.
-        levels: which unknowns are logarithms of levels, which may fall towards a lower bound.
+        levels: which unknowns are logarithms of what may fall towards nothing (or, of noise, towards a lower bound).
         bounds: of the unknowns.
         accuracy: end where the squared length of the next step, in standard deviations of the estimate, is below.
     """
@@ -273,9 +296,9 @@ def descended(
 
 
 def _of_levels(about: Quadratic, levels: Bool[Array, " k"] | bool) -> Quadratic:
-    """Slopes by logarithms are curvatures, too: nearly all of it where a level falls towards its lower bound.
+    """Slopes by logarithms are curvatures, too: nearly all of it where a level or a factor falls towards nothing.
 
-    Without them the steps of such a level are many times too long, and the steps of all are damped.
+    Without them the steps of such an unknown are many times too long, and the steps of all are damped.
     """
     return about._replace(curvature=about.curvature + jnp.diag(jnp.where(levels, jnp.maximum(about.slope, 0.0), 0.0)))
 

@@ -1,4 +1,4 @@
-"""Parameters that a fit may change, and their mapping to unconstrained unknowns of the optimiser.
+"""Parameters that a fit may change, and their mapping to unknowns of the optimiser.
 
 Every vector of unknowns is physically possible. Positive quantities are fitted as logarithms. The inertia is
 parametrised by the second moments of the mass distribution, so every possible rigid body can be reached and no
@@ -57,7 +57,7 @@ OFFSETS = {
 }
 """Quantities that may be zero, with the additive change per unit of the optimiser's unknown; the others change by a
 factor."""
-_AXES = ("inertia_xx", "inertia_yy", "inertia_zz")
+_AXES = GROUPS["inertia"]
 HOLD = 0.002
 """Initial value of the time for which a logged command acts, s: the firmware's rate loop runs at 500 Hz."""
 _FACTORS = ("mass", "rotor_inertia", "motor_time_constant", "motor_gain", "thrust_scale", "torque_scale")
@@ -118,7 +118,10 @@ class Unknowns(eqx.Module):
         """
         held = [name == "command_hold" for name in self.names]
         ends = ((share * interval - HOLD) / OFFSETS["command_hold"] for share in (-0.5, 1.5))
-        low, high = (jnp.where(jnp.asarray(held), end, free) for end, free in zip(ends, UNBOUNDED, strict=True))
+        low, high = (
+            jnp.asarray(np.where(held, end, free), jnp.result_type(float))
+            for end, free in zip(ends, UNBOUNDED, strict=True)
+        )
         return low, high
 
     def _hold(self, vector):
