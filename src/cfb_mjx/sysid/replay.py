@@ -147,7 +147,8 @@ def _in_turn(model: Quadrotor, some: Sequence[Lane], wanted: Wanted) -> Iterator
         if carry is None:
             carry = _begin(model, effects, {key: x[:, :2] for key, x in rows.items()})
         carry, found = _advance(model, effects, lead, measured, rows, carry, wanted)
-        yield jax.tree.map(lambda x: np.asarray(x)[: len(some)], found)
+        # Copied: a view would keep the lanes that only fill up.
+        yield jax.tree.map(lambda x: np.array(x[: len(some)]) if width > len(some) else np.asarray(x), found)
 
 
 def replays_in_pieces(model: Quadrotor, lanes: Sequence[Lane], blocks: int) -> Iterator[Replay]:

@@ -202,10 +202,14 @@ class Predictions:
 
     def errors(self, model: Quadrotor, trims: np.ndarray) -> list[np.ndarray]:
         """Errors (W, H, 2) of attitude and velocity relative to those of `hold`, for every part."""
+        return [np.linalg.norm(error, axis=-1) for error in self._raw(model, trims)]
+
+    def _raw(self, model: Quadrotor, trims: np.ndarray) -> list[np.ndarray]:
+        """The same, (W, H, 2, 3), as vectors."""
         found = []
         for part in self.parts:
             chunks = [np.asarray(_scaled(model, c, _own(trims, c), self.sizes, part.measured)) for c in part.chunks]
-            found.append(np.linalg.norm(np.concatenate(chunks)[: len(part.flight)], axis=-1))
+            found.append(np.concatenate(chunks)[: len(part.flight)])
         return found
 
     def losses(self, errors: list[np.ndarray]) -> list[np.ndarray]:
@@ -258,17 +262,18 @@ class Predictions:
         moved = [with_values(model, numbers, _but(values, k, by)) for k, by in zip(free, steps, strict=True)]
         # The parameters of an effect whose memory follows the flight also act through the memory at a window's start.
         kept = {type(e).name for e in model.effects if overrides(e, "follow")}
-        began = {i: self.started(moved[i]) for i, k in enumerate(free) if numbers[k].effect in kept}
+        # Of the windows that begin elsewhere only the errors are kept: their inputs are as large as all others'.
+        elsewhere = {
+            i: self.started(moved[i])._raw(moved[i], trims) for i, k in enumerate(free) if numbers[k].effect in kept
+        }
         along = np.concatenate([[numbers[k].scale for k in free] / steps, np.full(3, 1 / STEP)])
         for place, part in enumerate(self.parts):
             groups = [
                 _moves(model, moved, chunk, _own(trims, chunk), self.sizes, part.measured) for chunk in part.chunks
             ]
             found = np.concatenate(groups, axis=1)[:, : len(part.flight)]
-            for i, elsewhere in began.items():
-                chunks = elsewhere.parts[place].chunks
-                there = [_scaled(moved[i], c, _own(trims, c), self.sizes, part.measured) for c in chunks]
-                found[1 + i] = np.concatenate(there)[: len(part.flight)]
+            for i, there in elsewhere.items():
+                found[1 + i] = there[place]
             error, slope = found[0], np.zeros((*found[0].shape, count + 3))
             difference = _unwrapped(found[1:], error, np.asarray(self.sizes)) - error
             slope[..., [*free, count, count + 1, count + 2]] = np.moveaxis(difference, 0, -1) * along
