@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from cfb_mjx.sysid.identification.flight_data import FlightData
-from cfb_mjx.sysid.identification.solver import UNBOUNDED
+from cfb_mjx.sysid.identification.solver import Bounds, bounded_one
 
 _SHORTEST, _LONGEST = 0.03, 3.0  # correlation time of the disturbance, s
 _MIDDLE = math.sqrt(_SHORTEST * _LONGEST)
@@ -78,13 +78,9 @@ class Noise(eqx.Module):
         )
 
     @staticmethod
-    def bounds() -> tuple[Float[Array, "17"], Float[Array, "17"]]:
+    def bounds() -> Bounds:
         """Smallest and largest vector: only the correlation time is bounded, to what a flight's segments can tell."""
-        ends = (math.log(time / _MIDDLE) for time in (_SHORTEST, _LONGEST))
-        low, high = (
-            jnp.full(17, free, jnp.result_type(float)).at[9].set(end) for free, end in zip(UNBOUNDED, ends, strict=True)
-        )
-        return low, high
+        return bounded_one(17, 9, *(math.log(time / _MIDDLE) for time in (_SHORTEST, _LONGEST)))
 
     @staticmethod
     def first(data: FlightData) -> Noise:

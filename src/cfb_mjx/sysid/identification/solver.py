@@ -86,6 +86,12 @@ Bounds = tuple[Float[Array, " k"] | float, Float[Array, " k"] | float]
 """Smallest and largest value of the unknowns."""
 
 
+def bounded_one(count: int, which: int, low: float, high: float) -> Bounds:
+    """Bounds of ``count`` unknowns, of which only one has any."""
+    bottom, top = (jnp.full(count, free, jnp.result_type(float)) for free in UNBOUNDED)
+    return bottom.at[which].set(low), top.at[which].set(high)
+
+
 class Descent(NamedTuple):
     """The state of a damped descent beside the point that it has reached."""
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from cfb_mjx.errors import CfbError
 from cfb_mjx.optional import not_none
 from cfb_mjx.parameters import Parameters
-from cfb_mjx.sysid.identification.solver import UNBOUNDED
+from cfb_mjx.sysid.identification.solver import Bounds, bounded_one
 
 UNITS = {
     "mass": "kg",
@@ -111,18 +111,13 @@ class Unknowns(eqx.Module):
             return None
         return jnp.where(self.timed > 0, jnp.inf, self._hold(vector))
 
-    def bounds(self, interval: float) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
+    def bounds(self, interval: float) -> Bounds:
         """Smallest and largest vector: a command acts for -0.5 to 1.5 intervals between rows, s.
 
         Beyond 0 to 1 only so that an estimate near them is not pushed to one side.
         """
-        held = [name == "command_hold" for name in self.names]
         ends = ((share * interval - HOLD) / OFFSETS["command_hold"] for share in (-0.5, 1.5))
-        low, high = (
-            jnp.asarray(np.where(held, end, free), jnp.result_type(float))
-            for end, free in zip(ends, UNBOUNDED, strict=True)
-        )
-        return low, high
+        return bounded_one(len(self.names), self.names.index("command_hold"), *ends)
 
     def _hold(self, vector):
         return HOLD + OFFSETS["command_hold"] * vector[self.names.index("command_hold")]
