@@ -19,7 +19,7 @@ from cfb_mjx.optional import not_none  # noqa: E402
 from cfb_mjx.parameters import load_randomisation, sample_parameters  # noqa: E402
 from cfb_mjx.sysid import evaluate  # noqa: E402
 from cfb_mjx.sysid.identification.fitting import fit  # noqa: E402
-from cfb_mjx.sysid.identification.flight_data import prepare  # noqa: E402
+from cfb_mjx.sysid.identification.flight_data import ROWS_PER_SEGMENT, prepare  # noqa: E402
 
 over = Devices.take(DEVICES)
 assert over.count == DEVICES
@@ -44,7 +44,7 @@ def rollouts():
 
 def fitted(estimator):
     """Value and uncertainty of what is fitted to one flight, whose segments do not divide by two."""
-    odd = read_log(shipped("data", "flight_logs") / "yaw.mcap")
+    odd = read_log(shipped("data", "flight_logs") / "yaw.mcap").rows(slice(ROWS_PER_SEGMENT))
     assert len(not_none(prepare([odd]).segments).valid) % 2
     result = fit([odd], model.parameters, "inertia,motor_gain", estimator=estimator, over=over)
     # Each over its own size: they are of very different units.
