@@ -41,6 +41,13 @@ def test_rotor_speeds_alone_are_those_of_the_whole_model(model, flights):
         np.testing.assert_array_equal(alone, speed)
 
 
+def test_chosen_rows_are_those_of_all(model, flights):
+    chosen = [np.array([0, 511, 512, 512, 699]), np.zeros(0, dtype=int)]
+    every = remembered_along(model, flights, 0.1)
+    for rows, whole, some in zip(chosen, every, remembered_along(model, flights, 0.1, chosen), strict=True):
+        jax.tree.map(lambda x, y, rows=rows: np.testing.assert_array_equal(y, x[rows]), whole, some)
+
+
 def test_one_program_serves_all_rows(model, flights):
     """A weak type in what is carried on would make the second group of rows a program of its own."""
     effects = jax.tree.map(lambda x: np.asarray(x)[None], model.effects)

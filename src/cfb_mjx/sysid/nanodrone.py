@@ -275,8 +275,8 @@ def _stretch_of_flight(faults: SensorFaults, log: FlightLog, starts: Starts) -> 
 def _memory(model: Quadrotor, log: FlightLog, rows: np.ndarray) -> tuple:
     if not model.effects:
         return ()
-    ((_, memory),) = remembered_along(model, [prepare_flight(log, 0.0, 0.0)])
-    return jax.tree.map(lambda x: x[rows], memory)
+    ((_, memory),) = remembered_along(model, [prepare_flight(log, 0.0, 0.0)], rows=[rows])
+    return memory
 
 
 @eqx.filter_jit

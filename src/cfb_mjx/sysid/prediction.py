@@ -122,13 +122,14 @@ def starts_of_windows(
     nothing: tuple[np.ndarray, tuple] = np.zeros((0, 4)), ()
     if not there:
         return [nothing] * len(windows)
-    known = remembered_along(model, [not_none(flights[i]) for i in there])
+    rows = [windows[i].row for i in there]
+    known = remembered_along(model, [not_none(flights[i]) for i in there], rows=rows)
     found = []
     for i, (speed, memory) in zip(there, known, strict=True):
         log, own = logs[i], windows[i]
         # A start at a row's own time may lie before it by a rounding error.
         since = np.maximum(own.start - log.time[own.row], 0.0)
-        found.append((speed[own.row], jax.tree.map(lambda x, r=own.row: x[r], memory), log.command[own.row], since))
+        found.append((speed, memory, log.command[own.row], since))
     ends = np.cumsum([len(own) for own in windows])
     count = int(ends[-1])
     speed, memory, command, since = jax.tree.map(lambda *x: np.concatenate(x), *found)

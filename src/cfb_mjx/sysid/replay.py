@@ -58,6 +58,8 @@ class Lane(NamedTuple):
     rows and are not in the log (0: none are missing; about 1/4: every second one is)."""
     effects: tuple[Effect, ...] | None = None
     """Effects with other values, in place of the model's."""
+    rows: AnyArray | None = None
+    """(m,) rows, ascending, whose output is wanted; all by default."""
 
 
 class Replay(NamedTuple):
@@ -97,10 +99,21 @@ def _drives(effect: Effect) -> bool:
     return overrides(effect, "motors") or overrides(effect, "command")
 
 
-def remembered_along(model: Quadrotor, flights: Sequence[Flight], lead: float = 0.0) -> list[tuple[np.ndarray, tuple]]:
-    """Rotor speeds (n, 4) from commands, rad/s, and memories of all effects (leading axis n), at each row."""
-    alone = rotors_alone(model)
-    return list(_walked(alone, [Lane(flight, flight.rotor_speed, lead) for flight in flights], "memory"))
+def remembered_along(
+    model: Quadrotor, flights: Sequence[Flight], lead: float = 0.0, rows: Sequence[AnyArray] | None = None
+) -> list[tuple[np.ndarray, tuple]]:
+    """Rotor speeds (m, 4) from commands, rad/s, and memories of all effects (leading axis m), at rows of the flights.
+
+    Args:
+        model: the drone with its effects.
+        flights: prepared logs.
+        lead: as in `Lane`.
+        rows: (m,) rows of each flight, ascending; all by default.
+    """
+    wanted = [None] * len(flights) if rows is None else rows
+    pairs = zip(flights, wanted, strict=True)
+    lanes = [Lane(flight, flight.rotor_speed, lead, rows=own) for flight, own in pairs]
+    return list(_walked(rotors_alone(model), lanes, "memory"))
 
 
 def rotors_alone(model: Quadrotor) -> Quadrotor:
@@ -121,12 +134,14 @@ def _walked(model: Quadrotor, lanes: Iterable[Lane], wanted: Wanted) -> Iterator
 
 
 def _side_by_side(model: Quadrotor, some: list[Lane], wanted: Wanted) -> list:
-    together = _joined(_in_turn(model, some, wanted))
-    return [jax.tree.map(lambda x, i=i, n=len(lane.flight.time): x[i, :n], together) for i, lane in enumerate(some)]
-
-
-def _joined(pieces: Iterable):
-    return jax.tree.map(lambda *x: np.concatenate([np.asarray(y) for y in x], axis=1), *pieces)
+    rows = [np.arange(len(lane.flight.time)) if lane.rows is None else np.asarray(lane.rows) for lane in some]
+    kept: list[list] = [[] for _ in some]
+    for block, found in enumerate(_in_turn(model, some, wanted)):
+        for i, own in enumerate(rows):
+            # Copied: a view would keep the whole block.
+            here = own[slice(*np.searchsorted(own, [block * ROWS, (block + 1) * ROWS]))] - block * ROWS
+            kept[i].append(jax.tree.map(lambda x, i=i, here=here: x[i, here], found))
+    return [jax.tree.map(lambda *x: np.concatenate(x), *pieces) for pieces in kept]
 
 
 def _in_turn(model: Quadrotor, some: Sequence[Lane], wanted: Wanted) -> Iterator:
@@ -147,8 +162,7 @@ def _in_turn(model: Quadrotor, some: Sequence[Lane], wanted: Wanted) -> Iterator
         if carry is None:
             carry = _begin(model, effects, {key: x[:, :2] for key, x in rows.items()})
         carry, found = _advance(model, effects, lead, measured, rows, carry, wanted)
-        # Copied: a view would keep the lanes that only fill up.
-        yield jax.tree.map(lambda x: np.array(x[: len(some)]) if width > len(some) else np.asarray(x), found)
+        yield jax.tree.map(lambda x: np.asarray(x)[: len(some)], found)
 
 
 def replays_in_pieces(model: Quadrotor, lanes: Sequence[Lane], blocks: int) -> Iterator[Replay]:
@@ -164,7 +178,7 @@ def replays_in_pieces(model: Quadrotor, lanes: Sequence[Lane], blocks: int) -> I
     """
     groups = [_in_turn(model, lanes[i : i + LANES[-1]], "sensors") for i in range(0, len(lanes), LANES[-1])]
     for _ in range(0, len(lanes[0].flight.time), blocks * ROWS):
-        found = [_joined(islice(group, blocks)) for group in groups]
+        found = [jax.tree.map(lambda *x: np.concatenate(x, axis=1), *islice(group, blocks)) for group in groups]
         yield jax.tree.map(lambda *x: np.concatenate(x), *found)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -135,15 +135,43 @@ class _Part:
 
     Attributes:
         measured: whether the input is measured rotor speeds.
-        chunks: the windows in batches of equal shape.
-        flight: (W,) index of the flight of each window.
+        flights: windows of every flight, with the rotor speeds and effect memories at their starts.
+        steps: number of steps to which windows are padded; it differs between flights of different rates or gaps.
+        flight: (W,) index of the flight of each window, ascending.
+        row: (W,) index of the window among those of its flight.
         weight: (W,) weight of each window.
     """
 
     measured: bool
-    chunks: list[dict[str, Any]]
+    flights: list[tuple[Windows, np.ndarray, tuple]]
+    steps: int
     flight: np.ndarray
+    row: np.ndarray
     weight: np.ndarray
+
+    def chunks(self) -> Iterator[dict[str, Any]]:
+        """Inputs of the predictions in batches of `CHUNK` windows, made when needed, because they are large."""
+        for first in range(0, len(self.flight), CHUNK):
+            # The last chunk repeats its last window, so that one compiled program serves all.
+            chosen = np.minimum(np.arange(first, first + CHUNK), len(self.flight) - 1)
+            flight, row = self.flight[chosen], self.row[chosen]
+            pieces = [self._inputs(i, row[flight == i]) for i in np.unique(flight)]
+            yield jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *pieces) | {"flight": jnp.asarray(flight)}
+
+    def _inputs(self, i: int, row: np.ndarray) -> dict[str, Any]:
+        windows, start, memory = self.flights[i]
+        pad = self.steps - windows.step.shape[1]
+        fed = windows.rotor_speed[row, 1:] if self.measured else windows.command[row]
+        speed = windows.rotor_speed[row, 0] if self.measured else start[row]
+        state = (windows.position, windows.velocity, windows.quaternion, windows.body_rate)
+        return {
+            "state": (*(x[row] for x in state), speed, jax.tree.map(lambda x: np.asarray(x)[row], memory)),
+            "step": np.pad(windows.step[row], ((0, 0), (0, pad))),
+            "fed": np.pad(fed, ((0, 0), (0, pad), (0, 0)), mode="edge"),
+            "at": windows.at[row],
+            "quaternion": windows.true_quaternion[row],
+            "velocity": windows.true_velocity[row],
+        }
 
 
 @dataclass(frozen=True)
@@ -208,7 +236,7 @@ class Predictions:
         """The same, (W, H, 2, 3), as vectors."""
         found = []
         for part in self.parts:
-            chunks = [np.asarray(_scaled(model, c, _own(trims, c), self.sizes, part.measured)) for c in part.chunks]
+            chunks = [np.asarray(_scaled(model, c, _own(trims, c), self.sizes, part.measured)) for c in part.chunks()]
             found.append(np.concatenate(chunks)[: len(part.flight)])
         return found
 
@@ -269,7 +297,7 @@ class Predictions:
         along = np.concatenate([[numbers[k].scale for k in free] / steps, np.full(3, 1 / STEP)])
         for place, part in enumerate(self.parts):
             groups = [
-                _moves(model, moved, chunk, _own(trims, chunk), self.sizes, part.measured) for chunk in part.chunks
+                _moves(model, moved, chunk, _own(trims, chunk), self.sizes, part.measured) for chunk in part.chunks()
             ]
             found = np.concatenate(groups, axis=1)[:, : len(part.flight)]
             for i, there in elsewhere.items():
@@ -327,47 +355,22 @@ def kinds_alike(model: Quadrotor, logs: Sequence[FlightLog]) -> dict[str, float]
 
 def _part(flights: list[tuple], share: np.ndarray, measured: bool) -> _Part | None:
     """Windows with one kind of input; None if no flight has any."""
-    parts, owner = [], []
-    # The number of steps per window differs if flights have different rates or gaps.
-    steps = max((windows.step.shape[1] for windows, *_ in flights if len(windows)), default=0)
-    for i, (windows, start, memory) in enumerate(flights):
-        if not len(windows) or (measured and not _has_rotor_speed(windows)):
-            continue
-        whole = np.isfinite(windows.rotor_speed).all(axis=(1, 2)) if measured else np.ones(len(windows), dtype=bool)
-        inputs = _inputs(windows, start, memory, measured, steps)
-        parts.append(jax.tree.map(lambda x, keep=whole: np.asarray(x)[keep], inputs))
-        owner.append(np.full(whole.sum(), i))
-    flight = np.concatenate(owner) if owner else np.zeros(0, dtype=int)
+    longest = max((windows.step.shape[1] for windows, *_ in flights if len(windows)), default=0)
+    rows = [_usable(windows, measured) for windows, *_ in flights]
+    counts = np.array([len(own) for own in rows])
+    flight = np.repeat(np.arange(len(flights)), counts)
     if not len(flight):
         return None
-    every = jax.tree.map(lambda *x: np.concatenate(x), *parts) | {"flight": flight}
-    counts = np.bincount(flight, minlength=len(share))
     weight = share[flight] * len(flight) / (np.count_nonzero(counts) * counts[flight])
-    chunks = []
-    for first in range(0, len(flight), CHUNK):
-        # The last chunk repeats its last window, so that one compiled program serves all.
-        rows = np.minimum(np.arange(first, first + CHUNK), len(flight) - 1)
-        chunks.append(jax.tree.map(lambda x, r=rows: jnp.asarray(x[r]), every))
-    return _Part(measured, chunks, flight, weight)
+    return _Part(measured, flights, _STEPS * -(-longest // _STEPS), flight, np.concatenate(rows), weight)
 
 
-def _has_rotor_speed(windows: Windows) -> bool:
-    return windows.rotor_speed.size > 0 and bool(np.isfinite(windows.rotor_speed).mean() > MEASURED_SHARE)
-
-
-def _inputs(windows: Windows, start: np.ndarray, memory: tuple, measured: bool, steps: int) -> dict[str, Any]:
-    """Inputs of the predictions, with every window padded to ``steps``, rounded up to a multiple of `_STEPS`."""
-    pad = _STEPS * -(-steps // _STEPS) - windows.step.shape[1]
-    fed = windows.rotor_speed[:, 1:] if measured else windows.command
-    state = (windows.position, windows.velocity, windows.quaternion, windows.body_rate)
-    return {
-        "state": (*state, windows.rotor_speed[:, 0] if measured else start, memory),
-        "step": np.pad(windows.step, ((0, 0), (0, pad))),
-        "fed": np.pad(fed, ((0, 0), (0, pad), (0, 0)), mode="edge"),
-        "at": windows.at,
-        "quaternion": windows.true_quaternion,
-        "velocity": windows.true_velocity,
-    }
+def _usable(windows: Windows, measured: bool) -> np.ndarray:
+    """Indices of the windows that have a kind of input."""
+    speed = np.isfinite(windows.rotor_speed)
+    if not measured:
+        return np.arange(len(windows))
+    return np.flatnonzero(speed.all(axis=(1, 2)) & (speed.size > 0 and speed.mean() > MEASURED_SHARE))
 
 
 def _own(trims: np.ndarray, chunk: dict) -> Array:

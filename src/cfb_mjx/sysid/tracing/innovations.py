@@ -9,7 +9,7 @@ The filters are linear, so the derivative of a residual with respect to a parame
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import groupby, islice
+from itertools import chain, groupby, islice
 from typing import NamedTuple
 
 import equinox as eqx
@@ -45,7 +45,8 @@ CHANNELS = 10
 DOMAINS = {"rotor_speed": range(6, 10), "force": (*range(3, 6), *range(10, 13)), "torque": range(3)}
 """Channels of the innovations by where an effect acts: on rotor speeds, on forces, or on torques."""
 SIDE_BY_SIDE = 32, 16
-"""Number of blocks and of columns whitened at once. Fixed, so that one compiled program serves any number."""
+"""Number of groups of columns whitened at once, and of columns in a group. Fixed, so that one compiled program serves
+any number."""
 MOTOR_LAG = 0.05
 """Lag with which the error of a rotor speed follows its disturbance, s."""
 
@@ -361,13 +362,14 @@ def with_slopes(
             yield Lane(flight, speed + late * slope if late else speed, move.lead + early, move.effects)
 
     def sloped(piece: Piece, said: Replay) -> Piece:
-        found, steps = [], np.array([move.step for move in moves])
-        for seen, told in zip(
-            measured(piece.flight), predicted(piece.ahead, said, float(model.parameters.gravity)), strict=True
-        ):
-            slopes = (told[1:] - told[:1]) / steps[:, None, None]
-            found.append(np.moveaxis(np.concatenate([(seen - told[0])[None], slopes]), 0, -1))
-        return piece._replace(signals=Signals(*found))
+        steps = np.array([move.step for move in moves])
+        told = predicted(piece.ahead, said, float(model.parameters.gravity))
+        # In place, because they are the largest arrays of a search.
+        for seen, x in zip(measured(piece.flight), told, strict=True):
+            x[1:] -= x[0]
+            x[1:] /= steps[:, None, None]
+            x[0] = seen - x[0]
+        return piece._replace(signals=Signals(*(np.moveaxis(x, 0, -1) for x in told)))
 
     count = 1 + len(moves)
     for long, some in groupby(zip(flights, driven, strict=True), lambda pair: count * len(pair[0].time) > MOST):
@@ -434,29 +436,50 @@ def _term_accelerations(model: Quadrotor, flight: Flight, driven: Array, axis: A
     return jax.tree.map(lambda *x: jnp.stack(x), *found)
 
 
-def inner_products(blocks: Blocks, levels: Levels) -> Float[np.ndarray, "b c c"]:
-    """Inner products of the whitened columns (the residual and its derivatives) in each block."""
-    count, columns = len(blocks.interval), blocks.signals.quantity.shape[-1]
+def inner_products(pieces: Iterable[Blocks], levels: Levels) -> Float[np.ndarray, "b c c"]:
+    """Inner products of the whitened columns (the residual and its derivatives) in each block.
+
+    Args:
+        pieces: blocks with the same number of columns (c), of which few are held in memory at a time.
+        levels: noise levels.
+    """
+    pieces = iter(pieces)
+    first = next(pieces)
+    columns = first.signals.quantity.shape[-1]
+    groups = -(-columns // SIDE_BY_SIDE[1])
+
+    def whitened(batch: tuple[Blocks, int]) -> np.ndarray:
+        return np.asarray(_whitened(batch[0], levels))[: batch[1]]
+
+    found, waiting = [], np.zeros((0, ROWS, CHANNELS + 3, SIDE_BY_SIDE[1]))
+    for more in over_cores(whitened, _batches(chain([first], pieces), groups)):
+        waiting = np.concatenate([waiting, more])
+        count = len(waiting) // groups
+        whole, waiting = np.split(waiting, [count * groups])
+        e = np.moveaxis(whole.reshape(count, groups, -1, whole.shape[-1]), 1, -2)
+        e = e.reshape(count, -1, groups * whole.shape[-1])[..., :columns]
+        found.append(np.swapaxes(e, 1, 2) @ e)
+    return np.concatenate(found)
+
+
+def _batches(pieces: Iterable[Blocks], groups: int) -> Iterator[tuple[Blocks, int]]:
+    """Each group of columns of each block as a row of its own: batches of `SIDE_BY_SIDE`, and how many rows count."""
     most, wide = SIDE_BY_SIDE
-    groups = -(-columns // wide)
-
-    def apart(x: np.ndarray) -> np.ndarray:
-        """One row for each block and group of columns."""
-        x = np.pad(x, (*[(0, 0)] * (x.ndim - 1), (0, groups * wide - columns)))
-        return np.moveaxis(x.reshape(*x.shape[:-1], groups, wide), -2, 1).reshape(-1, *x.shape[1:-1], wide)
-
-    signals = Signals(*map(apart, blocks.signals))
-    every = Blocks(signals, *(np.repeat(x, groups, axis=0) for x in (blocks.interval, blocks.valid)))
-
-    def whitened(first: int) -> np.ndarray:
+    rows = (
+        (piece, block, group) for piece in pieces for block in range(len(piece.interval)) for group in range(groups)
+    )
+    while some := list(islice(rows, most)):
         # The last batch is filled by repeating the last row.
-        chosen = np.minimum(np.arange(first, first + most), count * groups - 1)
-        return np.asarray(_whitened(jax.tree.map(lambda x: x[chosen], every), levels))
-
-    found = list(over_cores(whitened, range(0, count * groups, most)))
-    e = np.concatenate(found)[: count * groups].reshape(count, groups, -1, wide)
-    e = np.moveaxis(e, 1, -2).reshape(count, -1, groups * wide)[..., :columns]
-    return np.swapaxes(e, 1, 2) @ e
+        filled = [*some, *[some[-1]] * (most - len(some))]
+        signals = Signals(*(np.zeros((most, ROWS, x.shape[-2], wide)) for x in some[0][0].signals))
+        for row, (piece, block, group) in enumerate(filled):
+            for whole, x in zip(signals, piece.signals, strict=True):
+                part = x[block, ..., group * wide : (group + 1) * wide]
+                whole[row, ..., : part.shape[-1]] = part
+        beside = (
+            np.stack([getattr(piece, name)[block] for piece, block, _ in filled]) for name in ("interval", "valid")
+        )
+        yield Blocks(signals, *beside), len(some)
 
 
 @eqx.filter_jit

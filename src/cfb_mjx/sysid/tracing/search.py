@@ -7,7 +7,7 @@ A `Search` holds the flights, the sensors' noise and the names of the effects to
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
@@ -46,8 +46,8 @@ from cfb_mjx.sysid.tracing.hypothesis import (
 from cfb_mjx.sysid.tracing.innovations import (
     CHANNELS,
     DOMAINS,
-    SIDE_BY_SIDE,
     Blocks,
+    Levels,
     Piece,
     Signals,
     cut,
@@ -81,7 +81,7 @@ SAMPLE = 32
 """Number of blocks from which noise levels are estimated: about a minute, far longer than the disturbances'
 correlation time."""
 KNOWN = 2
-"""Number of hypotheses whose residuals are cached."""
+"""Number of hypotheses whose residuals are cached, and of time shifts whose flights are."""
 
 
 @dataclass
@@ -153,6 +153,9 @@ class Search:
         if key not in self._flights:
             faults = SensorFaults(motor_shift=key)
             self._flights[key] = [prepare_flight(faults.repaired(log), *self.delays) for log in self.logs]
+            # A fit of the shift asks for many of them in turn.
+            for old in list(self._flights)[:-KNOWN]:
+                del self._flights[old]
         return self._flights[key]
 
     def residuals(
@@ -209,8 +212,8 @@ class Search:
     def linearise(self, hypothesis: Hypothesis, wanted: list[Column]) -> Linear:
         """Linearise the residual at a hypothesis, with respect to the command lead and the ``wanted`` columns."""
         columns = [lead_column(), *wanted]
-        pools = _pooled(self._slopes(hypothesis, columns))
-        return self._linear(hypothesis, columns, [self._products(hypothesis, pool) for pool in pools])
+        blocks = map(self._blocks, self._slopes(hypothesis, columns))
+        return self._linear(hypothesis, columns, inner_products(blocks, self._levels(hypothesis)))
 
     def linearise_terms(self, hypothesis: Hypothesis, own: list[Column]) -> list[Linear]:
         """`linearise` with respect to ``own`` and the library of formula terms, for each axis of `formula.AXES`."""
@@ -218,13 +221,19 @@ class Search:
         flights, columns = self.flights(hypothesis), [lead_column(), *own]
         squares = [term_squares(model, *pair) for pair in zip(flights, driven, strict=True)]
         sizes = np.sqrt(np.mean(squares, axis=0))
-        found: list[list[np.ndarray]] = [[] for _ in range(6)]
-        for pool in _pooled(self._slopes(hypothesis, columns, driven)):
-            for axis, products in enumerate(found):
-                found_here = [_beside(piece, term_slopes(model, piece, axis)) for piece in pool]
-                products.append(self._products(hypothesis, found_here))
-        every = [columns + term_columns(axis, sizes) for axis in range(6)]
-        return [self._linear(hypothesis, *pair) for pair in zip(every, found, strict=True)]
+        counts = []
+
+        def blocks() -> Iterator[Blocks]:
+            for piece in self._slopes(hypothesis, columns, driven):
+                for axis in range(6):
+                    found = self._blocks(_beside(piece, term_slopes(model, piece, axis)))
+                    counts.append(len(found.interval))
+                    yield found
+
+        products = inner_products(blocks(), self._levels(hypothesis))
+        parts = np.split(products, np.cumsum(counts)[:-1])
+        every = [(columns + term_columns(axis, sizes), np.concatenate(parts[axis::6])) for axis in range(6)]
+        return [self._linear(hypothesis, *pair) for pair in every]
 
     def _driven(self, hypothesis: Hypothesis) -> list[np.ndarray]:
         kept = self._kept(hypothesis)
@@ -232,15 +241,15 @@ class Search:
             return [driven for _, driven in kept]
         return driven_by(hypothesis.model(self.parameters), self.flights(hypothesis), hypothesis.lead)
 
-    def _products(self, hypothesis: Hypothesis, pool: list[Piece]) -> np.ndarray:
-        """Inner products of the columns in every block of some pieces of flights."""
-        levels = levels_from(jnp.asarray(hypothesis.levels), self.noise)
-        blocks = joined(self._looked_at(cut(piece.flight, not_none(piece.signals))) for piece in pool)
-        return inner_products(blocks, levels)
+    def _blocks(self, piece: Piece) -> Blocks:
+        return self._looked_at(cut(piece.flight, not_none(piece.signals)))
 
-    def _linear(self, hypothesis: Hypothesis, columns: list[Column], products: list[np.ndarray]) -> Linear:
+    def _levels(self, hypothesis: Hypothesis) -> Levels:
+        return levels_from(jnp.asarray(hypothesis.levels), self.noise)
+
+    def _linear(self, hypothesis: Hypothesis, columns: list[Column], products: np.ndarray) -> Linear:
         counts = [len(flight.time) // ROWS for flight in self.flights(hypothesis)]
-        return Linear(columns, np.concatenate(products), dealt(counts))
+        return Linear(columns, products, dealt(counts))
 
     def _looked_at(self, blocks: Blocks) -> Blocks:
         """The blocks with the channels that this search ignores marked as invalid."""
@@ -400,18 +409,6 @@ class Search:
         for column, value in zip(variant, found.values, strict=True):
             effect = moved(effect, column, float(value) * column.scale, False)
         return hypothesis.having(effect)
-
-
-def _pooled(pieces: Iterable[Piece]) -> Iterator[list[Piece]]:
-    """Pool short flights to fill the fixed batch that is whitened at once."""
-    waiting: list[Piece] = []
-    for piece in pieces:
-        waiting.append(piece)
-        if sum(len(each.flight.time) for each in waiting) >= SIDE_BY_SIDE[0] * ROWS:
-            yield waiting
-            waiting = []
-    if waiting:
-        yield waiting
 
 
 def _beside(piece: Piece, more: Signals) -> Piece:
