@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import weakref
+from collections.abc import Iterator
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -40,3 +43,20 @@ def test_inner_products_are_those_of_all_blocks_at_once(columns):
     wanted = np.einsum("bri,brj->bij", error, error)
     found = inner_products(iter(pieces), levels)
     np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+
+
+def test_few_pieces_are_held_at_a_time():
+    """Two batches of the filter are 16 pieces of 4 blocks."""
+    alive: list[weakref.ref] = []
+    most = 0
+
+    def pieces() -> Iterator[Blocks]:
+        nonlocal most
+        for seed in range(50):
+            most = max(most, sum(there() is not None for there in alive))
+            piece = drawn(4, 2, seed)
+            alive.append(weakref.ref(piece.interval))
+            yield piece
+
+    assert len(inner_products(pieces(), levels_from(jnp.asarray(FIRST), NOISE))) == 200
+    assert most < 25

@@ -108,6 +108,20 @@ def test_without_trims_the_numbers_stand_for_flights_whose_trim_nobody_knows(cam
     assert refined.cost[1] < found.cost[1] < 1.05 * refined.cost[1]
 
 
+def test_inputs_of_the_windows_are_made_when_needed(campaign):
+    """They were kept for every kind of prediction and model tried, more than the flights themselves."""
+    model = _prepared(Quadrotor(GUARDS()), plausible_numbers(GUARDS(), ("rotor_drag",)))
+    data = Predictions.of(model, campaign.fit, np.ones(len(campaign.fit)))
+
+    def held() -> int:
+        return sum(x.nbytes for x in jax.live_arrays())
+
+    before = held()
+    began = data.started(model)
+    assert np.isfinite(began.cost(model, np.zeros((len(campaign.fit), 3))))
+    assert held() - before < 0.1 * sum(windows.command.nbytes for _, windows, _ in data.flown)
+
+
 def test_the_gradient_is_that_of_the_loss(campaign):
     numbers = plausible_numbers(GUARDS(), ("rotor_drag", "inertia"))
     model = _prepared(Quadrotor(GUARDS()), numbers)

@@ -419,6 +419,14 @@ def test_all_effects_at_neutral_replay_like_the_bare_model(campaigns, base):
     assert jnp.isfinite(jnp.asarray(list(full.values()))).all()
 
 
+def test_flights_are_kept_for_the_last_time_shifts_only(closed):
+    diagnosis, _ = closed
+    search = dataclasses.replace(diagnosis.trace.search, logs=diagnosis.trace.search.logs[:1], _flights={})
+    found = [search.flights(dataclasses.replace(diagnosis.hypothesis, shift=shift)) for shift in (0.0, 0.01, 0.02)]
+    assert len(search._flights) == 2
+    assert search.flights(dataclasses.replace(diagnosis.hypothesis, shift=0.01)) is found[1]
+
+
 @pytest.mark.parametrize("axis", [1, 3])
 def test_terms_of_formulas_are_the_derivatives_by_their_numbers(closed, axis):
     """Without replaying the model for each: so they must agree with replays."""
