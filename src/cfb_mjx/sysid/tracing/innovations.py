@@ -9,7 +9,7 @@ The filters are linear, so the derivative of a residual with respect to a parame
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import chain, groupby, islice
+from itertools import groupby, islice
 from typing import NamedTuple
 
 import equinox as eqx
@@ -443,16 +443,14 @@ def inner_products(pieces: Iterable[Blocks], levels: Levels) -> Float[np.ndarray
         pieces: blocks with the same number of columns (c), of which few are held in memory at a time.
         levels: noise levels.
     """
-    pieces = iter(pieces)
-    first = next(pieces)
-    columns = first.signals.quantity.shape[-1]
-    groups = -(-columns // SIDE_BY_SIDE[1])
 
-    def whitened(batch: tuple[Blocks, int]) -> np.ndarray:
-        return np.asarray(_whitened(batch[0], levels))[: batch[1]]
+    def whitened(batch: tuple[Blocks, int, int]) -> tuple[np.ndarray, int]:
+        blocks, count, columns = batch
+        return np.asarray(_whitened(blocks, levels))[:count], columns
 
     found, waiting = [], np.zeros((0, ROWS, CHANNELS + 3, SIDE_BY_SIDE[1]))
-    for more in over_cores(whitened, _batches(chain([first], pieces), groups)):
+    for more, columns in over_cores(whitened, _batches(pieces)):
+        groups = _groups(columns)
         waiting = np.concatenate([waiting, more])
         count = len(waiting) // groups
         whole, waiting = np.split(waiting, [count * groups])
@@ -462,11 +460,22 @@ def inner_products(pieces: Iterable[Blocks], levels: Levels) -> Float[np.ndarray
     return np.concatenate(found)
 
 
-def _batches(pieces: Iterable[Blocks], groups: int) -> Iterator[tuple[Blocks, int]]:
-    """Each group of columns of each block as a row of its own: batches of `SIDE_BY_SIDE`, and how many rows count."""
+def _groups(columns: int) -> int:
+    return -(-columns // SIDE_BY_SIDE[1])
+
+
+def _batches(pieces: Iterable[Blocks]) -> Iterator[tuple[Blocks, int, int]]:
+    """Batches with each group of columns of each block as a row of its own.
+
+    Returns:
+        Iterator over a batch of `SIDE_BY_SIDE`, the number of its rows that count, and the number of columns.
+    """
     most, wide = SIDE_BY_SIDE
     rows = (
-        (piece, block, group) for piece in pieces for block in range(len(piece.interval)) for group in range(groups)
+        (piece, block, group)
+        for piece in pieces
+        for block in range(len(piece.interval))
+        for group in range(_groups(piece.signals.quantity.shape[-1]))
     )
     while some := list(islice(rows, most)):
         # The last batch is filled by repeating the last row.
@@ -476,10 +485,9 @@ def _batches(pieces: Iterable[Blocks], groups: int) -> Iterator[tuple[Blocks, in
             for whole, x in zip(signals, piece.signals, strict=True):
                 part = x[block, ..., group * wide : (group + 1) * wide]
                 whole[row, ..., : part.shape[-1]] = part
-        beside = (
-            np.stack([getattr(piece, name)[block] for piece, block, _ in filled]) for name in ("interval", "valid")
-        )
-        yield Blocks(signals, *beside), len(some)
+        interval = np.stack([piece.interval[block] for piece, block, _ in filled])
+        valid = np.stack([piece.valid[block] for piece, block, _ in filled])
+        yield Blocks(signals, interval, valid), len(some), some[0][0].signals.quantity.shape[-1]
 
 
 @eqx.filter_jit
