@@ -150,13 +150,15 @@ class Search:
     def flights(self, hypothesis: Hypothesis) -> list[Flight]:
         """The prepared flights, with the time shift of the motor columns that the hypothesis assumes removed."""
         key = round(hypothesis.shift, 5)
-        if key not in self._flights:
+        found = self._flights.pop(key, None)
+        if found is None:
             faults = SensorFaults(motor_shift=key)
-            self._flights[key] = [prepare_flight(faults.repaired(log), *self.delays) for log in self.logs]
-            # A fit of the shift asks for many of them in turn.
-            for old in list(self._flights)[:-KNOWN]:
-                del self._flights[old]
-        return self._flights[key]
+            found = [prepare_flight(faults.repaired(log), *self.delays) for log in self.logs]
+        # A fit of the shift asks for many of them in turn; the ones asked for last are kept.
+        self._flights[key] = found
+        for old in list(self._flights)[:-KNOWN]:
+            del self._flights[old]
+        return found
 
     def residuals(
         self, hypothesis: Hypothesis, flights: Sequence[Flight] | None = None
