@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from cfb_mjx.devices import over_cores
+from cfb_mjx.devices import last_repeated, over_cores
 from cfb_mjx.logs import FlightLog
 from cfb_mjx.logs.rotation import to_world
 from cfb_mjx.model.effects import Condition, Effect, Wrench
@@ -478,16 +478,15 @@ def _batches(pieces: Iterable[Blocks]) -> Iterator[tuple[Blocks, int, int]]:
         for group in range(_groups(piece.signals.quantity.shape[-1]))
     )
     while some := list(islice(rows, most)):
-        # The last batch is filled by repeating the last row.
-        filled = [*some, *[some[-1]] * (most - len(some))]
-        signals = Signals(*(np.zeros((most, ROWS, x.shape[-2], wide)) for x in some[0][0].signals))
-        for row, (piece, block, group) in enumerate(filled):
+        signals = Signals(*(np.zeros((len(some), ROWS, x.shape[-2], wide)) for x in some[0][0].signals))
+        for row, (piece, block, group) in enumerate(some):
             for whole, x in zip(signals, piece.signals, strict=True):
                 part = x[block, ..., group * wide : (group + 1) * wide]
                 whole[row, ..., : part.shape[-1]] = part
-        interval = np.stack([piece.interval[block] for piece, block, _ in filled])
-        valid = np.stack([piece.valid[block] for piece, block, _ in filled])
-        yield Blocks(signals, interval, valid), len(some), some[0][0].signals.quantity.shape[-1]
+        interval = np.stack([piece.interval[block] for piece, block, _ in some])
+        valid = np.stack([piece.valid[block] for piece, block, _ in some])
+        filled = jax.tree.map(lambda x: last_repeated(x, most), Blocks(signals, interval, valid))
+        yield filled, len(some), some[0][0].signals.quantity.shape[-1]
 
 
 @eqx.filter_jit
