@@ -10,16 +10,8 @@ import numpy as np
 import pytest
 
 from cfb_mjx.sysid.flight import ROWS
-from cfb_mjx.sysid.tracing.innovations import (
-    CHANNELS,
-    FIRST,
-    Blocks,
-    Signals,
-    inner_products,
-    innovations,
-    joined,
-    levels_from,
-)
+from cfb_mjx.sysid.tracing.innovations import CHANNELS, FIRST, inner_products, innovations, levels_from
+from cfb_mjx.sysid.tracing.signals import Blocks, Signals, joined
 
 NOISE = {"gyro": np.full(3, 0.02), "velocity": 0.01, "rotor": 5.0, "accelerometer": 0.1}
 

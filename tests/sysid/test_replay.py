@@ -15,7 +15,7 @@ from cfb_mjx.model import CATALOGUE, Quadrotor
 from cfb_mjx.sysid import replay
 from cfb_mjx.sysid.flight import prepare_flight
 from cfb_mjx.sysid.replay import Lane, remembered_along, replays, speeds_along
-from cfb_mjx.sysid.tracing import innovations
+from cfb_mjx.sysid.tracing import signals
 from cfb_mjx.sysid.tracing.search import Search
 from cfb_mjx.sysid.tracing.sensors import check_sensors
 
@@ -80,9 +80,9 @@ def test_a_flight_in_pieces_says_what_it_says_at_once(monkeypatch):
     hypothesis = search.nothing()
     wanted = [column for variant in search.candidates(hypothesis)[:6] for column in variant]
     found = []
-    for most, piece in ((replay.MOST, innovations.PIECE), (0, 1)):
-        monkeypatch.setattr(innovations, "MOST", most)
-        monkeypatch.setattr(innovations, "PIECE", piece)
+    for most, piece in ((replay.MOST, signals.PIECE), (0, 1)):
+        monkeypatch.setattr(signals, "MOST", most)
+        monkeypatch.setattr(signals, "PIECE", piece)
         found.append([search.linearise(hypothesis, wanted), *search.linearise_terms(hypothesis, wanted[:2])[1:5:3]])
     for whole, pieces in zip(*found, strict=True):
         np.testing.assert_array_equal(whole.fold, pieces.fold)

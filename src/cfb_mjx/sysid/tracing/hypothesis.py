@@ -20,7 +20,8 @@ from cfb_mjx.model.effects.formula import PLACES, TERMS, ResidualFormula
 from cfb_mjx.model.quadrotor import Quadrotor
 from cfb_mjx.parameters import Parameters
 from cfb_mjx.sysid.sensor_faults import SensorFaults
-from cfb_mjx.sysid.tracing.innovations import FIRST, Moved
+from cfb_mjx.sysid.tracing.innovations import FIRST
+from cfb_mjx.sysid.tracing.signals import Moved
 
 LEAD = COMMAND_LEAD
 """Nuisance parameter: commands sent between two rows are not in the log. Always free, never reported as an effect."""

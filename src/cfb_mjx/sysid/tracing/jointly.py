@@ -24,8 +24,9 @@ from cfb_mjx.sysid.evaluation import Evaluation, evaluate
 from cfb_mjx.sysid.flight import Flight, prepare_flight
 from cfb_mjx.sysid.tracing.evidence import Evidence, Prior, evidence, solve
 from cfb_mjx.sysid.tracing.hypothesis import SHIFT, Column, Fit, Hypothesis, Linear, sensible
-from cfb_mjx.sysid.tracing.innovations import CHANNELS, DOMAINS, Blocks, Levels, innovations, joined, levels_from
+from cfb_mjx.sysid.tracing.innovations import CHANNELS, DOMAINS, Levels, innovations, levels_from
 from cfb_mjx.sysid.tracing.search import Search
+from cfb_mjx.sysid.tracing.signals import Blocks, joined
 
 ERRORS = tuple(
     f"{q}@{h}s"

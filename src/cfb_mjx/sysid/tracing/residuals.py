@@ -20,9 +20,9 @@ from cfb_mjx.logs.rotation import to_body
 from cfb_mjx.model import Quadrotor
 from cfb_mjx.sysid.flight import Flight, delay_of, prepare_flight
 from cfb_mjx.sysid.tracing.hypothesis import Hypothesis
-from cfb_mjx.sysid.tracing.innovations import Blocks, driven_by, residual_blocks
 from cfb_mjx.sysid.tracing.rules import RULES
 from cfb_mjx.sysid.tracing.search import Search
+from cfb_mjx.sysid.tracing.signals import Blocks, driven_by, residual_blocks
 
 WIDTH = 0.02
 """Standard deviation of the Gaussian filter, s; about half of the power at 6 Hz passes."""

@@ -46,25 +46,27 @@ from cfb_mjx.sysid.tracing.hypothesis import (
 from cfb_mjx.sysid.tracing.innovations import (
     CHANNELS,
     DOMAINS,
-    Blocks,
     Levels,
+    fit_levels,
+    inner_products,
+    levels_from,
+    sensor_noise,
+    surprise,
+)
+from cfb_mjx.sysid.tracing.rules import RULES, Rules
+from cfb_mjx.sysid.tracing.sensors import SensorCheck
+from cfb_mjx.sysid.tracing.signals import (
+    Blocks,
     Piece,
     Signals,
     cut,
     driven_by,
-    fit_levels,
-    inner_products,
     joined,
-    levels_from,
     residual_blocks,
-    sensor_noise,
-    surprise,
     term_slopes,
     term_squares,
     with_slopes,
 )
-from cfb_mjx.sysid.tracing.rules import RULES, Rules
-from cfb_mjx.sysid.tracing.sensors import SensorCheck
 
 STILL = 0.3
 """A fit has converged when every step is below this fraction of a standard deviation."""
