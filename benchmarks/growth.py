@@ -5,7 +5,7 @@
 Writes ``benchmarks/growth.json`` and the block ``growth`` of ``docs/performance.md``. Every number comes from a process
 of its own. The logs are real 500 Hz flights where FOLDER holds some, else flights of the reference simulator; they are
 cut, joined with pauses and repeated to the wanted length. Cases that were measured before are measured anew; with
-``--commands`` the other commands keep the numbers in the file.
+``--commands`` the other commands keep the numbers in the file, and the machine that they were measured on.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ def main() -> None:
         return
     old = json.loads(arguments.json.read_text()) if arguments.json.exists() else {}
     with tempfile.TemporaryDirectory(prefix="cfb-growth-") as folder:
-        results = measure(Path(folder), arguments, old.get("rows", []))
+        results = measure(Path(folder), arguments, old)
     write(results, arguments.json, arguments.page)
     print(section(results))
 
 
-def measure(folder: Path, arguments: argparse.Namespace, old: list[dict]) -> dict:
+def measure(folder: Path, arguments: argparse.Namespace, old: dict) -> dict:
     """Measure the commands that were asked for.
 
     Args:
         folder: an empty folder for logs, caches and results.
         arguments: of the command line.
-        old: rows of earlier measurements, of which those of other commands are kept.
+        old: earlier results, of which those of other commands are kept.
     """
     logs = folder / "logs"
     logs.mkdir()
@@ -74,17 +74,20 @@ def measure(folder: Path, arguments: argparse.Namespace, old: list[dict]) -> dic
     source = subprocess.run(
         [*make, *(["--quick"] if arguments.quick else [])], check=True, capture_output=True, text=True
     ).stdout.strip()
-    rows = [row for row in old if row["command"] not in arguments.commands]
+    rows = [row for row in old.get("rows", []) if row["command"] not in arguments.commands]
     for name in arguments.commands:
         for series in ("length", "logs"):
             rows += _series(name, series, folder, arguments)
     facts = "import json; from cfb_mjx.runtime import environment; print(json.dumps(environment()))"
-    return {
+    conditions = {
         "environment": json.loads(subprocess.run([sys.executable, "-c", facts], capture_output=True, text=True).stdout),
         "flights": source,
-        "each_s": EACH,
         "limit_s": arguments.limit,
         "cores": len(os.sched_getaffinity(0)),
+    }
+    return {
+        "conditions": old.get("conditions", {}) | dict.fromkeys(arguments.commands, conditions),
+        "each_s": EACH,
         "rows": sorted(rows, key=lambda row: COMMANDS.index(row["command"])),
     }
 
@@ -275,11 +278,14 @@ def slopes(rows: list[dict], key: str) -> tuple[float, float] | None:
 
 def section(results: dict) -> str:
     """Return the section on growth, as Markdown."""
+    sys.path[:0] = [str(ROOT / "scripts")]
+    from campaign import measured_on
+
     lines = []
     for name in COMMANDS:
         for series in ("length", "logs"):
             rows = [row for row in results["rows"] if (row["command"], row["series"]) == (name, series)]
-            lines += [_line(row, results["limit_s"]) for row in rows]
+            lines += [_line(row, results["conditions"][name]["limit_s"]) for row in rows]
     grown = []
     for name in COMMANDS:
         for series, what in (("length", "length of a log"), ("logs", "number of logs")):
@@ -290,17 +296,19 @@ def section(results: dict) -> str:
             ]
             if all(cells):
                 grown.append(f"| `cfb {name}` | {what} | {' | '.join(cells)} |")
-    facts = ", ".join(f"{name} {value}" for name, value in results["environment"].items())
+    made = results["conditions"]
+    facts = measured_on(
+        {f"`cfb {name}`": made[name]["environment"] | _limits(made[name]) for name in COMMANDS if name in made}
+    )
     head = "| command | what grows | wall, all | last two | CPU, all | last two | memory, all | last two |"
     return f"""## How cost grows with the flights
 
-Written by `python benchmarks/growth.py`. {facts}; bound to {results["cores"]} core(s).
+Written by `python benchmarks/growth.py`. {facts}.
 
-Logs: {results["flights"]}, joined with pauses of {PAUSE:g} s and repeated to the length. Where the number of logs
-grows, each is {results["each_s"]:g} s long. Every number is of a process of its own. *First* and *again* are two runs
-of the same command. The cache of compiled programs is empty before the first row of a command and kind of growth; the
-difference between the two runs is what is compiled. A run is ended after {results["limit_s"]:g} s, and larger cases are
-then left out.
+The logs are joined with pauses of {PAUSE:g} s and repeated to the length. Where the number of logs grows, each is
+{results["each_s"]:g} s long. Every number is of a process of its own. *First* and *again* are two runs of the same
+command. The cache of compiled programs is empty before the first row of a command and kind of growth; the
+difference between the two runs is what is compiled. After a run that was ended, larger cases are left out.
 
 | command | logs | flight, s | first, s | again, s | CPU again, s | compiling, CPU s | memory, MB |
 |---|---:|---:|---:|---:|---:|---:|---:|
@@ -313,6 +321,14 @@ between the last two: 1 is linear, less is sublinear because of what every proce
 |---|---|---:|---:|---:|---:|---:|---:|
 {chr(10).join(grown)}
 """
+
+
+def _limits(conditions: dict) -> dict[str, str]:
+    return {
+        "bound to": f"{conditions['cores']} core(s)",
+        "runs ended after": f"{conditions['limit_s']:g} s",
+        "logs of": conditions["flights"],
+    }
 
 
 def _line(row: dict, limit: float) -> str:

@@ -69,7 +69,7 @@ def main() -> None:
     file = ROOT / "benchmarks" / "scenes.json"
     results = json.loads(file.read_text()) if file.exists() else {}
     # Without the options of `configure_jax`: jaxlib 0.10 aborts while it compiles contacts with them.
-    results["environment"] = environment()
+    results["environments"] = results.get("environments", {}) | dict.fromkeys(arguments.parts, environment())
     if "speed" in arguments.parts:
         results["bodies"], results["worlds"], results["rays"] = bodies(), worlds(), rays()
     if "race" in arguments.parts:
@@ -290,7 +290,9 @@ def draw(path: Path, gates, way: np.ndarray) -> None:
 
 def page(results: dict) -> str:
     """Return the page."""
-    facts = ", ".join(f"{name} {value}" for name, value in results["environment"].items())
+    from campaign import measured_on
+
+    facts = measured_on(results["environments"])
     measured = results["bodies"]
     of_bodies = []
     for many, rates in measured["rates"].items():

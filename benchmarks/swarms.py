@@ -39,7 +39,7 @@ def main() -> None:
     file = ROOT / "benchmarks" / "swarms.json"
     results = json.loads(file.read_text()) if file.exists() else {}
     configure_jax(x64=False)
-    results["environment"] = environment()
+    results["environments"] = results.get("environments", {}) | dict.fromkeys(arguments.parts, environment())
     if "speed" in arguments.parts:
         results["speed"] = speeds()
     if "flights" in arguments.parts:
@@ -197,11 +197,12 @@ def crossing(seed: int) -> dict:
 
 def page(results: dict) -> str:
     """Return the page."""
+    from campaign import measured_on
     from tracing_sweep import recovered
 
     from cfb_mjx.train.together import WAKE
 
-    facts = ", ".join(f"{name} {value}" for name, value in results["environment"].items())
+    facts = measured_on(results["environments"])
     slowest = min(line["rate"] / line["alone"] for line in results["speed"] if line["size"] == 2)
     rows = [
         f"| {line['size']} | {line['swarms']} | {line['rate'] / 1e6:.1f} M | {line['alone'] / 1e6:.1f} M | "

@@ -4,7 +4,7 @@ import argparse
 import json
 import math
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,6 +109,25 @@ def facts_line(command: str, results: list[dict], did: str = "trained") -> str:
         f"Written by `{command}`; {did} {when}, {of['processor']}, Python {of['python']}, "
         f"jax {of['jax']}, cfb_mjx {of['cfb_mjx']}."
     )
+
+
+def measured_on(parts: Mapping[str, dict[str, str]]) -> str:
+    """Say when, on which machine and with which versions the parts of a page were measured.
+
+    Args:
+        parts: environment (`cfb_mjx.runtime.environment`) of each part, by its name.
+
+    Returns:
+        What all parts have in common; then, if they differ, what is special of each.
+    """
+    common = dict.fromkeys(item for facts in parts.values() for item in facts.items())
+    common = [item for item in common if all(item in facts.items() for facts in parts.values())]
+    groups: dict[str, list[str]] = {}
+    for name, facts in parts.items():
+        own = ", ".join(f"{key} {value}" for key, value in facts.items() if (key, value) not in common)
+        groups.setdefault(own, []).append(name)
+    text = [", ".join(f"{key} {value}" for key, value in common)]
+    return "; ".join(text + [f"{', '.join(names)}: {own}" for own, names in groups.items() if own])
 
 
 def moved(before: dict, now: dict, pick: Callable[[dict], dict[str, float]], share: float = 0.05) -> list[str]:

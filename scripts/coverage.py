@@ -19,6 +19,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from campaign import measured_on
 
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.runtime import configure_jax, environment
@@ -153,9 +154,9 @@ def rows_of(fits: list[dict]) -> dict[str, dict]:
     return rows
 
 
-def page(results: dict, options: argparse.Namespace) -> str:
-    """Return the page as Markdown."""
-    facts = ", ".join(f"{name} {value}" for name, value in environment().items())
+def page(results: dict, environments: dict, options: argparse.Namespace) -> str:
+    """Return the page as Markdown, from the fits of each condition and where they were computed."""
+    facts = measured_on(environments)
     parts, every = [], []
     for key, condition in CONDITIONS.items():
         fits = list(results.get(key, {}).values())
@@ -256,7 +257,7 @@ def main() -> None:
     from cfb_mjx.logs import read_log
 
     kept = json.loads(RESULTS.read_text()) if RESULTS.is_file() and not options.anew else {}
-    results = kept.get("conditions", {})
+    results, environments = kept.get("conditions", {}), kept.get("environments", {})
     for index, (key, condition) in enumerate(CONDITIONS.items()):
         done = results.setdefault(key, {})
         if key not in options.only or len(done) >= options.drones:
@@ -267,6 +268,7 @@ def main() -> None:
                 if drone in done:
                     continue
                 rng = np.random.default_rng([options.seed + index, number])
+                environments[key] = environment()
                 done[drone] = one(read_log(Path(folder) / facts["files"][0]), facts, condition, rng)
                 # Write after every fit, so that an interruption loses one fit only.
                 write_json(
@@ -275,14 +277,14 @@ def main() -> None:
                         "drones": options.drones,
                         "seed": options.seed,
                         "conditions": results,
-                        "environment": environment(),
+                        "environments": environments,
                     },
                 )
         for name, row in rows_of(list(done.values())).items():
             numbers = "  ".join(f"{k} {v:.3g}" for k, v in row.items() if v is not None)
             print(f"{key:<12}{name:<28}{numbers}", flush=True)
         print(f"{key}: {np.median([f['seconds'] for f in done.values()]):.1f} s a fit", flush=True)
-        write_text(PAGE, page(results, options))
+        write_text(PAGE, page(results, environments, options))
 
 
 if __name__ == "__main__":

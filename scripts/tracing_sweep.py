@@ -16,6 +16,7 @@ from collections import Counter, defaultdict
 from pathlib import Path
 
 import numpy as np
+from campaign import facts_line
 from tracing_cases import LEAST, MOST, SEED, achievable, alone, cases
 
 from cfb_mjx.files import write_text
@@ -72,7 +73,7 @@ def run(wanted: list[Case], results: Path, from_end: bool, again: bool) -> None:
                 "after": _pick(outcome.after.metrics("commands_in")),
                 "seconds": seconds,
                 "again": again,
-                "version": environment()["cfb_mjx"],
+                "environment": environment(),
             }
             if campaign.case.name in perfect:
                 twin = evaluate(declared, perfect[campaign.case.name].held_out)
@@ -115,6 +116,18 @@ def recovered(line: dict) -> float:
     return float(np.mean(np.minimum(shares, 1.0))) if shares else float("nan")
 
 
+def _known(line: dict) -> bool:
+    return "environment" in line
+
+
+def _measured(lines: list[dict]) -> str:
+    """Say when and on which machine the campaigns were traced, as far as their results tell."""
+    command, known = "python scripts/tracing_sweep.py", [line for line in lines if _known(line)]
+    text = facts_line(command, known, "traced") if known else f"Written by `{command}`."
+    untold = len(lines) - len(known)
+    return text + (f" The results of {untold} campaigns do not tell their date and machine." if untold else "")
+
+
 def page(results: Path, planned: int, again: dict[str, Path]) -> str:
     """Return the page, from the results of ``planned`` campaigns and of sweeps on other seeds (``again``)."""
     lines = read(results)
@@ -122,8 +135,7 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
     text = [
         "# Tracing on the reference simulator",
         "",
-        "Written by `python scripts/tracing_sweep.py`; do not edit. "
-        + ", ".join(f"{name} {value}" for name, value in environment().items()),
+        _measured(lines),
         "",
         "This page says how often `cfb close-loop` names the right effect, and how much of the error it removes. Read",
         "it to judge how far you can trust a report. To measure it again (this takes hours):",
@@ -192,7 +204,7 @@ def page(results: Path, planned: int, again: dict[str, Path]) -> str:
 
 def _traced_by(lines: list[dict]) -> list[str]:
     """Say how many campaigns each version of the library ran."""
-    counts = Counter(line.get("version", "0.1.0") for line in lines)
+    counts = Counter(line["environment"]["cfb_mjx"] if _known(line) else line.get("version", "0.1.0") for line in lines)
     told = ", ".join(f"cfb_mjx {version}: {count}" for version, count in sorted(counts.items()))
     return [f"Campaigns by version: {told}."]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,6 +35,10 @@ def rows(costs, command="evaluate"):
     ]
 
 
+def conditions(machine, limit=300):
+    return {"environment": {"processor": machine}, "flights": "flights of a test", "limit_s": limit, "cores": 2}
+
+
 def test_slopes_are_those_of_a_power(growth):
     found = growth.slopes(rows([3 * n**1.5 for n in (5, 15, 60, 300, 1800)]), "wall_s")
     assert found == pytest.approx((1.5, 1.5))
@@ -47,12 +52,8 @@ def test_a_run_that_was_ended_is_said_and_does_not_count(growth):
     left_out = {"command": "evaluate", "series": "length", "size": 1800, "flight_s": 1800, "skipped": True}
     results = {
         "rows": [*measured, left_out],
-        "limit_s": 300,
         "each_s": 6,
-        "cores": 2,
-        "flights": "flights of a test",
-        "load": {"`import jax`": 0.4},
-        "environment": {"python": "3"},
+        "conditions": {"evaluate": conditions("one")},
     }
     page = growth.section(results)
     assert "over 300" in page
@@ -60,6 +61,21 @@ def test_a_run_that_was_ended_is_said_and_does_not_count(growth):
     assert growth.slopes(measured, "wall_s") == growth.slopes(measured[:3], "wall_s")
     widths = {line.count("|") for line in page.splitlines() if line.startswith("| `cfb evaluate` | 1 |")}
     assert widths == {9}
+
+
+def test_kept_rows_keep_the_machine_that_they_were_measured_on(growth, monkeypatch, tmp_path):
+    def told(command, **_):
+        return SimpleNamespace(stdout="flights of a test" if "--make" in command else '{"processor": "new"}')
+
+    monkeypatch.setattr(growth.subprocess, "run", told)
+    monkeypatch.setattr(growth, "_series", lambda name, series, *_: rows([1.0], name) if series == "length" else [])
+    old = {"conditions": {"fit": conditions("old", 60), "refine": conditions("old", 60)}, "rows": rows([90.0], "fit")}
+    arguments = SimpleNamespace(commands=["evaluate", "refine"], quick=True, flights=[], limit=300)
+    results = growth.measure(tmp_path, arguments, old)
+    machines = {name: made["environment"]["processor"] for name, made in results["conditions"].items()}
+    assert machines == {"evaluate": "new", "fit": "old", "refine": "new"}
+    text = growth.section(results)
+    assert "; `cfb evaluate`, `cfb refine`: processor new, runs ended after 300 s; `cfb fit`: processor old, " in text
 
 
 def test_a_process_is_measured_and_ended_at_its_limit(growth):
