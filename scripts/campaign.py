@@ -104,7 +104,7 @@ def facts_line(command: str, results: list[dict], did: str = "trained") -> str:
     facts = [result["environment"] for result in results]
     first, last = min(f["date"] for f in facts), max(f["date"] for f in facts)
     when = first if first == last else f"{first} to {last}"
-    of = facts[-1]
+    of = {name: " and ".join(dict.fromkeys(f[name] for f in facts)) for name in facts[0]}
     return (
         f"Written by `{command}`; {did} {when}, {of['processor']}, Python {of['python']}, "
         f"jax {of['jax']}, cfb_mjx {of['cfb_mjx']}."
