@@ -22,6 +22,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT / "scripts")]
 FILE, PAGE = ROOT / "benchmarks" / "growth.json", ROOT / "docs" / "performance.md"
 # The measuring process loads no library, because a process inherits the peak memory of the one that started it.
 LENGTHS, COUNTS = (5, 15, 60, 300, 1800), (4, 10, 20, 40)
@@ -278,14 +279,14 @@ def slopes(rows: list[dict], key: str) -> tuple[float, float] | None:
 
 def section(results: dict) -> str:
     """Return the section on growth, as Markdown."""
-    sys.path[:0] = [str(ROOT / "scripts")]
     from campaign import measured_on
 
+    conditions = {name: results["conditions"][name] for name in COMMANDS if name in results["conditions"]}
     lines = []
     for name in COMMANDS:
         for series in ("length", "logs"):
             rows = [row for row in results["rows"] if (row["command"], row["series"]) == (name, series)]
-            lines += [_line(row, results["conditions"][name]["limit_s"]) for row in rows]
+            lines += [_line(row, conditions[name]["limit_s"]) for row in rows]
     grown = []
     for name in COMMANDS:
         for series, what in (("length", "length of a log"), ("logs", "number of logs")):
@@ -296,10 +297,7 @@ def section(results: dict) -> str:
             ]
             if all(cells):
                 grown.append(f"| `cfb {name}` | {what} | {' | '.join(cells)} |")
-    made = results["conditions"]
-    facts = measured_on(
-        {f"`cfb {name}`": made[name]["environment"] | _limits(made[name]) for name in COMMANDS if name in made}
-    )
+    facts = measured_on({f"`cfb {name}`": of["environment"] | _limits(of) for name, of in conditions.items()})
     head = "| command | what grows | wall, all | last two | CPU, all | last two | memory, all | last two |"
     return f"""## How cost grows with the flights
 
@@ -355,7 +353,6 @@ def _line(row: dict, limit: float) -> str:
 
 def write(results: dict, file: Path, page: Path) -> None:
     """Write the results, and the block of the page."""
-    sys.path[:0] = [str(ROOT / "scripts")]
     from marked_block import write_block
 
     from cfb_mjx.files import write_text

@@ -126,7 +126,7 @@ def measured_on(parts: Mapping[str, dict[str, str]]) -> str:
     for name, facts in parts.items():
         own = ", ".join(f"{key} {value}" for key, value in facts.items() if (key, value) not in common)
         groups.setdefault(own, []).append(name)
-    text = [", ".join(f"{key} {value}" for key, value in common)]
+    text = [", ".join(f"{key} {value}" for key, value in common)] if common else []
     return "; ".join(text + [f"{', '.join(names)}: {own}" for own, names in groups.items() if own])
 
 

@@ -19,6 +19,8 @@ import tempfile
 import time
 from pathlib import Path
 
+from campaign import measured_on
+
 from cfb_mjx.files import write_json, write_text
 from cfb_mjx.runtime import configure_jax, environment
 
@@ -195,7 +197,6 @@ that XLA compiles.""",
 def page(result: dict) -> str:
     """Return the page of the results, as Markdown."""
     sections = result["sections"]
-    facts = {", ".join(f"{k} {v}" for k, v in s["environment"].items()) for s in sections.values()}
     text = ["# Performance on a GPU", ""]
     text += ["Use this page to estimate the speed and memory of rollouts, gradients and trainings on a GPU.", ""]
     text += ["```sh", "make gpu", "```", ""]
@@ -203,7 +204,7 @@ def page(result: dict) -> str:
         "Written by `make gpu` (`scripts/gpu.py`); do not edit. All numbers are float32, the best of several runs.",
         "",
     ]
-    text += [*sorted(facts), ""]
+    text += [measured_on({name: section["environment"] for name, section in sections.items()}), ""]
     if "machine" in sections:
         copied = sections["machine"]["rows"][0]["per_s"]
         text += [f"Memory bandwidth, measured in the same way: `x + 1` reads and writes {copied / 1e12:.1f} TB/s.", ""]

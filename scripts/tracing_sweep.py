@@ -123,7 +123,7 @@ def _known(line: dict) -> bool:
 def _measured(lines: list[dict]) -> str:
     """Say when and on which machine the campaigns were traced, as far as their results tell."""
     command, known = "python scripts/tracing_sweep.py", [line for line in lines if _known(line)]
-    text = facts_line(command, known, "traced") if known else f"Written by `{command}`."
+    text = facts_line(command, known, "traced") if known else f"Written by `{command}`; do not edit."
     untold = len(lines) - len(known)
     return text + (f" The results of {untold} campaigns do not tell their date and machine." if untold else "")
 
